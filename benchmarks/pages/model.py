@@ -229,10 +229,10 @@ def of_seeds(found: Mapping[str, Any], number: str) -> str:
 
 def weights_table() -> str:
     """The weights that come with the devkit, with what their notes say."""
-    from deepaccident_devkit.plugins.model.checkpoint import SHIPPED, read_weights
+    from deepaccident_devkit.plugins.model.checkpoint import SHIPPED_FILES, read_weights
 
     rows = []
-    for name, path in SHIPPED.items():
+    for name, path in SHIPPED_FILES.items():
         notes = read_weights(path).meta
         made, scored = notes["made"], notes["scored"]["scores"]
         scores = (f"{100 * scored[each]:.1f}" for each in ("iou", "vpq", "map"))

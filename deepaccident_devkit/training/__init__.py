@@ -1,1 +1,1 @@
-"""What training reads: resized images that are kept, and datasets and batches for PyTorch."""
+"""The data of training: cached images, and datasets and batches for PyTorch."""

@@ -793,7 +793,7 @@ def test_peak_radii_of_the_released_formula(det: GoldenModel) -> None:
 def test_targets_of_the_released_head(det: GoldenModel, task: int) -> None:
     outputs, ours = det.outputs(), our_targets(det)[task]
     assert torch.equal(ours.mask, outputs[f"target.{task}.mask"].bool())
-    assert torch.equal(ours.place, outputs[f"target.{task}.index"])
+    assert torch.equal(ours.cell_index, outputs[f"target.{task}.index"])
     check_close(ours.heatmap, outputs[f"target.{task}.heatmap"])
     check_close(ours.box, outputs[f"target.{task}.box"])
 
@@ -931,7 +931,7 @@ def model_of(golden: Any) -> V2XFormer:
     done = load_weights(
         model, Weights(tensors=golden.state(), meta={}, path=Path("end_to_end.npz")), whole=True
     )
-    assert not done.kept
+    assert not done.unchanged
     assert not done.unused
     return model
 

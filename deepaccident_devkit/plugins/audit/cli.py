@@ -30,15 +30,16 @@ from deepaccident_devkit.support.text import path_of
 @click.argument("sides", nargs=-1, required=True, metavar="FILES...")
 @json_parameter
 def check_splits(sides: tuple[str, ...], as_json: bool) -> None:
-    """Find what stands on two sides of a split: frames, recordings, twins, or the mini release beside the full one.
+    """Find frames, recordings or twins on two sides of a split, or mini beside the full release.
 
-    Each of FILES is a side. A line names a scenario, a sample or a frame by its token, or any file of a release.
-    Instead of files you can give dataroots; then recordings or twins that two of them share are found.
+    Each of FILES is a side. A line names a scenario, a sample or a frame by its token, or any file
+    of a release. Instead of files you can give dataroots; then recordings or twins that two of them
+    share are found.
     Exit status 1: something was found. 2: nothing was compared.
     """
     if len(sides) < 2:
         raise click.UsageError(f"expected two sides or more, found {len(sides)}: {' '.join(sides)}")
-    _end(audit_splits(sides), as_json)
+    _finish(audit_splits(sides), as_json)
 
 
 @verb("scores")
@@ -52,7 +53,7 @@ def check_splits(sides: tuple[str, ...], as_json: bool) -> None:
 def check_scores(
     dataroot: str, file: str, split: str | None, as_json: bool, **release: Any
 ) -> None:
-    """Find what scores of accidents depend on: length of the clip, folder, name, town, weather or actors.
+    """Find what scores of accidents depend on: clip length, folder, name, town, weather or actors.
 
     FILE has results of the task accident, JSON of token and score, or CSV of token,score.
     Exit status 1: something was found. 2: nothing was compared.
@@ -62,7 +63,7 @@ def check_scores(
         report = audit_scores(DeepAccident(dataroot=dataroot, **release), scores, split)
     except (TokenError, ResultsError) as error:
         raise ResultsError(f"{file}: {error}") from error
-    _end(report, as_json)
+    _finish(report, as_json)
 
 
 @verb("reader")
@@ -70,23 +71,25 @@ def check_scores(
 @click.option(
     "--write-release",
     is_flag=True,
-    help="Write the release that a reader in another language, or in another environment, reads into the new folder "
-    "TARGET.",
+    help="Write the release that a reader in another language, or in another environment, reads "
+    "into the new folder TARGET.",
 )
 @json_parameter
 def check_reader(target: str, write_release: bool, as_json: bool) -> None:
     """Find columns of the release's files that a reader mistakes for others.
 
-    TARGET is a Python function, module:function or file.py:function. The command calls it with a dataroot, and compares
-    what it returns with the files. TARGET can also be a folder with JSON and pictures that your reader made of the
-    release that --write-release writes. docs/validation.md explains what is found.
+    TARGET is a Python function, module:function or file.py:function. The command calls it with a
+    dataroot, and compares what it returns with the files. TARGET can also be a folder with JSON and
+    pictures that your reader made of the release that --write-release writes. docs/validation.md
+    explains what is found.
     Exit status 1: something was found. 2: nothing was compared.
     """
     if write_release:
         refuse_unused("with --write-release", "as_json")
         path = write_audit_release(path_of(target))
         click.echo(
-            f"written: {path}; let your reader write JSON of it, and give that folder to `check reader`"
+            f"written: {path}; let your reader write JSON of it, and give that folder to "
+            "`check reader`"
         )
         return
     try:
@@ -98,24 +101,22 @@ def check_reader(target: str, write_release: bool, as_json: bool) -> None:
         raise ConfigError(
             f"{target}: ended with {type(error).__name__}, so nothing was compared"
         ) from error
-    _end(report, as_json)
+    _finish(report, as_json)
 
 
-def _end(report: AuditReport, as_json: bool) -> None:
+def _finish(report: AuditReport, as_json: bool) -> None:
     """Print a report, and exit with its status."""
     click.echo(report.to_json() if as_json else report.to_text())
     sys.exit(report.exit_status)
 
 
 def _function(target: str) -> Callable[[str], object]:
-    """The function that a text names."""
-    place, _, name = target.rpartition(":")
-    sys.path.insert(0, str(Path(place).parent))  # of a module: here
+    """Return the function that a text names; raises UsageError."""
+    module, _, name = target.rpartition(":")
+    sys.path.insert(0, str(Path(module).parent))  # the current folder, for a module
     try:
-        return cast(
-            "Callable[[str], object]",
-            resolve_name(f"{Path(place).name.removesuffix('.py')}:{name}"),
-        )
+        function = resolve_name(f"{Path(module).name.removesuffix('.py')}:{name}")
+        return cast("Callable[[str], object]", function)
     except (ImportError, AttributeError, ValueError) as error:
         expected = "expected a folder, module:function or file.py:function"
         raise click.UsageError(f"TARGET: {expected}, found {target!r} ({error})") from error

@@ -1,4 +1,4 @@
-"""What somebody's reader returned or wrote, value by value, whatever its form: tables, tensors, objects, files."""
+"""The values of a reader's output, in any form: tables, tensors, objects, files."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 
-# Number of values from which on an array is a picture or a cloud, and no column of the labels.
-_LARGE: Final = 20_000
-# Depth of nested values that are looked at.
-_MOST_LEVELS: Final = 20
-# Places in a list that have a key of their own.
+# Size from which on an array is a picture or a cloud, and no column of the labels.
+_MIN_PICTURE_SIZE: Final = 20_000
+# Depth of nested values that are examined.
+_MAX_LEVELS: Final = 20
+# Indices of a list that have a key of their own.
 _COMPONENTS: Final = range(64)
 
 
 def values_in_folder(folder: Path) -> Iterator[tuple[list[str], Any]]:
-    """Yield what is in all files of JSON, and the paths of others; raise ConfigError."""
+    """Yield the values of all JSON files, and the paths of other files; raises ConfigError."""
     for path in sorted(filter(Path.is_file, folder.rglob("*"))):
         if path.suffix != ".json":
             yield [path.relative_to(folder).as_posix()], path
@@ -42,70 +42,76 @@ def values_in_folder(folder: Path) -> Iterator[tuple[list[str], Any]]:
 def values_in(
     value: Any, known: dict[int, object], keys: list[str]
 ) -> Iterator[tuple[list[str], Any]]:
-    """Yield the keys of each value without parts, or too deep or large to have them, and the value.
+    """Yield each value that has no parts, or is too deep or large for them, with its keys.
 
     Args:
-        value: of any type; what its iterators raise is raised as it is.
-        known: what was looked at, by its id; only lists and arrays are looked at twice.
-        keys: those of the value, as `_keys` gives them.
+        value: A value of any type; exceptions of its iterators are not caught.
+        known: Examined values by their id; only lists and arrays are examined twice.
+        keys: Keys of the value, as from `_keys`.
     """
     parts = _parts(value)
-    if parts is None or keys[0].count("/") > _MOST_LEVELS:
+    if parts is None or keys[0].count("/") > _MAX_LEVELS:
         yield keys, value
         return
-    yield [], None  # so that what has no end is counted
+    yield [], None  # counts the parts of an endless value
     if isinstance(value, list | tuple | np.ndarray) or id(value) not in known:
-        known[id(value)] = value  # which keeps its id
+        known[id(value)] = value  # a reference, so that its id is not reused
         for name, part in parts:
             yield from values_in(part, known, _keys(keys, name))
 
 
 def _keys(keys: list[str], name: object) -> list[str]:
-    """Return the keys of a part: its own, `size/*`, and in lists those as a component and as a part of a row.
+    """Return the keys of a part: its own, and in lists its keys as a component and in a row.
 
     Args:
-        keys: of what it is a part of.
-        name: or place; None for the same value in another form.
+        keys: Keys of the value that it is a part of.
+        name: Its name or index; None for the same value in another form.
     """
-    whole, *others = keys
+    own_key, *other_keys = keys
     if name is None:
         return keys
     if name in _COMPONENTS:
-        return [f"{whole}/*", f"{whole}/*[{name}]", *(f"{key}/*" for key in others[:1])]
-    return [f"{whole}/*" if re.search(r"\d{2}|^\d", str(name)) else f"{whole}/{name}"]
+        return [
+            f"{own_key}/*",
+            f"{own_key}/*[{name}]",
+            *(f"{key}/*" for key in other_keys[:1]),
+        ]
+    return [f"{own_key}/*" if re.search(r"\d{2}|^\d", str(name)) else f"{own_key}/{name}"]
 
 
 def _parts(value: Any) -> Any:
-    """Return names or places of a value's parts, and the parts, or None and another form of it; None if it has none."""
+    """Return the names or indices of a value's parts, and the parts; None if it has no parts.
+
+    A value that has another form has one part: None, and this form.
+    """
     if isinstance(value, Number | str | bytes | os.PathLike | type | ModuleType):
         return None
-    abilities = {*dir(type(value))}
-    if {"keys", "items"} <= abilities:  # also a table of pandas
+    methods = {*dir(type(value))}
+    if {"keys", "items"} <= methods:  # also a table of pandas
         return value.items()
-    for method in {
-        "to_pydict",
-        "to_dict",
-        "_asdict",
-    } & abilities:  # a table of Arrow or Polars, a named tuple
+    # Tables of Arrow or Polars, and named tuples.
+    for method in {"to_pydict", "to_dict", "_asdict"} & methods:
         return [(None, getattr(value, method)())]
-    if {"__array__", "__array_interface__"} & abilities:
+    if {"__array__", "__array_interface__"} & methods:
         return _parts_of_array(value)
     names = [*getattr(value, "__dict__", ())]
     for base in type(value).__mro__:
         slots = getattr(base, "__slots__", ())
         names += [slots] if isinstance(slots, str) else slots
     attributes = {name: getattr(value, name, None) for name in names if name[:2] != "__"}
-    if {"__iter__", "__len__"} & abilities:
+    if {"__iter__", "__len__"} & methods:
         return chain(attributes.items(), enumerate(value))
     return attributes.items() or None
 
 
 def _parts_of_array(value: Any) -> Any:
-    with suppress(Exception):  # each library has its own, for tensors on a GPU or with gradients
+    """Return the parts of an array or a tensor: its fields, or its values as a list."""
+    # Libraries raise their own exceptions for tensors on a GPU or with gradients.
+    with suppress(Exception):
         array = np.asanyarray(value)
         if array.dtype.names:
             return [(name, array[name]) for name in array.dtype.names]
-        if array.size >= _LARGE:
+        if array.size >= _MIN_PICTURE_SIZE:
             return None if array is value else [(None, array)]
         value = array
     with suppress(Exception):

@@ -1,4 +1,4 @@
-"""`AuditReport`: what an audit found, each finding in words with its remedy, and the tables it rests on."""
+"""`AuditReport`: the findings of an audit, with remedies and the tables that they rest on."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from deepaccident_devkit.support.reports import CheckReport, Report, Row
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditFinding(ShortRepr):
-    """One thing that is wrong with splits, scores or a reader.
+    """A fault of splits, scores or a reader.
 
     Attributes:
-        kind: a word for programs, such as `twins` or `misread`.
-        what: a sentence that says what was found, and why it is wrong.
-        remedy: what to do.
-        number: how many cases there are.
-        examples: the first of them.
+        kind: A word for programs, such as `twins` or `misread`.
+        what: A sentence that describes the fault and why it is wrong.
+        remedy: A remedy, as a sentence.
+        number: Number of cases.
+        examples: A few of the cases.
     """
 
     kind: str
@@ -30,12 +30,12 @@ class AuditFinding(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditReport(CheckReport):
-    """What an audit found, and what it compared.
+    """The findings of an audit, and the numbers of things that it compared.
 
     Attributes:
-        findings: what is wrong; none if nothing of what was compared is.
-        tables: name → rows, the heading first: what the findings rest on.
-        notes: sentences on how the numbers were made, and on what was left out.
+        findings: The faults; empty if nothing that was compared is wrong.
+        tables: Name → rows, the heading first, which the findings rest on.
+        notes: Sentences on how the numbers were computed, and on what was left out.
     """
 
     findings: tuple[AuditFinding, ...]
@@ -48,21 +48,16 @@ class AuditReport(CheckReport):
         return not self.findings
 
     def named_tables(self) -> Mapping[str, Sequence[Row]]:
-        """What the findings rest on."""
+        """Return the tables that the findings rest on."""
         return self.tables
 
     def to_text(self) -> str:
-        """A paragraph for each finding, what was compared, the tables and the notes."""
-        paragraphs = [
-            "\n  ".join(
-                [
-                    f"FOUND {each.kind}: {each.what}",
-                    *map("such as {}".format, each.examples),
-                    each.remedy,
-                ]
-            )
-            for each in self.findings
-        ]
+        """Return a paragraph for each finding, what was compared, the tables and the notes."""
+        paragraphs = []
+        for finding in self.findings:
+            examples = [f"such as {example}" for example in finding.examples]
+            lines = [f"FOUND {finding.kind}: {finding.what}", *examples, finding.remedy]
+            paragraphs.append("\n  ".join(lines))
         if self.exit_status == 0:
             paragraphs.append("Nothing was found.")
         return "\n\n".join([*paragraphs, self.basis_text(), Report.to_text(self), *self.notes])

@@ -1,7 +1,8 @@
 """Predictions without a model.
 
-What a set of agents sees by the labels goes on at a constant velocity or turn rate, or stands (`outlook`); `predict`
-makes motion maps, accidents (`collisions`), detections and paths of that, and `predict_results` files of them.
+The actors that a set of agents sees by the labels continue at a constant velocity or turn rate, or
+stand still (`outlook`). `predict` turns them into motion maps, accidents, detections and paths, and
+`predict_results` writes files of these.
 """
 
 from deepaccident_devkit.plugins.baselines.outlook import (

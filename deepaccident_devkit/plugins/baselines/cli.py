@@ -38,12 +38,12 @@ from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS, VEHICLE_AGENTS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.messages import Payload
 
-_ALONE = "single"
-# Their names as parameters of a verb.
-_LINK = ("latency", "pose_noise", "packet_loss", "seed", "budget")
+_SINGLE_AGENT = "single"
+# Names of the link's options as parameters of a verb.
+_LINK_OPTIONS = ("latency", "pose_noise", "packet_loss", "seed", "budget")
 _RELEASED_HORIZON = Baseline().horizon
-# Tasks of which results are written if none is named: those of trained models.
-_USUAL = ("motion", "accident", "detection")
+# Default tasks, which are the tasks of trained models.
+_DEFAULT_TASKS = ("motion", "accident", "detection")
 _EXAMPLES = """\b
 Examples:
   deepaccident predict constant_velocity DATAROOT --agents all --out baseline
@@ -65,15 +65,16 @@ Examples:
     "tasks",
     multiple=True,
     metavar="NAME[,NAME…]",
-    default=_USUAL,
+    default=_DEFAULT_TASKS,
     help=f"Of a baseline: tasks to write results for: {', '.join(RESULTS_NAMES)}, or all.  "
-    f"[default: {','.join(_USUAL)}]",
+    f"[default: {','.join(_DEFAULT_TASKS)}]",
 )
 @click.option(
     "--horizon",
     default=_RELEASED_HORIZON,
     show_default=True,
-    help="Of a baseline: how many seconds to predict, in steps of 0.5; planning and forecasting predict at least 3.",
+    help="Of a baseline: how many seconds to predict, in steps of 0.5; planning and forecasting "
+    "predict at least 3.",
 )
 @link_parameters()
 @field_option(Link, "packet_loss")
@@ -85,7 +86,8 @@ Examples:
     type=WordChoice(["evaluate", "all"]),
     default="evaluate",
     show_default=True,
-    help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.",
+    help="evaluate: samples within the horizon before the end. all: two samples per second of each "
+    "scenario.",
 )
 @click.option(
     "--scope",
@@ -99,68 +101,68 @@ Examples:
 def predict(model: str, purpose: Any, **options: Any) -> None:
     """Predict a split of the release in DATAROOT.
 
-    MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` or `tiny_lidar`, which the devkit
-    ships. Or a baseline, which needs no training: `constant_velocity`, `constant_turn_rate` or `standing` say how
-    actors go on that some agents see. The files motion/, accident.json, … are what `deepaccident evaluate` takes. The
-    path that a baseline plans for a vehicle is its own, if it goes on so.
+    MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` or
+    `tiny_lidar`, which the devkit ships. Or a baseline, which needs no training:
+    `constant_velocity`, `constant_turn_rate` or `standing` say how actors go on that some agents
+    see. The files motion/, accident.json, … are what `deepaccident evaluate` takes. The path that a
+    baseline plans for a vehicle is its own, if it goes on so.
     """
-    if not Path(model).exists():  # before PyTorch is asked for
-        model = choice(
-            "MODEL, which is no file and no folder", model, (*MOTION_MODELS, *SHIPPED_WEIGHTS)
-        )
+    if not Path(model).exists():  # a wrong name fails before PyTorch is imported
+        names = (*MOTION_MODELS, *SHIPPED_WEIGHTS)
+        model = choice("MODEL, which is no file and no folder", model, names)
     if purpose == "all":
         refuse_unused("with --samples all, which are those of all scenarios", "scope")
-    seed, link = options["seed"], _link_of(options, "boxes" if model in MOTION_MODELS else "bev")
+    is_baseline = model in MOTION_MODELS
+    seed = options["seed"]
+    link = _pop_link(options, "boxes" if is_baseline else "bev")
     agents = names_or_configuration(options.pop("agents"))
-    predicted = _by_baseline if model in MOTION_MODELS else _by_network
-    predicted(model, purpose, agents=agents, link=link, seed=seed, **options)
+    write_predictions = _predict_with_baseline if is_baseline else _predict_with_network
+    write_predictions(model, purpose, agents=agents, link=link, seed=seed, **options)
 
 
 @workers_kept()
-def _by_baseline(
+def _predict_with_baseline(
     model: Any, purpose: Any, *, agents: Any, link: Link | None, out: Path, **options: Any
 ) -> None:
+    """Write a baseline's results of each task."""
     refuse_unused("with a baseline", "device", "images_cache")
-    agents = agents or _ALONE
-    if agents == _ALONE:
-        refuse_unused("with --agents single, which has no partners", *_LINK)
+    agents = agents or _SINGLE_AGENT
+    if agents == _SINGLE_AGENT:
+        refuse_unused("with --agents single, which has no partners", *_LINK_OPTIONS)
     if link is None or not (link.pose_noise or link.packet_loss):
         refuse_unused("without --pose-noise or --packet-loss", "seed")
     words = [choice("--task", word, (*RESULTS_NAMES, "all")) for word in words_of(options["tasks"])]
-    asked = [task for task in RESULTS_NAMES if task in words or "all" in words]
-    chosen = Baseline(agents=agents, model=model, link=link, horizon=options["horizon"])
+    tasks = [task for task in RESULTS_NAMES if task in words or "all" in words]
+    baseline = Baseline(agents=agents, model=model, link=link, horizon=options["horizon"])
     folder = writable_folder(out)
-    released = chosen.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
+    is_released = baseline.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
+    rules = "released" if is_released else "paper"
     engine = engine_of(options)
     dataset = open_release(**release_of(options), **engine)
-    tokens = _samples(
-        dataset, purpose, "released" if released else "paper", chosen.horizon, options
-    )
-    for task in asked:
-        path, own = folder / RESULTS_NAMES[task], tokens
+    tokens = _samples(dataset, purpose, rules, baseline.horizon, options)
+    for task in tasks:
+        path, task_tokens = folder / RESULTS_NAMES[task], tokens
         if task == "planning":
-            own = [token for token in tokens if agent_of(token) in VEHICLE_AGENTS]
-        kept = is_predicted(dataset, task, own, path, chosen)
-        predict_results(dataset, task, own, path, chosen, **engine, progress=True)
-        click.echo(
-            f"{task}: {counted(len(own), 'sample')} in {path}{', which were there already' if kept else ''}"
-        )
+            task_tokens = [token for token in tokens if agent_of(token) in VEHICLE_AGENTS]
+        was_predicted = is_predicted(dataset, task, task_tokens, path, baseline)
+        predict_results(dataset, task, task_tokens, path, baseline, **engine, progress=True)
+        note = ", which were there already" if was_predicted else ""
+        click.echo(f"{task}: {counted(len(task_tokens), 'sample')} in {path}{note}")
 
 
-def _by_network(
+def _predict_with_network(
     model: str, purpose: Any, *, agents: Any, link: Link | None, seed: int, **options: Any
 ) -> None:
+    """Write a trained model's results of all tasks."""
     refuse_unused(
         "with a trained model, which predicts all tasks as far as it was trained",
         "tasks",
         "horizon",
     )
     refuse_unused("with a trained model, which runs on this machine", "scheduler")
-    if agents == _ALONE:
-        refuse_unused(
-            "with --agents single, which has no partners",
-            *(name for name in _LINK if name != "seed"),
-        )
+    if agents == _SINGLE_AGENT:
+        link_options = [name for name in _LINK_OPTIONS if name != "seed"]
+        refuse_unused("with --agents single, which has no partners", *link_options)
     need_plugin("model", "a trained model")
     use_threads_sparingly()
     from deepaccident_devkit.plugins.model import (
@@ -187,12 +189,11 @@ def _by_network(
     for task, path in paths.items():
         click.echo(f"{task}: {counted(len(tokens), 'sample')} in {path}")
     if dataset.layout == "nuScenes":
-        from deepaccident_devkit.plugins.nuscenes.results import (
-            write_detections,
-        )  # the plug-in opened the release
+        # The plug-in opened the release, so it is installed.
+        from deepaccident_devkit.plugins.nuscenes.results import write_detections
 
-        written = write_detections(dataset, paths["detection"])
-        click.echo(f"detection, for nuScenes' own evaluation: {written}")
+        nuscenes_path = write_detections(dataset, paths["detection"])
+        click.echo(f"detection, for nuScenes' own evaluation: {nuscenes_path}")
     if model in SHIPPED_WEIGHTS and "scored" in network.notes:
         click.echo(scores_text(network, dataset, tokens, paths["motion"]))
 
@@ -200,7 +201,7 @@ def _by_network(
 def _samples(
     dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: dict[str, Any]
 ) -> list[str]:
-    """The samples to predict; raises NotAvailableError if there are none."""
+    """Return the samples to predict; raises NotAvailableError if there are none."""
     split, scope = options["split"], options["scope"]
     tokens = dataset.samples(split, purpose, rules, horizon=horizon, scope=scope)
     if not tokens:
@@ -210,10 +211,13 @@ def _samples(
     return tokens
 
 
-def _link_of(options: dict[str, Any], payload: Payload) -> Link | None:
-    """Take the link's options out of the verb's; None if nothing happens to the partners' data, which are `payload`."""
-    chosen = {name: options.pop(name) for name in _LINK}
-    noise = chosen.pop("pose_noise") or None  # noise with a mean of 0 m would still have a spread
-    if not (chosen["latency"] or noise or chosen["packet_loss"] or chosen["budget"]):
+def _pop_link(options: dict[str, Any], payload: Payload) -> Link | None:
+    """Remove the link's options from a verb's options and return the link.
+
+    Return None if nothing happens to the partners' data, which are `payload`.
+    """
+    values = {name: options.pop(name) for name in _LINK_OPTIONS}
+    noise = values.pop("pose_noise") or None  # noise with a mean of 0 m would still have a spread
+    if not (values["latency"] or noise or values["packet_loss"] or values["budget"]):
         return None
-    return Link(pose_noise=noise, payload=payload if chosen["budget"] else None, **chosen)
+    return Link(pose_noise=noise, payload=payload if values["budget"] else None, **values)

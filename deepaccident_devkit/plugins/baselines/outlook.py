@@ -1,7 +1,7 @@
 """`Outlook`: where an agent and its partners expect the actors that they see now.
 
-Who is seen, and where, is by the labels (`v2x.cooperation`): an oracle. Actors go on at a constant velocity, or at a
-constant turn rate besides, or all stand still from now on.
+The visible actors and their positions come from the labels (`v2x.cooperation`): an oracle. Actors
+continue at a constant velocity, optionally with a constant turn rate, or all stand still.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
 MotionModel = Literal["constant_velocity", "constant_turn_rate", "standing"]
 MOTION_MODELS: Final[tuple[MotionModel, ...]] = get_args(MotionModel)
-# Recorded frames that turn rates look back, at most: 0.5 s.
-HISTORY: Final = 5
-# Radians of turn below which a path is straight to all digits.
-_STRAIGHT: Final = 1e-6
+# Number of recorded frames that turn rates look back: 0.5 s.
+MAX_HISTORY_FRAMES: Final = 5
+# Turn below which a path is straight, to all digits.
+_MIN_TURN_RAD: Final = 1e-6
 
 
 def constant_velocity(pose: FloatArray, velocity: FloatArray, times: FloatArray) -> FloatArray:
-    """Straight on.
+    """Return poses of actors that move straight on at a constant velocity.
 
     Args:
-        pose: (N, 3) x, y (metres), yaw (radians) at time 0, in any right-handed frame.
-        velocity: (N, 2) m/s over the ground, in the same frame; NaN counts as standing.
-        times: (T,) seconds.
+        pose: x, y (metres), yaw (radians) at time 0, in any right-handed frame, shape (N, 3).
+        velocity: Velocity over the ground in m/s, in the same frame, shape (N, 2); NaN counts as
+            standing.
+        times: Seconds, shape (T,).
 
     Returns:
-        (T, N, 3) x, y, yaw.
+        x, y, yaw, shape (T, N, 3).
     """
     return constant_turn_rate(pose, velocity, np.zeros(len(pose)), times)
 
@@ -44,75 +45,83 @@ def constant_velocity(pose: FloatArray, velocity: FloatArray, times: FloatArray)
 def constant_turn_rate(
     pose: FloatArray, velocity: FloatArray, turn_rate: FloatArray, times: FloatArray
 ) -> FloatArray:
-    """At a constant speed, while velocity and heading turn alike.
+    """Return poses of actors at a constant speed, with velocity and heading turning alike.
 
     Args:
-        pose: as of `constant_velocity`.
-        velocity: as of `constant_velocity`.
-        turn_rate: (N,) radians a second, counter-clockwise; 0 goes straight on.
-        times: (T,) seconds.
+        pose: As in `constant_velocity`, shape (N, 3).
+        velocity: As in `constant_velocity`, shape (N, 2).
+        turn_rate: Radians a second, counter-clockwise, shape (N,); 0 goes straight on.
+        times: Seconds, shape (T,).
 
     Returns:
-        (T, N, 3) x, y, yaw.
+        x, y, yaw, shape (T, N, 3).
     """
-    moving = np.where(np.isfinite(velocity), velocity, 0.0)
+    known_velocity = np.where(np.isfinite(velocity), velocity, 0.0)
     turn = times[:, None] * turn_rate
-    straight = np.abs(turn) < _STRAIGHT
-    divisor = np.where(straight, 1.0, turn)
+    is_straight = np.abs(turn) < _MIN_TURN_RAD
+    divisor = np.where(is_straight, 1.0, turn)
     # ∫ (cos, sin)(rate · s) ds from 0 to t, over t
-    ahead = np.where(straight, 1.0, np.sin(turn) / divisor)
-    aside = np.where(straight, turn / 2, (1 - np.cos(turn)) / divisor)
-    x = ahead * moving[:, 0] - aside * moving[:, 1]
-    y = aside * moving[:, 0] + ahead * moving[:, 1]
-    way = times[:, None, None] * np.stack([x, y], axis=-1)
-    return np.concatenate([pose[:, :2] + way, (pose[:, 2] + turn)[..., None]], axis=-1)
+    forward_factor = np.where(is_straight, 1.0, np.sin(turn) / divisor)
+    lateral_factor = np.where(is_straight, turn / 2, (1 - np.cos(turn)) / divisor)
+    x = forward_factor * known_velocity[:, 0] - lateral_factor * known_velocity[:, 1]
+    y = lateral_factor * known_velocity[:, 0] + forward_factor * known_velocity[:, 1]
+    offsets = times[:, None, None] * np.stack([x, y], axis=-1)
+    return np.concatenate([pose[:, :2] + offsets, (pose[:, 2] + turn)[..., None]], axis=-1)
 
 
 def turn_rates(
     dataset: Dataset, sample: RowArgument, *, agents: Agents = "single", link: Link | None = None
 ) -> FloatArray:
-    """The turn rates of the actors of `seen_actors`, by their headings at the present and up to 0.5 s before it.
+    """Return the turn rates of the actors of `seen_actors`, from headings now and up to 0.5 s ago.
 
-    For each actor the earliest of these moments counts at which the agents saw it. Arguments and errors as of
-    `seen_actors`.
+    The earlier heading of an actor is from the earliest of these moments at which the agents saw
+    it. Arguments and errors are as in `seen_actors`.
 
     Returns:
-        (N,) radians a second, counter-clockwise; 0 for actors not seen before.
+        Radians a second, counter-clockwise, shape (N,); 0 for actors that nobody saw before.
     """
     scenario, agent, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
     present = seen_actors(dataset, sample, agents=agents, link=link, frame="world").boxes
-    rate, known = np.zeros(len(present)), np.zeros(len(present), dtype=bool)
+    rates = np.zeros(len(present))
+    is_known = np.zeros(len(present), dtype=bool)
     delay = 0 if link is None else link.latency_frames
-    for back in range(min(HISTORY, int(number) - 1 - delay), 0, -1):
-        if known.all():
+    for age in range(min(MAX_HISTORY_FRAMES, int(number) - 1 - delay), 0, -1):
+        if is_known.all():
             break
-        token = sample_token(scenario, agent, int(number) - back)
-        before = seen_actors(dataset, token, agents=agents, link=link, frame="world").boxes
-        _, now, then = np.intersect1d(present.actor_id, before.actor_id, return_indices=True)
-        turned = present.yaw[now] - before.yaw[then]
-        found = np.zeros(len(present), dtype=bool)
-        found[now] = True
-        values = np.zeros(len(present))
-        values[now] = np.arctan2(np.sin(turned), np.cos(turned)) / (back * FRAME_PERIOD)
-        fresh = found & ~known
-        rate[fresh], known = values[fresh], known | found
-    return rate
+        token = sample_token(scenario, agent, int(number) - age)
+        past = seen_actors(dataset, token, agents=agents, link=link, frame="world").boxes
+        _, present_rows, past_rows = np.intersect1d(
+            present.actor_id, past.actor_id, return_indices=True
+        )
+        turns = present.yaw[present_rows] - past.yaw[past_rows]
+        is_matched = np.zeros(len(present), dtype=bool)
+        is_matched[present_rows] = True
+        matched_rates = np.zeros(len(present))
+        wrapped_turns = np.arctan2(np.sin(turns), np.cos(turns))
+        matched_rates[present_rows] = wrapped_turns / (age * FRAME_PERIOD)
+        is_new = is_matched & ~is_known
+        rates[is_new] = matched_rates[is_new]
+        is_known |= is_matched
+    return rates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outlook(FrozenArrays):
-    """Actors, in the present ego frame, and how they go on; arrays are read-only.
+    """Actors in the present ego frame, and how they are expected to move; arrays are read-only.
 
     Attributes:
-        seen: who is known; boxes in the frame `ego`.
-        turn_rate: (N,) radians a second, counter-clockwise.
+        seen: The known actors; boxes in the frame `ego`.
+        turn_rate: Radians a second, counter-clockwise, shape (N,).
     """
 
     seen: SeenActors
     turn_rate: FloatArray
 
     def poses(self, times: FloatArray) -> FloatArray:
-        """(T, N, 3) x forward, y left (metres), yaw (radians), in the present ego frame, at times (T,) in seconds."""
+        """Return the actors' poses at times (T,) in seconds, shape (T, N, 3).
+
+        Poses are x forward, y left (metres), yaw (radians), in the present ego frame.
+        """
         boxes = self.seen.boxes
         pose = np.column_stack([boxes.center[:, :2], boxes.yaw])
         return constant_turn_rate(pose, boxes.velocity[:, :2], self.turn_rate, times)
@@ -126,27 +135,27 @@ def outlook(
     model: MotionModel = "constant_velocity",
     link: Link | None = None,
 ) -> Outlook:
-    """The outlook of some agents at a sample.
+    """Return the outlook of some agents at a sample.
 
     Args:
-        dataset: the release.
-        sample: token or record: its agent is the ego, its frame the present.
-        agents: who cooperates.
-        model: how actors go on; one that nobody saw before goes straight on at a constant turn rate, too.
-        link: what happens to the partners' data; None for nothing.
+        dataset: The release.
+        sample: Token or record; its agent is the ego, its frame the present.
+        agents: The cooperating agents.
+        model: Motion model of the actors; also at a constant turn rate, an actor that nobody saw
+            before goes straight on.
+        link: Degradation of the partners' data; None for none.
 
     Raises:
-        ChoiceError: no such model.
-        DeepAccidentError: as of `seen_actors`.
+        ChoiceError: There is no such model.
+        DeepAccidentError: As in `seen_actors`.
     """
     model = choice("model", model, MOTION_MODELS)
-    seen = seen_actors(dataset, sample, agents=agents, link=link)
+    actors = seen_actors(dataset, sample, agents=agents, link=link)
     if model == "standing":
-        seen = replace(seen, boxes=replace(seen.boxes, velocity=np.zeros_like(seen.boxes.velocity)))
-    turns = model == "constant_turn_rate"
-    rate = (
-        turn_rates(dataset, sample, agents=agents, link=link)
-        if turns
-        else np.zeros(len(seen.boxes))
-    )
-    return Outlook(seen=seen, turn_rate=rate)
+        standing = replace(actors.boxes, velocity=np.zeros_like(actors.boxes.velocity))
+        actors = replace(actors, boxes=standing)
+    if model == "constant_turn_rate":
+        rates = turn_rates(dataset, sample, agents=agents, link=link)
+    else:
+        rates = np.zeros(len(actors.boxes))
+    return Outlook(seen=actors, turn_rate=rates)

@@ -1,7 +1,7 @@
-"""Results files of the baselines: predictions of many samples, written like those of a model.
+"""Results files of the baselines: predictions of many samples, in the format of a model's results.
 
-Each scenario's samples are results of their own at first, beside the whole: a killed run loses the scenarios at hand
-alone, and several processes share the scenarios.
+Each scenario's samples first get their own results, beside the final file: a killed run only loses
+the scenarios that it was working on, and several processes share the scenarios.
 """
 
 from __future__ import annotations
@@ -50,14 +50,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Baseline:
-    """Which agents see, and how seen actors go on.
+    """The agents that see, and the motion model of the actors that they see.
 
     Attributes:
-        agents: who cooperates, as of `v2x.cooperating_agents`.
-        model: how actors go on.
-        link: what happens to the partners' data; None for nothing. They send boxes if it does not say another payload.
-        horizon: seconds to look ahead, of motion and accidents; a multiple of 0.5. Plans and forecasts look at least
-            3 s ahead.
+        agents: The cooperating agents, as in `v2x.cooperating_agents`.
+        model: Motion model of the actors.
+        link: Degradation of the partners' data; None for none. Partners send boxes unless it
+            defines another payload.
+        horizon: Seconds to look ahead, for motion and accidents; a multiple of 0.5. Plans and
+            forecasts look at least 3 s ahead.
     """
 
     agents: Agents = "single"
@@ -72,35 +73,38 @@ class Baseline:
 
     @property
     def config(self) -> MotionLabelConfig:
-        """The released labels, this far ahead; raises ConfigError."""
+        """The config of the released labels with this horizon; raises ConfigError."""
         return MotionLabelConfig(future_frames=len(path_times(self.horizon)))
 
     def predict(self, dataset: Dataset, task: ResultsTask, token: str) -> Prediction:
-        """Its prediction of a sample; raises DeepAccidentError as the functions of `predict`."""
-        seeing: dict[str, Any] = {"agents": self.agents, "link": self.link}
+        """Predict a sample for a task; raises DeepAccidentError as the functions of `predict`."""
+        cooperation: dict[str, Any] = {"agents": self.agents, "link": self.link}
         if task == "motion":
-            return predict_motion(dataset, token, model=self.model, config=self.config, **seeing)
+            return predict_motion(
+                dataset, token, model=self.model, config=self.config, **cooperation
+            )
         if task == "accident":
             return predict_accidents(
-                dataset, token, model=self.model, horizon=self.horizon, **seeing
+                dataset, token, model=self.model, horizon=self.horizon, **cooperation
             )
         if task == "detection":
-            return predict_detections(dataset, token, **seeing)
-        going: dict[str, Any] = {"model": self.model, "horizon": self.horizon_of(task)}
+            return predict_detections(dataset, token, **cooperation)
+        extrapolation: dict[str, Any] = {"model": self.model, "horizon": self.horizon_of(task)}
         if task == "planning":
-            return [predict_plan(dataset, token, **going)]
-        return predict_forecasts(dataset, token, **going, **seeing)
+            return [predict_plan(dataset, token, **extrapolation)]
+        return predict_forecasts(dataset, token, **extrapolation, **cooperation)
 
     def horizon_of(self, task: ResultsTask) -> float:
-        """Seconds that its predictions for a task look ahead."""
-        return (
-            max(self.horizon, PATH_HORIZON) if task in ("planning", "forecasting") else self.horizon
-        )
+        """Return the horizon of the predictions for a task, in seconds."""
+        if task in ("planning", "forecasting"):
+            return max(self.horizon, PATH_HORIZON)
+        return self.horizon
 
     def meta(self) -> dict[str, Any]:
-        """Its notes in a results file, as JSON holds them."""
+        """Return the notes on the baseline in a results file, as JSON holds them."""
+        model_text = self.model.replace("_", " ")
         return {
-            "method": f"baseline: what the agents see by the labels, {self.model.replace('_', ' ')}",
+            "method": f"baseline: what the agents see by the labels, {model_text}",
             "agents": agents_note(self.agents),
             "model": self.model,
             "link": None if self.link is None else asdict(self.link),
@@ -114,31 +118,35 @@ def predict_results(
     tokens: Sequence[str],
     out: str | os.PathLike[str],
     baseline: Baseline | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> Path:
-    """Write a baseline's predictions of samples to a results file (of motion, a folder); returns its path.
+    """Write a baseline's predictions of samples to a results file (a folder for motion).
 
-    Scenario follows scenario there, in the order in which the samples name them. Their notes have, as `bytes`, how much
-    partners send.
+    The file lists one scenario after another, in the order in which the samples mention them. Its
+    notes have, as `bytes`, how much partners send.
 
-    The bytes do not depend on workers. If a call is interrupted, the same call continues it: only the scenarios at hand
-    are lost. Several processes that are given the same `out` share the scenarios. Complete results of the same samples
-    and settings are left as they are.
+    The bytes do not depend on workers. If a call is interrupted, the same call continues it: only
+    the current scenarios are lost. Several processes with the same `out` share the scenarios.
+    Complete results of the same samples and settings are left unchanged.
 
     Args:
-        dataset: the release.
-        task: of `RESULTS_NAMES`; of planning, samples of vehicles alone.
-        tokens: of the samples.
-        out: the file or folder to write.
-        baseline: None for a single vehicle and constant velocity.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        task: A task of `RESULTS_NAMES`; planning only takes samples of vehicles.
+        tokens: Tokens of the samples.
+        out: The file or folder to write.
+        baseline: The baseline; None for a single vehicle and constant velocity.
+        **engine: `workers`, `executor` and `progress`, as in `parallel.Engine`.
+
+    Returns:
+        The path of the results.
 
     Raises:
-        ChoiceError: no such task.
-        NotAvailableError: an agent that cooperates is not in this (partial) release.
-        ResultsError: a token comes twice, something else stands at `out`, or nothing can be written.
-        SomeFailedError: samples of some scenarios cannot be predicted; the others are done.
-        WorkerError: a worker was killed, or cannot do the work.
+        ChoiceError: There is no such task.
+        NotAvailableError: A cooperating agent is not in this (partial) release.
+        ResultsError: A token occurs twice, something else exists at `out`, or nothing can be
+            written.
+        SomeFailedError: Samples of some scenarios cannot be predicted; the others are done.
+        WorkerError: A worker was killed, or cannot do the work.
     """
     task, path = choice("task", task, get_args(ResultsTask)), path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
@@ -148,24 +156,26 @@ def predict_results(
     if work.is_done(path, scenarios):
         store.remove()  # of a process that was killed just before
         return path
-    work.writer(path)  # refuses what stands there
-    for own in scenarios.values():
-        cooperating_agents(
-            dataset, own[0], work.baseline.agents
-        )  # fails now, and not in every worker
-    jobs = {
-        scenario: _Job(replace(work, scenarios=(scenario,)), own, store, f"{name}/{scenario}")
-        for scenario, own in scenarios.items()
-    }
+    work.writer(path)  # refuses other content at the path
+    for scenario_tokens in scenarios.values():
+        # An agent that is missing fails here, and not in every worker.
+        cooperating_agents(dataset, scenario_tokens[0], work.baseline.agents)
+    jobs = {}
+    for scenario, scenario_tokens in scenarios.items():
+        scenario_work = replace(work, scenarios=(scenario,))
+        jobs[scenario] = _Job(scenario_work, scenario_tokens, store, f"{name}/{scenario}")
     places = Places(reads=dataset.places, writes=(store.folder,))
     with store.shared() as turn:
-        if not work.is_done(path, scenarios):  # by another process meanwhile
-            store.run(_predict, jobs, label=work.task, places=places, **how)
+        if not work.is_done(path, scenarios):  # another process may have finished meanwhile
+            store.run(_predict_scenario, jobs, label=work.task, places=places, **engine)
         if turn.alone() and not work.is_done(path, scenarios):
-            sent = [each for job in jobs.values() for each in read_results(job.path).meta["bytes"]]
-            with work.writer(path, traffic_note(sent, work.baseline.link, work.payload)) as whole:
+            sent_bytes: list[Any] = []
+            for job in jobs.values():
+                sent_bytes += read_results(job.path).meta["bytes"]
+            note = traffic_note(sent_bytes, work.baseline.link, work.payload)
+            with work.writer(path, note) as writer:
                 for job in jobs.values():
-                    whole.add_part(read_results(job.path))
+                    writer.add_part(read_results(job.path))
             store.remove()
     return path
 
@@ -177,7 +187,10 @@ def is_predicted(
     out: str | os.PathLike[str],
     baseline: Baseline | None = None,
 ) -> bool:
-    """Whether `predict_results` has written its results with these arguments before; raises ResultsError as it."""
+    """Return whether `predict_results` has already written results with these arguments.
+
+    Raises ResultsError as `predict_results`.
+    """
     path = path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
     work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))
@@ -185,19 +198,22 @@ def is_predicted(
 
 
 def samples_by_scenario(path: Path, tokens: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The samples of each scenario, in the given order; raises ResultsError, which names `path`, if one comes twice."""
-    found: dict[str, dict[str, None]] = {}
+    """Return the samples of each scenario, in the order of `tokens`.
+
+    Raises ResultsError, with `path` in its message, if a sample occurs twice.
+    """
+    scenarios: dict[str, dict[str, None]] = {}
     for token in tokens:
-        own = found.setdefault(scenario_of(token), {})
-        if token in own:
+        scenario_tokens = scenarios.setdefault(scenario_of(token), {})
+        if token in scenario_tokens:
             raise ResultsError(f"{path}: {token}: comes twice; give each sample once")
-        own[token] = None
-    return {scenario: tuple(own) for scenario, own in found.items()}
+        scenario_tokens[token] = None
+    return {scenario: tuple(scenario_tokens) for scenario, scenario_tokens in scenarios.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """What is predicted; cheap to pickle."""
+    """Settings of predictions; cheap to pickle."""
 
     dataset: Dataset
     task: ResultsTask
@@ -206,25 +222,24 @@ class _Work:
 
     @property
     def payload(self) -> Payload | int:
-        """What partners send."""
+        """The payload of partners' messages."""
         return (self.baseline.link and self.baseline.link.payload) or "boxes"
 
     @property
     def meta(self) -> dict[str, Any]:
-        """The notes in its results, but the bytes that partners send, which follow from these and the samples."""
-        horizon, release = (
-            self.baseline.horizon_of(self.task),
-            release_note(self.dataset, self.scenarios),
-        )
+        """The notes in the results, except the bytes that partners send.
+
+        The bytes follow from these notes and the samples.
+        """
         return {
             **self.baseline.meta(),
-            "horizon": horizon,
-            "release": release,
+            "horizon": self.baseline.horizon_of(self.task),
+            "release": release_note(self.dataset, self.scenarios),
             "devkit": __version__,
         }
 
     def digest(self, scenarios: Mapping[str, tuple[str, ...]]) -> str:
-        """Of all that decides the results of these samples."""
+        """Return a digest of everything that decides the results of these samples."""
         tokens = list(chain(*scenarios.values()))
         return digest_of(
             {
@@ -232,23 +247,26 @@ class _Work:
                 "task": self.task,
                 "tokens": tokens,
                 "meta": self.meta,
-                "payload": self.payload,  # whose bytes each scenario's results note
+                "payload": self.payload,  # each scenario's results note its bytes
             }
         )
 
     def is_done(self, path: Path, scenarios: Mapping[str, tuple[str, ...]]) -> bool:
-        """Whether its results of these samples are there."""
+        """Return whether the results of these samples exist."""
         try:
             results = read_results(path)
         except ResultsError:  # nothing, or something else
             return False
-        wanted = self.task, self.meta, tuple(chain(*scenarios.values()))
-        there = {name: value for name, value in results.meta.items() if name != "bytes"}
-        return (results.task, there, results.tokens) == wanted
+        expected = self.task, self.meta, tuple(chain(*scenarios.values()))
+        meta = {name: value for name, value in results.meta.items() if name != "bytes"}
+        return (results.task, meta, results.tokens) == expected
 
-    def writer(self, path: Path, sent: object = None) -> ResultsWriter:
-        """A writer of its results, with a note on the bytes; raises ResultsError if something stands there."""
-        meta = self.meta | {"bytes": sent}
+    def writer(self, path: Path, sent_bytes: object = None) -> ResultsWriter:
+        """Return a writer of the results, with a note on the bytes.
+
+        Raises ResultsError if something exists at the path.
+        """
+        meta = self.meta | {"bytes": sent_bytes}
         if self.task != "motion":
             return ResultsWriter(path, self.task, meta=meta)
         config = self.baseline.config
@@ -260,7 +278,7 @@ class _Work:
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """The samples of a scenario, and where their results are kept until all are there."""
+    """The samples of a scenario, and the store of their results until all scenarios are done."""
 
     work: _Work
     tokens: tuple[str, ...]
@@ -269,22 +287,24 @@ class _Job:
 
     @property
     def path(self) -> Path:
-        return self.store.path(self.name if self.work.task == "motion" else f"{self.name}.json")
+        suffix = "" if self.work.task == "motion" else ".json"
+        return self.store.path(f"{self.name}{suffix}")
 
 
-def _predict(job: _Job) -> None:
-    """Write the results of a scenario, unless they are there; what cannot be written ends it all."""
+def _predict_scenario(job: _Job) -> None:
+    """Write the results of a scenario if they are missing.
+
+    An error in writing is raised as an OSError, which ends all work.
+    """
     work = job.work
     if job.path.exists():
         return
+    agents, link = work.baseline.agents, work.baseline.link
     try:
-        with work.writer(
-            job.path,
-            [
-                traffic(work.dataset, token, work.baseline.agents, work.baseline.link, work.payload)
-                for token in job.tokens
-            ],
-        ) as writer:
+        sent_bytes = [
+            traffic(work.dataset, token, agents, link, work.payload) for token in job.tokens
+        ]
+        with work.writer(job.path, sent_bytes) as writer:
             for token in job.tokens:
                 writer.add(token, work.baseline.predict(work.dataset, work.task, token))
     except ResultsError as error:

@@ -1,16 +1,17 @@
 """V2XFormer, the model that was published with DeepAccident, in plain PyTorch (the extra `torch`).
 
     from deepaccident_devkit import DeepAccident
-    from deepaccident_devkit.plugins.model import ModelChoice, PredictConfig, load_model, predict_results, train
+    from deepaccident_devkit.plugins.model import ModelChoice, PredictConfig
+    from deepaccident_devkit.plugins.model import load_model, predict_results, train
 
     da = DeepAccident(dataroot="data/DeepAccident")
     train(da, "runs/all", ModelChoice(preset="tiny"))
     tokens = da.evaluation_samples("val")
     predict_results(load_model("runs/all"), da, tokens, "results", PredictConfig(agents="all"))
 
-The preset `released` is equal to the released modules, with their quirks as fields of its configuration; `tiny` is
-trained by a laptop (docs/training.md), and its weights come with the devkit (docs/model.md). `network` says which
-module does what on the way from images to predictions.
+The preset `released` is equal to the released modules, with their quirks as fields of its
+configuration; a laptop can train `tiny` (docs/training.md), and its weights come with the devkit
+(docs/model.md). `network` describes the modules on the way from images to predictions.
 Importing a name from it without torch raises MissingExtraError.
 """
 
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     )
 
 # Public name → its module.
-_HOMES = {
+_MODULES = {
     **dict.fromkeys(
         ("Loaded", "Weights", "load_weights", "read_weights", "write_weights"), "checkpoint"
     ),
@@ -87,18 +88,22 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name's module only when the name is used: the help of the command `train` needs no torch."""
-    if name not in _HOMES:
+    """Import a public name's module when the name is used.
+
+    So the help of the command `train` needs no torch.
+    """
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
         import safetensors  # noqa: F401 - as torch
         import torch  # noqa: F401 - nothing here works without it
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"the model needs PyTorch and safetensors, and {error.name} is not there: in a checkout, pip install "
-            "'.[torch]' (for PyTorch's CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
+            f"the model needs PyTorch and safetensors, and {error.name} is not there: in a "
+            "checkout, pip install '.[torch]' (for PyTorch's CPU build alone: pip install torch "
+            "--index-url https://download.pytorch.org/whl/cpu)"
         ) from error
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

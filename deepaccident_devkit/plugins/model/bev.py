@@ -1,7 +1,7 @@
-"""BEV features cut to a task's grid, and the encoders that stand before a task's head.
+"""BEV features cropped to a task's grid, and the encoders in front of a task's head.
 
-Every task has a crop and an encoder of its own, as in BEVerse (the released `BevFeatureSlicer` and `BevEncode`).
-`BevUNet` is our small encoder; its result has half the grid's resolution.
+Every task has its own crop and encoder, as in BEVerse (the released `BevFeatureSlicer` and
+`BevEncode`). `BevUNet` is our small encoder; its result has half the grid's resolution.
 """
 
 from __future__ import annotations
@@ -19,11 +19,21 @@ from deepaccident_devkit.support.arrays import check_least
 
 
 def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
-    """Features (N, C, H, W) of one grid at another's cell centres, bilinear (the released `BevFeatureSlicer`).
+    """Sample features at another grid's cell centres (the released `BevFeatureSlicer`).
 
-    Both grids are in metres of the same ego frame and in the same orientation, else GeometryError is raised. Outside
-    the source grid features are zero; within half a cell of its edge, on either side, they fade. If the grids are
-    equal, nothing is sampled.
+    Sampling is bilinear.
+
+    Both grids are in metres of the same ego frame and in the same orientation. Outside the source
+    grid features are zero; within half a cell of its edge, on either side, they fade. If the grids
+    are equal, nothing is sampled.
+
+    Args:
+        features: Features on the source grid, shape (N, C, H, W).
+        source: Grid of the features.
+        target: Grid of the result.
+
+    Raises:
+        GeometryError: The features do not fit the source grid, or the orientations differ.
     """
     rows, columns = source.shape
     if features.dim() != 4 or tuple(features.shape[-2:]) != (rows, columns):
@@ -37,25 +47,26 @@ def crop(features: Tensor, source: BevGrid, target: BevGrid) -> Tensor:
         )
     if source == target:
         return features
-    down, along = (
-        _sample_points(inside, outside, features.device)
-        for inside, outside in zip(axes_of(target), axes_of(source), strict=True)
+    vertical_points, horizontal_points = (
+        _sample_points(target_axis, source_axis, features.device)
+        for target_axis, source_axis in zip(axes_of(target), axes_of(source), strict=True)
     )
-    points = torch.stack(torch.meshgrid(along, down, indexing="xy"), dim=-1)
-    # half precision cannot tell neighbouring cells of a large grid apart
+    grid = torch.meshgrid(horizontal_points, vertical_points, indexing="xy")
+    points = torch.stack(grid, dim=-1)
+    # Half precision cannot distinguish neighbouring cells of a large grid.
     dtype = torch.promote_types(features.dtype, torch.float32)
     points = points.to(dtype).expand(len(features), -1, -1, -1)
     return functional.grid_sample(features.to(dtype), points, align_corners=True).to(features.dtype)
 
 
 def _sample_points(target: Axis, source: Axis, device: torch.device) -> Tensor:
-    """A target axis's cell centres; −1 and 1 are the centres of the source axis's first and last cell."""
+    """Return a target axis's cell centres, scaled to the source axis.
+
+    −1 and 1 are the centres of the source axis's first and last cell.
+    """
     low, high, size = target
-    centers = (
-        low
-        + (torch.arange(round((high - low) / size), device=device, dtype=torch.float64) + 0.5)
-        * size
-    )
+    steps = torch.arange(round((high - low) / size), device=device, dtype=torch.float64)
+    centers = low + (steps + 0.5) * size
     low, high, size = source
     return (2 * centers - (low + high)) / (high - low - size)
 
@@ -65,9 +76,9 @@ class BevEncodeConfig:
     """Sizes of the released encoder; the defaults are the released ones.
 
     Attributes:
-        in_channels: of the features after fusion.
-        out_channels: of the result.
-        widths: channels of the three stages, at 1/2, 1/4 and 1/8 of the input's resolution.
+        in_channels: Channels of the features after fusion.
+        out_channels: Channels of the result.
+        widths: Channels of the three stages, at 1/2, 1/4 and 1/8 of the input's resolution.
     """
 
     in_channels: int = 64
@@ -80,10 +91,13 @@ class BevEncodeConfig:
 
 
 class BevEncode(nn.Module):
-    """The released `BevEncode`: three stages of two residual blocks, and a decoder back to the input's resolution."""
+    """The released `BevEncode`: three stages, and a decoder back to the input's resolution.
+
+    Each stage has two residual blocks.
+    """
 
     def __init__(self, config: BevEncodeConfig) -> None:
-        """Make the layers of the given sizes."""
+        """Build the layers of the given sizes."""
         super().__init__()
         inputs = (config.in_channels, *config.widths[:-1])
         self.layers = nn.ModuleList(
@@ -98,7 +112,7 @@ class BevEncode(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        """(N, in_channels, H, W), H and W even → (N, out_channels, H, W)."""
+        """Encode features (N, in_channels, H, W), H and W even; return (N, out_channels, H, W)."""
         fine = self.layers[0](features)
         coarse = self.layers[2](self.layers[1](fine))
         return self.up2(self.up1(coarse, fine))
@@ -106,12 +120,12 @@ class BevEncode(nn.Module):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BevUNetConfig:
-    """Sizes of our small encoder; the defaults are those of `tiny`.
+    """Sizes of our small encoder; the defaults are the sizes of `tiny`.
 
     Attributes:
-        in_channels: of the features after fusion.
-        out_channels: of the result.
-        widths: channels of the two stages, at 1/2 and 1/4 of the input's resolution.
+        in_channels: Channels of the features after fusion.
+        out_channels: Channels of the result.
+        widths: Channels of the two stages, at 1/2 and 1/4 of the input's resolution.
     """
 
     in_channels: int = 32
@@ -124,10 +138,10 @@ class BevUNetConfig:
 
 
 class BevUNet(nn.Module):
-    """Our small encoder: a residual block at 1/2 and one at 1/4 of the input's resolution, joined at 1/2."""
+    """Our small encoder: residual blocks at 1/2 and 1/4 of the resolution, joined at 1/2."""
 
     def __init__(self, config: BevUNetConfig) -> None:
-        """Make the layers of the given sizes."""
+        """Build the layers of the given sizes."""
         super().__init__()
         fine, coarse = config.widths
         self.fine = _ResidualBlock(config.in_channels, fine, stride=2)
@@ -135,7 +149,10 @@ class BevUNet(nn.Module):
         self.join = nn.Sequential(*_convolution(fine + coarse, config.out_channels))
 
     def forward(self, features: Tensor) -> Tensor:
-        """(N, in_channels, H, W) → (N, out_channels, H / 2, W / 2), odd sizes rounded up."""
+        """Encode features (N, in_channels, H, W); return (N, out_channels, H / 2, W / 2).
+
+        Odd sizes are rounded up.
+        """
         fine = self.fine(features)
         coarse = functional.interpolate(
             self.coarse(fine), size=fine.shape[-2:], mode="bilinear", align_corners=False
@@ -144,7 +161,10 @@ class BevUNet(nn.Module):
 
 
 class _ResidualBlock(nn.Module):
-    """Two convolutions and a skip; as released, a skip that changes the size is a 3 × 3 convolution without norm."""
+    """Two convolutions and a skip.
+
+    As released, a skip that changes the size is a 3 × 3 convolution without norm.
+    """
 
     def __init__(self, inputs: int, outputs: int, *, stride: int = 1) -> None:
         super().__init__()
@@ -157,14 +177,13 @@ class _ResidualBlock(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
-        inner = functional.relu(self.bn1(self.conv1(features)), inplace=True)
-        return functional.relu(
-            self.bn2(self.conv2(inner)) + self.downsample(features), inplace=True
-        )
+        hidden = functional.relu(self.bn1(self.conv1(features)), inplace=True)
+        hidden = self.bn2(self.conv2(hidden))
+        return functional.relu(hidden + self.downsample(features), inplace=True)
 
 
 class _UpAndJoin(nn.Module):
-    """Coarse features brought to the size of fine ones, joined with them, and two convolutions."""
+    """Coarse features enlarged and joined with fine ones; then two convolutions."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()

@@ -1,7 +1,8 @@
 """Weights in files: our own as safetensors, foreign ones of the release, BEVerse or Swin.
 
-Names are the release's (tests/data/golden/model/released_keys_*.txt), so that the key table is the identity.
-A foreign file is read by `release.checkpoints`, which runs no code of it and makes nothing large.
+Names are the release's (tests/data/golden/model/released_keys_*.txt), so the key table is the
+identity. A foreign file is read by `release.checkpoints`, which runs no code from it and allocates
+nothing large.
 """
 
 from __future__ import annotations
@@ -36,44 +37,52 @@ from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS
 
-BEST: Final = "best.safetensors"
-FINAL: Final = "final.safetensors"
-# In a run's folder: the weights with the best score; of a run that was not validated, those of the last step; and the
-# state from which it goes on.
-LAST: Final = "last.safetensors"
-# Weights that come with the devkit, by name; their notes say how they were made, and what they score where.
-SHIPPED: Final = MappingProxyType(
+# Files of a run's folder: the weights with the best score; for a run without validation the weights
+# of the last step; and the state from which the run continues.
+BEST_FILE: Final = "best.safetensors"
+FINAL_FILE: Final = "final.safetensors"
+STATE_FILE: Final = "last.safetensors"
+# Weights that are part of the devkit, by name; their notes describe their training and their
+# scores.
+SHIPPED_FILES: Final = MappingProxyType(
     {name: Path(__file__).with_name(f"{name}.safetensors") for name in SHIPPED_WEIGHTS}
 )
-# Beginning of the names of the optimizer's tensors in that state.
-OPTIMIZER: Final = "optimizer."
-_META: Final = "deepaccident"
-# Ends of names whose values follow from the configuration, or do not matter.
-_MADE: Final = ("relative_position_index", "transformer.frustum", "num_batches_tracked")
-_TOLD: Final = 3
-# Bytes of the header of a safetensors file; `released` has 0.1 MB.
-_HEADER: Final = 4 << 20
-_FACTOR: Final = 4
-# Tensors may have so many times the bytes of their foreign file, and so many more: several may share theirs.
-_ROOM: Final = 1 << 20
-# What a damaged or hostile file of weights can raise.
+# Prefix of the names of the optimizer's tensors in the state.
+OPTIMIZER_PREFIX: Final = "optimizer."
+_META_KEY: Final = "deepaccident"
+# Suffixes of names with values that follow from the configuration, or do not matter.
+_DERIVED_SUFFIXES: Final = (
+    "relative_position_index",
+    "transformer.frustum",
+    "num_batches_tracked",
+)
+# Number of names that a message lists.
+_MAX_LISTED_NAMES: Final = 3
+# Size of the header of a safetensors file; that of `released` has 0.1 MB.
+_MAX_HEADER_BYTES: Final = 4 << 20
+# Tensors of a foreign file may be larger than the file by this factor and this constant, because
+# several may share their storage.
+_MAX_EXPANSION: Final = 4
+_MAX_EXTRA_BYTES: Final = 1 << 20
+# Exceptions that a damaged or hostile file of weights can raise.
 _FAULTS: Final = (SafetensorError, *FAULTS)
+_MODEL_PARTS: Final = ("img_backbone", "img_neck", "transformer", "temporal_model", "pts_bbox_head")
 
 
 class _Header(msgspec.Struct):
-    """What else than tensors is in the header of a safetensors file."""
+    """The header of a safetensors file, except the tensors."""
 
     metadata: dict[str, str] = msgspec.field(name="__metadata__", default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Weights(ShortRepr):
-    """Tensors by name, and what is known of them.
+    """Tensors by name, and notes on them.
 
     Attributes:
-        tensors: by the model's names.
-        meta: of our own files: the preset, and how they were made; empty for foreign ones.
-        path: of the file.
+        tensors: Tensors by the model's names.
+        meta: Notes of our own files: the preset, and the training; empty for foreign ones.
+        path: Path of the file.
     """
 
     tensors: Mapping[str, Tensor]
@@ -83,198 +92,213 @@ class Weights(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loaded(ShortRepr):
-    """What `load_weights` did.
+    """The result of `load_weights`.
 
     Attributes:
-        loaded: names of the model's tensors that the file had.
-        kept: names that it did not have: they stay as they were.
-        unused: names that only the file has.
+        loaded: Names of the model's tensors that the file had.
+        unchanged: Names of the model's tensors that the file did not have.
+        unused: Names that only the file has.
     """
 
     loaded: tuple[str, ...]
-    kept: tuple[str, ...]
+    unchanged: tuple[str, ...]
     unused: tuple[str, ...]
 
     def to_text(self) -> str:
-        """One line."""
-        whole = len(self.loaded) + len(self.kept)
-        kept = f"; as they were: {_some(self.kept)}" if self.kept else ""
-        unused = f"; of the file not used: {_some(self.unused)}" if self.unused else ""
-        return f"{len(self.loaded)} of {whole} tensors loaded{kept}{unused}"
+        """Return one line of text."""
+        total = len(self.loaded) + len(self.unchanged)
+        unchanged = f"; as they were: {_names_text(self.unchanged)}" if self.unchanged else ""
+        unused = f"; of the file not used: {_names_text(self.unused)}" if self.unused else ""
+        return f"{len(self.loaded)} of {total} tensors loaded{unchanged}{unused}"
 
 
 def read_weights(path: str | os.PathLike[str]) -> Weights:
-    """The weights in a file: safetensors, or a foreign checkpoint (`.pth`, `.pt`); of a run's folder, the best.
+    """Read the weights in a file: safetensors, or a foreign checkpoint (`.pth`, `.pt`).
 
-    A name of `SHIPPED` that is no file or folder stands for those weights.
+    For a run's folder these are the best weights. A name of `SHIPPED_FILES` that is no file or
+    folder stands for the shipped weights.
 
     Raises:
-        ConfigError: the file is not there, cannot be read, or holds no state dict.
+        ConfigError: The file does not exist, cannot be read, or holds no state dict.
     """
-    path = path_of(path)
-    if not path.exists():
-        path = SHIPPED.get(str(path), path)
-    if path.is_dir():
-        path = next(
-            (path / name for name in (BEST, FINAL, LAST) if (path / name).is_file()), path / BEST
-        )
+    path = _weights_path(path_of(path))
     try:
         content = read_bytes(path, "weights")
     except OSError as error:
         raise ConfigError(
             f"{path}: weights cannot be read ({error.strerror or error}); give a file of weights"
         ) from error
-    if content[8:9] != b"{" and content[:2] in (
-        b"PK",
-        b"\x80\x02",
-    ):  # what torch.save writes, or wrote
-        return Weights(tensors=_foreign(content, path), meta={}, path=path)
+    # torch.save writes zip files, and wrote pickles before.
+    if content[8:9] != b"{" and content[:2] in (b"PK", b"\x80\x02"):
+        return Weights(tensors=_foreign_tensors(content, path), meta={}, path=path)
     try:
         length = int.from_bytes(content[:8], "little")
-        if length > _HEADER:
+        if length > _MAX_HEADER_BYTES:
             raise ValueError(f"its header would have {length:,} bytes")
         header = parsed_record(content[8 : 8 + length], _Header)
-        meta = as_record(parsed_json(header.metadata.get(_META, "{}").encode()), dict[str, Any])
+        meta_text = header.metadata.get(_META_KEY, "{}")
+        meta = as_record(parsed_json(meta_text.encode()), dict[str, Any])
         tensors: dict[str, Tensor] = load(content)
-        for name, each in tensors.items():
-            if str(each.dtype).removeprefix("torch.") not in NUMBER_BYTES:
-                raise ValueError(f"{shortened(name)!r} has numbers of {each.dtype}")
+        for name, tensor in tensors.items():
+            if str(tensor.dtype).removeprefix("torch.") not in NUMBER_BYTES:
+                raise ValueError(f"{shortened(name)!r} has numbers of {tensor.dtype}")
     except _FAULTS as error:
         raise ConfigError(
-            f"{path}: is no file of weights ({reason_of(error)}); give a safetensors file, or a .pth"
+            f"{path}: is no file of weights ({reason_of(error)}); give a safetensors file, or a "
+            ".pth"
         ) from error
     return Weights(tensors=tensors, meta=meta, path=path)
 
 
+def _weights_path(path: Path) -> Path:
+    """Return the path of the file of shipped weights or of a run's folder."""
+    if not path.exists():
+        path = SHIPPED_FILES.get(str(path), path)
+    if not path.is_dir():
+        return path
+    for name in (BEST_FILE, FINAL_FILE, STATE_FILE):
+        if (path / name).is_file():
+            return path / name
+    return path / BEST_FILE
+
+
 def reason_of(error: Exception) -> str:
-    """What an error says, for a message: the first line, and not all of a long one."""
+    """Return the reason in an error for a message: the first line, shortened."""
     return shortened(fault_text(error).splitlines()[0], MOST_TOLD)
 
 
 def write_weights(
     path: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], *, half: bool = False
 ) -> None:
-    """Write weights as safetensors, completely or not at all; the same ones give the same bytes.
+    """Write weights as safetensors, atomically; equal weights give equal bytes.
 
     Args:
-        path: of the file.
-        tensors: by name.
-        meta: what to note with them, as JSON holds it.
-        half: whether floats are rounded to float16.
+        path: Path of the file.
+        tensors: Tensors by name.
+        meta: Notes that are stored with them, as JSON holds them.
+        half: Whether floats are rounded to float16.
     """
-    stored = {
-        name: (each.half() if half and each.is_floating_point() else each)
-        for name, each in tensors.items()
-    }
-    ready = {name: each.detach().cpu().contiguous() for name, each in stored.items()}
-    write_bytes(path, save(ready, metadata={_META: json.dumps(dict(meta), sort_keys=True)}))
+    contiguous = {}
+    for name, tensor in tensors.items():
+        stored = tensor.half() if half and tensor.is_floating_point() else tensor
+        contiguous[name] = stored.detach().cpu().contiguous()
+    meta_text = json.dumps(dict(meta), sort_keys=True)
+    write_bytes(path, save(contiguous, metadata={_META_KEY: meta_text}))
 
 
 def load_weights(model: nn.Module, weights: Weights, *, whole: bool = False) -> Loaded:
-    """Put weights into a model.
+    """Load weights into a model.
 
     Args:
-        model: whose names are compared.
-        weights: from `read_weights`.
-        whole: whether they must have every tensor of the model that training changes.
+        model: The model; its names are compared.
+        weights: Weights from `read_weights`.
+        whole: Whether they must have every tensor of the model that training changes.
 
     Returns:
-        Which tensors were loaded, and which not.
+        The names of the tensors that were loaded, and of the others.
 
     Raises:
-        ConfigError: the file has none of the model's tensors, tensors of other shapes, or lacks some though `whole`.
+        ConfigError: The file has none of the model's tensors, tensors of other shapes, or lacks
+            some although `whole`.
     """
-    own = model.state_dict()
-    given = {name: each for name, each in weights.tensors.items() if not _is_apart(name)}
-    wanted = [name for name in own if not _is_apart(name)]
-    loaded = [name for name in wanted if name in given]
-    missing = [name for name in wanted if name not in given]
-    other = [name for name in loaded if own[name].shape != given[name].shape]
-    unused = sorted(name for name in given if name not in own)
-    if other or not loaded or (whole and missing):
-        raise ConfigError(f"{weights.path}: {_difference(weights, own, other, missing, unused)}")
-    model.load_state_dict({name: given[name].to(own[name].dtype) for name in loaded}, strict=False)
-    return Loaded(loaded=tuple(loaded), kept=tuple(missing), unused=tuple(unused))
+    model_state = model.state_dict()
+    file_state = {
+        name: tensor for name, tensor in weights.tensors.items() if not _is_no_weight(name)
+    }
+    names = [name for name in model_state if not _is_no_weight(name)]
+    loaded = [name for name in names if name in file_state]
+    missing = [name for name in names if name not in file_state]
+    misshapen = [name for name in loaded if model_state[name].shape != file_state[name].shape]
+    unused = sorted(name for name in file_state if name not in model_state)
+    if misshapen or not loaded or (whole and missing):
+        difference = _difference_text(weights, model_state, misshapen, missing, unused)
+        raise ConfigError(f"{weights.path}: {difference}")
+    loaded_state = {name: file_state[name].to(model_state[name].dtype) for name in loaded}
+    model.load_state_dict(loaded_state, strict=False)
+    return Loaded(loaded=tuple(loaded), unchanged=tuple(missing), unused=tuple(unused))
 
 
-def _is_apart(name: str) -> bool:
-    """Whether a tensor is no weight: it follows from the configuration, or is the optimizer's."""
-    return name.endswith(_MADE) or name.startswith(OPTIMIZER)
+def _is_no_weight(name: str) -> bool:
+    """Return whether a tensor follows from the configuration, or belongs to the optimizer."""
+    return name.endswith(_DERIVED_SUFFIXES) or name.startswith(OPTIMIZER_PREFIX)
 
 
-def _difference(
+def _difference_text(
     weights: Weights,
-    own: Mapping[str, Tensor],
-    other: Sequence[str],
+    model_state: Mapping[str, Tensor],
+    misshapen: Sequence[str],
     missing: Sequence[str],
     unused: Sequence[str],
 ) -> str:
-    """What keeps weights from fitting a model, with the remedy."""
-    told = []
-    if other:
-        found = shortened(str(tuple(weights.tensors[other[0]].shape)))
-        shapes = f"{other[0]} is {found}, not {tuple(own[other[0]].shape)}"
-        told.append(f"{len(other)} tensors have another shape ({shapes})")
+    """Return why weights do not fit a model, with the remedy."""
+    reasons = []
+    if misshapen:
+        name = misshapen[0]
+        shape = shortened(str(tuple(weights.tensors[name].shape)))
+        shapes = f"{name} is {shape}, not {tuple(model_state[name].shape)}"
+        reasons.append(f"{len(misshapen)} tensors have another shape ({shapes})")
     if missing:
-        told.append(f"{len(missing)} of the model are missing ({_some(missing)})")
+        reasons.append(f"{len(missing)} of the model are missing ({_names_text(missing)})")
     if unused:
-        told.append(f"{len(unused)} are not the model's ({_some(unused)})")
+        reasons.append(f"{len(unused)} are not the model's ({_names_text(unused)})")
     preset = weights.meta.get("preset")
-    whose = f"weights of the preset {shortened(repr(preset))}" if preset else "weights"
-    return f"{whose} do not fit this model: {', '.join(told)}; give the preset and the options that they were trained with"
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(map(shortened, names[:_TOLD])) + (
-        f", … ({len(names)})" if len(names) > _TOLD else ""
+    subject = f"weights of the preset {shortened(repr(preset))}" if preset else "weights"
+    return (
+        f"{subject} do not fit this model: {', '.join(reasons)}; give the preset and the options "
+        "that they were trained with"
     )
 
 
-def _foreign(content: bytes, path: Path) -> dict[str, Tensor]:
-    """A foreign checkpoint's tensors under our names."""
+def _names_text(names: Sequence[str]) -> str:
+    """Return a few of the names, and their number if there are more."""
+    text = ", ".join(map(shortened, names[:_MAX_LISTED_NAMES]))
+    return f"{text}, … ({len(names)})" if len(names) > _MAX_LISTED_NAMES else text
+
+
+def _foreign_tensors(content: bytes, path: Path) -> dict[str, Tensor]:
+    """Return a foreign checkpoint's tensors under our names; raises ConfigError."""
     try:
-        found, storages = read_checkpoint(content)
+        checkpoint, storages = read_checkpoint(content)
         for name in ("state_dict", "model"):  # mmcv's, Swin's
-            if isinstance(found, dict) and isinstance(found.get(name), dict):
-                found = found[name]
-        pairs = found.items() if isinstance(found, dict) else ()
-        stored = {
-            name: each
-            for name, each in pairs
-            if isinstance(name, str) and isinstance(each, StoredTensor)
-        }
-        if sum(each.size for each in stored.values()) > _FACTOR * len(content) + _ROOM:
+            if isinstance(checkpoint, dict) and isinstance(checkpoint.get(name), dict):
+                checkpoint = checkpoint[name]
+        stored = {}
+        for name, value in checkpoint.items() if isinstance(checkpoint, dict) else ():
+            if isinstance(name, str) and isinstance(value, StoredTensor):
+                stored[name] = value
+        size = sum(tensor.size for tensor in stored.values())
+        if size > _MAX_EXPANSION * len(content) + _MAX_EXTRA_BYTES:
             raise ValueError("its tensors are far larger than the file")
-        named = {
-            name.removeprefix("module."): each for name, each in _made(stored, storages).items()
+        tensors = {
+            name.removeprefix("module."): tensor
+            for name, tensor in _opened(stored, storages).items()
         }
-        if "patch_embed.proj.weight" in named:
-            named = from_official(named)
+        if "patch_embed.proj.weight" in tensors:
+            tensors = from_official(tensors)
     except _FAULTS as error:
         raise ConfigError(
-            f"{path}: is no plain checkpoint ({reason_of(error)}); give one that holds tensors alone"
+            f"{path}: is no plain checkpoint ({reason_of(error)}); give one that holds tensors "
+            "alone"
         ) from error
-    if not named:
+    if not tensors:
         raise ConfigError(f"{path}: holds no tensors by name; give a state dict")
-    if not any("." in name and name.split(".")[0] in _PARTS for name in named):
-        named = {
-            f"img_backbone.{name}": each for name, each in named.items()
-        }  # an image encoder alone
-    return named
+    if any("." in name and name.split(".")[0] in _MODEL_PARTS for name in tensors):
+        return tensors
+    # The file only has an image encoder.
+    return {f"img_backbone.{name}": tensor for name, tensor in tensors.items()}
 
 
-def _made(stored: Mapping[str, StoredTensor], storages: Storages) -> dict[str, Tensor]:
-    """Tensors, of which those of one storage share its memory; raises one of `_FAULTS`."""
-    contents = {
-        name: bytearray(storages(name)) for name in {each.storage for each in stored.values()}
-    }
+def _opened(stored: Mapping[str, StoredTensor], storages: Storages) -> dict[str, Tensor]:
+    """Return the stored tensors; tensors of one storage share its memory.
+
+    Raises one of `_FAULTS`.
+    """
+    storage_names = {tensor.storage for tensor in stored.values()}
+    contents = {name: bytearray(storages(name)) for name in storage_names}
     tensors = {}
-    for name, each in stored.items():
-        content, dtype = contents[each.storage], getattr(torch, each.dtype)
-        whole = torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
-        # which refuses, before anything is made, what reaches beyond the storage
-        tensors[name] = whole.as_strided(each.shape, each.strides, each.offset)
+    for name, tensor in stored.items():
+        content, dtype = contents[tensor.storage], getattr(torch, tensor.dtype)
+        storage = torch.frombuffer(content, dtype=dtype) if content else torch.empty(0, dtype=dtype)
+        # A tensor that reaches beyond the storage is refused before memory is allocated.
+        tensors[name] = storage.as_strided(tensor.shape, tensor.strides, tensor.offset)
     return tensors
-
-
-_PARTS: Final = ("img_backbone", "img_neck", "transformer", "temporal_model", "pts_bbox_head")

@@ -17,15 +17,17 @@ from deepaccident_devkit.cli.options import (
     use_threads_sparingly,
 )
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, verb
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.taxonomy import ModelFusion, ModelPreset
 
-_CHOICE = ("preset", "fusion", "horizon", "focal", "labels")
-_TRAINING = ("steps", "moments", "egos", "split", "validation", "samples", "seed", "bf16")
+_CHOICE_OPTIONS = ("preset", "fusion", "horizon", "focal", "labels")
+_TRAINING_OPTIONS = ("steps", "moments", "egos", "split", "validation", "samples", "seed", "bf16")
 _EXAMPLES = """\b
 Examples:
   deepaccident train DATAROOT --preset tiny --agents all --out runs/all
   deepaccident train DATAROOT --from runs/single --agents all --freeze img_backbone. --out runs/warm
-  torchrun --nproc-per-node 4 -m deepaccident_devkit.cli train DATAROOT --preset released --bf16 --out runs/big"""
+  torchrun --nproc-per-node 4 -m deepaccident_devkit.cli train DATAROOT --preset released --bf16 \
+--out runs/big"""
 
 
 @verb(epilog=_EXAMPLES)
@@ -48,7 +50,8 @@ Examples:
 @advanced(
     "--focal",
     type=float,
-    help="Focal length in pixels of the virtual camera that all images look as if taken by.  [default: their own]",
+    help="Focal length in pixels of the virtual camera that all images look as if taken by.  "
+    "[default: their own]",
 )
 @advanced(
     "--labels",
@@ -109,7 +112,8 @@ Examples:
     "--from",
     "weights",
     type=PATH,
-    help="Run or file of weights to begin from, `tiny`, `tiny_lidar`, or a checkpoint of the release, BEVerse or Swin.",
+    help="Run or file of weights to begin from, `tiny`, `tiny_lidar`, or a checkpoint of the "
+    "release, BEVerse or Swin.",
 )
 @click.option(
     "--also", type=PATH, metavar="DATAROOT", help="Another release, or nuScenes, to learn from too."
@@ -144,27 +148,29 @@ def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -
     from deepaccident_devkit.plugins.model import ModelChoice, SecondSource, TrainConfig
     from deepaccident_devkit.plugins.model import train as train_model
 
-    validation = options["validation"]
+    training_options = {name: options[name] for name in _TRAINING_OPTIONS}
+    if training_options["validation"] == "none":
+        training_options["validation"] = None
     config = TrainConfig(
         agents=names_or_configuration(options["agents"]) or "all",
         learning_rate=options["learning_rate"],
         freeze=options["freeze"],
-        **{
-            **{name: options[name] for name in _TRAINING},
-            "validation": None if validation == "none" else validation,
-        },
+        **training_options,
     )
-    choice = ModelChoice(**{name: options[name] for name in _CHOICE})
+    choice = ModelChoice(**{name: options[name] for name in _CHOICE_OPTIONS})
     dataset = open_release(**release_of(options))
-    second = (
-        None if also is None else SecondSource(dataset=open_release(also, version="v1"), mix=mix)
-    )
-    for source in (dataset, *([] if second is None else [second.dataset])):
+    sources: list[Dataset] = [dataset]
+    second_source = None
+    if also is not None:
+        second_source = SecondSource(dataset=open_release(also, version="v1"), mix=mix)
+        sources.append(second_source.dataset)
+    for source in sources:
         if source.layout == "nuScenes":
-            from deepaccident_devkit.plugins.nuscenes.check import check_source  # opened it
+            # The plug-in opened the source, so it is installed.
+            from deepaccident_devkit.plugins.nuscenes.check import check_source
 
             check_source(source)
-    best = train_model(
+    weights_path = train_model(
         dataset,
         options["out"],
         choice,
@@ -173,11 +179,12 @@ def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -
         device=options["device"],
         workers=options["workers"] or 0,
         images_cache=options["images_cache"],
-        also=second,
+        also=second_source,
         say=click.echo,
     )
-    click.echo(f"weights: {best}")
+    click.echo(f"weights: {weights_path}")
     click.echo(
-        f"next: deepaccident predict {options['out']} {options['dataroot']} --split val --out results\n"
+        f"next: deepaccident predict {options['out']} {options['dataroot']} --split val --out "
+        "results\n"
         "Numbers on the split that chose the weights (--validation, by default val) flatter them."
     )

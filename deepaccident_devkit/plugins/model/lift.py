@@ -1,7 +1,8 @@
-"""`LiftSplat`: image features → a map seen from above, by a distribution over depths (Philion and Fidler, ECCV 2020).
+"""`LiftSplat`: image features → a map seen from above, by a distribution over depths.
 
-Each pixel of a feature map stands for a ray. The points of the ray at fixed depths receive its features, weighed by the
-probability of the depth, and each cell of the map is the sum or the mean of the points in it.
+Philion and Fidler, ECCV 2020. Each pixel of a feature map represents a ray. The points of the ray
+at fixed depths receive its features, weighted by the probability of the depth, and each cell of the
+map is the sum or the mean of its points.
 """
 
 from __future__ import annotations
@@ -22,12 +23,14 @@ from deepaccident_devkit.taxonomy import POLE_HEIGHT
 Frustum = Literal["corners", "centres"]
 Rounding = Literal["trunc", "floor"]
 Pooling = Literal["sum", "mean"]
-# Metres above its origin from which a camera is a vehicle's: those of the release are some 1.6 m above, or at 0.
-_LEAST_CAMERA: Final = 1.0
-# What is added to a cell's sum of probabilities, so that one that hardly any point reaches stays near 0.
-_LEAST_MASS: Final = 0.01
-# Share of a step by which a range may miss a whole number of steps, as in `geometry.BevGrid`.
-_WHOLE = 1e-6
+# Height above its origin from which on a camera belongs to a vehicle: the release's cameras are
+# about 1.6 m above the origin, or at it.
+_MIN_VEHICLE_CAMERA_HEIGHT_M: Final = 1.0
+# Added to a cell's sum of probabilities, so that a cell that hardly any point reaches stays near 0.
+_MASS_OFFSET: Final = 0.01
+# Share of a step by which a range may deviate from an integer number of steps, as in
+# `geometry.BevGrid`.
+_STEP_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,33 +38,39 @@ class LiftConfig:
     """Sizes and rules of the lift. Ranges are metres (start, end, step) in the ego frame.
 
     Attributes:
-        in_channels: of the image features.
-        channels: of the map.
-        depth: the depths along the optical axis; the end is not among them.
-        x: columns of the map, ascending.
-        y: rows of the map, ascending.
-        z: height of the points that count: one step.
-        image_size: height and width of the images, pixels.
-        stride: pixels of the image a step of the features.
-        frustum: where a feature's ray passes through the image: `centres` of its cells; `corners` spreads the rays from
-            the first to the last pixel, the release's rule.
-        voxel_rounding: `floor`, or the release's `trunc`: rounding to zero, by which points up to a step below a range
-            fall into its first cell.
-        band: heights above the road of the points that count, so that depths need not be learned from nothing; None for
-            all in `z`, as in the release. The road is at the height of the origin, or 4 m below it for cameras that are
-            not above the origin: a pole's (docs/format.md).
-        pooling: of the points in a cell: their `sum`, the release's rule, or their `mean` by their probabilities, which
-            does not grow with the number of pixels that see a cell.
+        in_channels: Channels of the image features.
+        channels: Channels of the map.
+        depth: Depths along the optical axis, without the end.
+        x: Columns of the map, ascending.
+        y: Rows of the map, ascending.
+        z: Height of the points that count: one step.
+        image_size: Height and width of the images, pixels.
+        stride: Pixels of the image per cell of the features.
+        frustum: Where a feature's ray passes through the image: `centres` of its cells; `corners`
+            spreads the rays from the first to the last pixel, the release's rule.
+        voxel_rounding: `floor`, or the release's `trunc`: rounding to zero, with which points up to
+            a step below a range fall into its first cell.
+        band: Heights above the road of the points that count, so that depths need not be learned
+            from scratch; None for all heights in `z`, as in the release. The road is at the height
+            of the origin, or 4 m below it for cameras that are not above the origin, but on a pole
+            (docs/format.md).
+        pooling: Pooling of the points in a cell: their `sum`, the release's rule, or their `mean`
+            weighted by their probabilities, which does not grow with the number of pixels that see
+            a cell.
     """
 
+    # Channels.
     in_channels: int
     channels: int
+    # Ranges.
     depth: Axis
     x: Axis
     y: Axis
     z: Axis
+    # Images.
     image_size: tuple[int, int]
     stride: int
+    # Rules.
     frustum: Frustum = "centres"
     voxel_rounding: Rounding = "floor"
     band: tuple[float, float] | None = None
@@ -69,13 +78,17 @@ class LiftConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges and words; raises ConfigError, or ChoiceError for an unknown word."""
-        words = {"frustum": Frustum, "voxel_rounding": Rounding, "pooling": Pooling}
-        settle_choices(self, {name: get_args(each) for name, each in words.items()})
+        words = {
+            "frustum": get_args(Frustum),
+            "voxel_rounding": get_args(Rounding),
+            "pooling": get_args(Pooling),
+        }
+        settle_choices(self, words)
         grid = BevGrid(x=self.x, y=self.y)
         object.__setattr__(self, "x", grid.x)
         object.__setattr__(self, "y", grid.y)
-        _steps("depth", self.depth)
-        if _steps("z", self.z) != 1:
+        _step_count("depth", self.depth)
+        if _step_count("z", self.z) != 1:
             raise ConfigError(
                 f"z: expected one step, as in ({self.z[0]}, {self.z[1]}, {self.z[1] - self.z[0]})"
             )
@@ -83,8 +96,8 @@ class LiftConfig:
             raise ConfigError(f"band: expected a lower and a higher end, found {self.band}")
         if any(size < self.stride or size % self.stride for size in self.image_size):
             raise ConfigError(
-                f"image_size: expected height and width in multiples of the stride {self.stride}, found "
-                f"{self.image_size}; resize, crop or fill the images"
+                "image_size: expected height and width in multiples of the stride "
+                f"{self.stride}, found {self.image_size}; resize, crop or fill the images"
             )
 
     @property
@@ -96,17 +109,18 @@ class LiftConfig:
     def frustum_shape(self) -> tuple[int, int, int]:
         """Depths of a ray, rows and columns of the features."""
         height, width = self.image_size
-        return _steps("depth", self.depth), height // self.stride, width // self.stride
+        return _step_count("depth", self.depth), height // self.stride, width // self.stride
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraGeometry:
-    """The cameras of B samples, P frames, N cameras: from the pixels that the network sees to the ego frame.
+    """The cameras of B samples, P frames, N cameras: from the network's pixels to the ego frame.
 
     Attributes:
-        rotation: (B, P, N, 3, 3) of `ego_from_camera`; camera axes are x right, y down, z forward.
-        translation: (B, P, N, 3) of `ego_from_camera`, metres.
-        intrinsics: (B, P, N, 3, 3) K, pixels.
+        rotation: Rotation of `ego_from_camera`, shape (B, P, N, 3, 3); camera axes are x right, y
+            down, z forward.
+        translation: Translation of `ego_from_camera` in metres, shape (B, P, N, 3).
+        intrinsics: Camera matrices K in pixels, shape (B, P, N, 3, 3).
     """
 
     rotation: Tensor
@@ -114,16 +128,16 @@ class CameraGeometry:
     intrinsics: Tensor
 
     def flattened(self) -> CameraGeometry:
-        """The cameras of (B, A, P, N, …) tensors, with A agents, as those of B · A samples."""
-        return CameraGeometry(
-            **{each.name: getattr(self, each.name).flatten(0, 1) for each in fields(self)}
-        )
+        """Return the cameras of (B, A, P, N, …) tensors, with A agents, as of B · A samples."""
+        tensors = {field.name: getattr(self, field.name).flatten(0, 1) for field in fields(self)}
+        return CameraGeometry(**tensors)
 
 
 class LiftSplat(nn.Module):
-    """Lifts features of all cameras into one map (the released TransformerLSS); a state dict has the released names.
+    """Lifts features of all cameras into one map (the released TransformerLSS).
 
-    `frustum`, (D, h', w', 3) pixels u, v of the image and depth in metres, is part of the state dict as in the release.
+    A state dict has the released names. `frustum`, pixels u, v of the image and depth in metres,
+    shape (D, h', w', 3), is part of the state dict as in the release.
     """
 
     frustum: Tensor
@@ -135,16 +149,16 @@ class LiftSplat(nn.Module):
         self.register_buffer("frustum", _frustum(config))
 
     def forward(self, features: Tensor, cameras: CameraGeometry) -> Tensor:
-        """Features (B, P, N, C, h', w') → one map of each frame, (B, P, `channels`, Y, X); float32 under autocast too.
+        """Lift features (B, P, N, C, h', w') to one map a frame, (B, P, `channels`, Y, X).
 
-        Row = y ascending, column = x ascending. Raises GeometryError: features or cells do not have the configured
-        shape.
+        The map is float32, under autocast too. Rows are ordered by ascending y, columns by
+        ascending x. Raises GeometryError if features or cells do not have the configured shape.
         """
         depths, rows, columns = self.config.frustum_shape
         if tuple(features.shape[-2:]) != (rows, columns):
             raise GeometryError(
-                f"features: expected (…, {rows}, {columns}) of images of {self.config.image_size} pixels, found "
-                f"{tuple(features.shape)}"
+                f"features: expected (…, {rows}, {columns}) of images of {self.config.image_size} "
+                f"pixels, found {tuple(features.shape)}"
             )
         cells = self.cells(cameras)
         expected = (*features.shape[:3], depths, rows, columns)
@@ -152,35 +166,37 @@ class LiftSplat(nn.Module):
             raise GeometryError(
                 f"cameras: expected cells {expected} for these features, found {tuple(cells.shape)}"
             )
-        # sums of thousands of points need more than half precision
+        # Sums of thousands of points need more than half precision.
         logits = precise(self.depthnet(features.flatten(0, 2)))
         return self._splat(logits[:, :depths].softmax(1), logits[:, depths:], cells)
 
     @torch.no_grad()
     def cells(self, cameras: CameraGeometry) -> Tensor:
-        """The cell of each frustum point, (B, P, N, D, h', w') int64: row · X + column, −1 if it does not count."""
+        """Return the cell of each frustum point, (B, P, N, D, h', w') int64.
+
+        A cell is row · X + column; −1 if the point does not count.
+        """
         config = self.config
         points = self.points(cameras)
         axes = (config.x, config.y, config.z)
         step = points.new_tensor([size for _, _, size in axes])
-        # in this order rounding lets points on a border fall where the release has them
+        # In this order, rounding puts points on a border into the same cells as the release does.
         lower = points.new_tensor([low + size / 2 for low, _, size in axes]) - step / 2
         steps = (points - lower) / step
         steps = steps.trunc() if config.voxel_rounding == "trunc" else steps.floor()
         rows, columns = config.grid_shape
-        inside = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
+        is_counted = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
         if config.band is not None:
-            road = torch.where(cameras.translation[..., 2] > _LEAST_CAMERA, 0.0, -POLE_HEIGHT)[
-                ..., None, None, None
-            ]
-            above = points[..., 2] - road
-            inside &= (above >= config.band[0]) & (above < config.band[1])
-        column, row, _ = torch.where(inside[..., None], steps, 0).long().unbind(-1)
-        return torch.where(inside, row * columns + column, -1)
+            is_vehicle = cameras.translation[..., 2] > _MIN_VEHICLE_CAMERA_HEIGHT_M
+            road = torch.where(is_vehicle, 0.0, -POLE_HEIGHT)[..., None, None, None]
+            height = points[..., 2] - road
+            is_counted &= (height >= config.band[0]) & (height < config.band[1])
+        column, row, _ = torch.where(is_counted[..., None], steps, 0).long().unbind(-1)
+        return torch.where(is_counted, row * columns + column, -1)
 
     @torch.no_grad()
     def points(self, cameras: CameraGeometry) -> Tensor:
-        """The frustum's points (B, P, N, D, h', w', 3) in the ego frame, metres."""
+        """Return the frustum's points in the ego frame in metres, (B, P, N, D, h', w', 3)."""
         dtype = torch.promote_types(cameras.rotation.dtype, torch.float32)
         with torch.autocast(self.frustum.device.type, enabled=False):
             rotation, shift = cameras.rotation.to(dtype), cameras.translation.to(dtype)
@@ -191,30 +207,31 @@ class LiftSplat(nn.Module):
         return points.unflatten(-2, self.config.frustum_shape)
 
     def _splat(self, depth: Tensor, context: Tensor, cells: Tensor) -> Tensor:
-        """Sum (M, D, h', w') · (M, C, h', w') of M = B · P · N cameras over the cells."""
+        """Pool (M, D, h', w') · (M, C, h', w') of M = B · P · N cameras in the cells."""
         samples, frames = cells.shape[:2]
         rows, columns = self.config.grid_shape
-        of_camera = cells.shape[3:].numel()
-        of_pixel = cells.shape[4:].numel()
-        # the product is made for points that count only: most of the memory of this model is here
-        flat = cells.flatten()
-        point = (flat >= 0).nonzero().squeeze(1)
-        pixel = point.div(of_camera, rounding_mode="floor") * of_pixel + point % of_pixel
-        frame = point.div(of_camera * cells.shape[2], rounding_mode="floor")
-        chances = depth.flatten().index_select(0, point)[:, None]
-        features = context.flatten(2).transpose(1, 2).flatten(0, 1).index_select(0, pixel) * chances
-        cell = flat[point] + frame * (rows * columns)
+        camera_points = cells.shape[3:].numel()
+        camera_pixels = cells.shape[4:].numel()
+        # The product is only computed for points that count: it takes most of this model's memory.
+        flat_cells = cells.flatten()
+        point = (flat_cells >= 0).nonzero().squeeze(1)
+        pixel = point.div(camera_points, rounding_mode="floor") * camera_pixels
+        pixel += point % camera_pixels
+        frame = point.div(camera_points * cells.shape[2], rounding_mode="floor")
+        probabilities = depth.flatten().index_select(0, point)[:, None]
+        features = context.flatten(2).transpose(1, 2).flatten(0, 1).index_select(0, pixel)
+        features = features * probabilities
+        cell = flat_cells[point] + frame * (rows * columns)
         maps = features.new_zeros(samples * frames * rows * columns, context.shape[1])
         maps = maps.index_add_(0, cell, features)
         if self.config.pooling == "mean":
-            maps = maps / (
-                chances.new_zeros(len(maps), 1).index_add_(0, cell, chances) + _LEAST_MASS
-            )
+            mass = probabilities.new_zeros(len(maps), 1).index_add_(0, cell, probabilities)
+            maps = maps / (mass + _MASS_OFFSET)
         return maps.view(samples, frames, rows, columns, -1).permute(0, 1, 4, 2, 3).contiguous()
 
 
 def _frustum(config: LiftConfig) -> Tensor:
-    """(D, h', w', 3): u, v in pixels of the image, depth in metres."""
+    """Return u, v in pixels of the image and depth in metres, (D, h', w', 3)."""
     height, width = config.image_size
     depths, rows, columns = config.frustum_shape
     if config.frustum == "corners":
@@ -226,12 +243,13 @@ def _frustum(config: LiftConfig) -> Tensor:
     return torch.stack(torch.meshgrid(depth, v, u, indexing="ij")[::-1], -1)
 
 
-def _steps(name: str, axis: Axis) -> int:
-    """Steps of a range; raises ConfigError if they are not a whole number from 1."""
+def _step_count(name: str, axis: Axis) -> int:
+    """Return the number of steps of a range; raises ConfigError if it is no positive integer."""
     start, end, step = axis
     count = (end - start) / step if step > 0 else 0.0
-    if round(count) < 1 or abs(count - round(count)) > _WHOLE:
+    if round(count) < 1 or abs(count - round(count)) > _STEP_TOLERANCE:
         raise ConfigError(
-            f"{name}: expected start, end and step with a whole number of steps between, found {axis}"
+            f"{name}: expected start, end and step with a whole number of steps between, found "
+            f"{axis}"
         )
     return round(count)

@@ -1,4 +1,7 @@
-"""Batches that worker processes read; a worker that fails ends the run with an error instead of leaving it waiting."""
+"""Batches that worker processes read.
+
+A worker that fails ends the run with an error; otherwise the run would wait forever.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +18,18 @@ from torch.utils.data import DataLoader
 from deepaccident_devkit.errors import DeepAccidentError, WorkerError, shortened
 from deepaccident_devkit.support.parallel import FEWER_WORKERS, starting_workers
 
-# What torch says in this process if a worker failed, or if what it sent cannot be opened here.
-_WORKERS_FAULT: Final = re.compile(r"DataLoader worker|</torch_|ancdata")
+# Torch's messages in this process if a worker failed, or if its data cannot be opened here.
+_WORKER_FAULTS: Final = re.compile(r"DataLoader worker|</torch_|ancdata")
 
 
 def read_batches(
     data: Any, collate: Callable[..., Any], workers: int, **options: Any
 ) -> Iterator[dict[str, Any]]:
-    """Start to read batches by worker processes, or by this one (0).
+    """Start to read batches by worker processes, or by this one (0 workers).
 
     Args:
         data: A map-style dataset of torch.
-        collate: Makes a batch of items.
+        collate: Function that makes a batch of items.
         workers: Number of processes that read.
         **options: Further options of `DataLoader`.
 
@@ -49,14 +52,15 @@ def read_batches(
 
 @contextmanager
 def worker_faults_named() -> Iterator[None]:
-    """Raise WorkerError where a worker of `read_batches` was killed or failed otherwise; the devkit's errors pass.
+    """Raise WorkerError if a worker of `read_batches` is killed or fails otherwise.
 
-    Torch may raise such an error at any time while the workers run, so the block is all that uses the batches.
+    The devkit's own errors pass. Torch may raise such an error at any time while the workers run,
+    so the block must contain everything that uses the batches.
     """
     try:
         yield
     except Exception as error:
-        if isinstance(error, DeepAccidentError) or not _WORKERS_FAULT.search(str(error)):
+        if isinstance(error, DeepAccidentError) or not _WORKER_FAULTS.search(str(error)):
             raise
         *_, cause = str(error).strip().splitlines()
         raise WorkerError(
@@ -65,7 +69,10 @@ def worker_faults_named() -> Iterator[None]:
 
 
 def _send_faults(_: int) -> None:
-    """Let this worker send the reason if it cannot send a batch: otherwise it prints that, and its reader waits."""
+    """Let this worker send the reason if it cannot send a batch.
+
+    Otherwise it would print the reason, and the reading process would wait.
+    """
     Queue._on_queue_feeder_error = _send_reason  # type: ignore[attr-defined] # noqa: SLF001 - multiprocessing's own hook
 
 

@@ -1,11 +1,11 @@
-"""`ModelConfig`, all that a model is made of, and `V2XFormer`: what all agents see → the ego's future maps, boxes.
+"""`ModelConfig`, the configuration of a model, and `V2XFormer`: sensors → the ego's maps and boxes.
 
 | step | from → to | where |
 |---|---|---|
 | the devkit's batch | tensors in the model's frame | `inputs` |
 | images | features of each image | `images` |
 | lift | features → a map from above, each frame of each agent | `lift` |
-| pillars | LiDAR points → the same, where a model has both joined with it | `pillars` |
+| pillars | LiDAR points → the same; a model with both joins them | `pillars` |
 | time | P frames → one map of each agent | `temporal` |
 | placement | agents' maps → the ego's frame | `warps` |
 | fusion | agents' maps → one | `fusion` |
@@ -59,16 +59,19 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.training.torch import V2XConfig
 from deepaccident_devkit.v2x import Agents, Link
 
+# Keys of encoders and decoders; the first two are the release's.
+_DETECTION, _MOTION, _SHARED = "3dod", "motion", "shared"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """How a model sees with cameras.
+    """A model's processing of cameras.
 
     Attributes:
-        images: how images are prepared; uint8.
-        rows: of the images, once they are filled with black at the bottom; None for as they are.
-        encoder: of images.
-        lift: from image features to a map seen from above.
+        images: Preparation of images; uint8.
+        rows: Rows of the images after filling them with black at the bottom; None for no filling.
+        encoder: Encoder of images.
+        lift: Lift from image features to a map seen from above.
     """
 
     images: ImageConfig
@@ -82,142 +85,129 @@ class ModelConfig:
     """A V2XFormer; quirks of the release are fields of its parts.
 
     Attributes:
-        cameras: how it sees with cameras; None for not at all.
-        pillars: how it sees with LiDARs; None for not at all. The maps of both are joined.
-        temporal: joins an agent's own frames.
-        fusion: joins the agents.
-        bev: the encoders before the heads.
-        one_bev: whether both heads share one encoder, of the whole map; the release has one each.
-        motion: the motion head.
-        detection: the detection head.
-        labels: the motion labels that it learns; their grid is the motion grid.
-        handedness: of the model's frame, `left` in the release (`inputs`).
-        motion_loss: weights of the motion losses.
-        detection_loss: of the detection losses.
-        targets: how detection targets are made.
-        decoding: from detection maps to boxes.
+        cameras: Processing of cameras; None without cameras.
+        pillars: Processing of LiDARs; None without LiDARs. The maps of both are joined.
+        temporal: Join of an agent's own frames.
+        fusion: Join of the agents.
+        bev: Encoders before the heads.
+        one_bev: Whether both heads share one encoder of the complete map; the release has one each.
+        motion: The motion head.
+        detection: The detection head.
+        labels: Motion labels that it learns; their grid is the motion grid.
+        handedness: Handedness of the model's frame, `left` in the release (`inputs`).
+        motion_loss: Weights of the motion losses.
+        detection_loss: Weights of the detection losses.
+        targets: Rules for detection targets.
+        decoding: Rules for reading boxes from detection maps.
     """
 
+    # Sensors.
     cameras: CameraConfig | None = None
     pillars: PillarConfig | None = None
+    # Joins of frames and agents.
     temporal: TemporalConfig
     fusion: FusionConfig
+    # Encoders and heads.
     bev: BevEncodeConfig | BevUNetConfig
     one_bev: bool = False
     motion: MotionHeadConfig
     detection: DetectionConfig
+    # Frame and labels.
     labels: MotionLabelConfig
     handedness: Handedness = "right"
+    # Training and decoding.
     motion_loss: MotionLossConfig = field(default_factory=MotionLossConfig)
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
     decoding: DecodingConfig = field(default_factory=DecodingConfig)
 
     def __post_init__(self) -> None:
-        """Check what parts have to have in common; raises ConfigError."""
-        cameras, pillars, channels = self.cameras, self.pillars, self.temporal.channels
+        """Check that the parts fit together; raises ConfigError."""
+        cameras, pillars = self.cameras, self.pillars
         if cameras is None and pillars is None:
             raise ConfigError(
                 "cameras, pillars: expected one of them or both; without, a model sees nothing"
             )
+        channels = self.temporal.channels
+        bev_channels = self.bev.out_channels
+        future_frames = self.labels.future_frames
+        frames = self.labels.receptive_field
+        # Name, value, name of the value that it must equal, and this value.
         pairs: list[tuple[str, Any, str, Any]] = [
             ("bev.in_channels", self.bev.in_channels, "temporal.channels", channels),
-            (
-                "motion.in_channels",
-                self.motion.in_channels,
-                "bev.out_channels",
-                self.bev.out_channels,
-            ),
-            (
-                "detection.in_channels",
-                self.detection.in_channels,
-                "bev.out_channels",
-                self.bev.out_channels,
-            ),
+            ("motion.in_channels", self.motion.in_channels, "bev.out_channels", bev_channels),
+            ("detection.in_channels", self.detection.in_channels, "bev.out_channels", bev_channels),
             (
                 "motion.future_frames",
                 self.motion.future_frames,
                 "labels.future_frames",
-                self.labels.future_frames,
+                future_frames,
             ),
-            (
-                "temporal.frames",
-                self.temporal.frames,
-                "labels.receptive_field",
-                self.labels.receptive_field,
-            ),
+            ("temporal.frames", self.temporal.frames, "labels.receptive_field", frames),
         ]
         if cameras is not None:
+            dtype = cameras.images.dtype
             pairs += [
-                (
-                    "images.dtype",
-                    cameras.images.dtype,
-                    "uint8, which the model scales itself",
-                    "uint8",
-                ),
+                ("images.dtype", dtype, "uint8, which the model scales itself", "uint8"),
                 ("lift.channels", cameras.lift.channels, "temporal.channels", channels),
             ]
         if self.one_bev:
-            pairs.append(
-                (
-                    "temporal.grid",
-                    _extent(self.temporal.grid),
-                    "the extent of labels.grid",
-                    _extent(self.labels.grid),
-                )
-            )
+            extent, labels_extent = _extent(self.temporal.grid), _extent(self.labels.grid)
+            pairs.append(("temporal.grid", extent, "the extent of labels.grid", labels_extent))
         if pillars is not None:
             pairs += [
                 ("pillars.channels", pillars.channels, "temporal.channels", channels),
                 ("pillars.grid", pillars.grid, "temporal.grid", self.temporal.grid),
             ]
-        for name, found, other, expected in pairs:
-            if found != expected:
-                raise ConfigError(f"{name}: expected {expected!r}, as {other}, found {found!r}")
+        for name, value, expected_name, expected in pairs:
+            if value != expected:
+                raise ConfigError(
+                    f"{name}: expected {expected!r}, as {expected_name}, found {value!r}"
+                )
 
     @property
     def grid(self) -> BevGrid:
-        """The cells of the maps that are fused."""
+        """The cells of the fused maps."""
         return self.temporal.grid
 
     @property
     def horizon(self) -> float:
-        """Seconds that motion is predicted."""
+        """Seconds of motion that are predicted."""
         return self.labels.future_frames * self.labels.step * FRAME_PERIOD
 
     @property
     def labels_protocol(self) -> str | None:
-        """The name of the labels' protocol, for results and evaluators; None for one of one's own."""
+        """The name of the labels' protocol, for results and evaluators; None for a custom one."""
         return self.labels.protocol if isinstance(self.labels.protocol, str) else None
 
     def inputs(self, agents: Agents, *, link: Link | None = None, **changes: Any) -> V2XConfig:
-        """What an item of a dataset needs for the model's inputs alone.
+        """Return the config of a dataset with the model's inputs and nothing else.
 
         Args:
-            agents: who cooperates.
-            link: what happens to the partners' data.
-            changes: other fields of `V2XConfig`, such as those of targets.
+            agents: The cooperating agents.
+            link: Degradation of the partners' data.
+            **changes: Other fields of `V2XConfig`, such as fields of targets.
         """
-        seen = {
+        options: dict[str, Any] = {
             "images": None if self.cameras is None else self.cameras.images,
             "points": self.pillars is not None,
+            "boxes": None,
+            "on_missing": "skip",
+            **changes,
         }
-        given: dict[str, Any] = {**seen, "boxes": None, "on_missing": "skip", **changes}
         past, step = self.labels.receptive_field, self.labels.step
-        return V2XConfig(agents=agents, link=link, past=past, step=step, **given)
+        return V2XConfig(agents=agents, link=link, past=past, step=step, **options)
 
 
 _Input = TypeVar("_Input")
-# Keys of encoders and decoders; the first two are the release's.
-_DETECTION, _MOTION, _BOTH = "3dod", "motion", "shared"
 
 
 class ModelPredictions(NamedTuple):
-    """What the model says for G egos.
+    """The outputs of the model for G egos.
 
     Attributes:
-        motion: maps of the present and the future frames, and the latent's distributions.
-        detection: maps of each detection task.
+        motion: Maps of the present and the future frames, and the latent's distributions.
+        detection: Maps of each detection task.
     """
 
     motion: MotionOutputs
@@ -228,8 +218,8 @@ class V2XFormer(nn.Module):
     """The model that a configuration describes; its state dict has the release's names.
 
     Attributes:
-        config: what it was made of.
-        notes: what is known of its weights (`checkpoint.Weights.meta`).
+        config: The configuration.
+        notes: Notes on its weights (`checkpoint.Weights.meta`).
     """
 
     notes: Mapping[str, Any]
@@ -260,64 +250,70 @@ class V2XFormer(nn.Module):
         """Predict for each ego.
 
         Args:
-            inputs: of B moments with A agents, G egos.
-            targets: the egos' labels, for the posterior of a training step; None for a prediction.
-            noise: of the latents (`motion.MotionHead`); drawn if None.
-            generator: draws it.
+            inputs: Inputs of B moments with A agents, G egos.
+            targets: The egos' labels, for the posterior of a training step; None for a prediction.
+            noise: Noise of the latents (`motion.MotionHead`); drawn if None.
+            generator: Generator of the noise.
         """
-        return self.pts_bbox_head(
-            self.fused(self.encoded(inputs), inputs), targets, noise=noise, generator=generator
-        )
+        maps = self.fused(self.encoded(inputs), inputs)
+        return self.pts_bbox_head(maps, targets, noise=noise, generator=generator)
 
     def encoded(self, inputs: ModelInputs) -> Tensor:
-        """Each agent's own map (B, A, C, H, W) of the present, in its own frame: what it would send."""
+        """Return each agent's own map of the present, which it would send, (B, A, C, H, W).
+
+        It is in the agent's own frame.
+        """
         agents = inputs.frame_valid.shape[:2]
         maps = self.temporal_model(
-            self._seen(inputs),
+            self._frame_maps(inputs),
             inputs.egomotion.flatten(0, 1),
             inputs.frame_valid.flatten(0, 1),
             inputs.bev_transform.repeat_interleave(agents[1], 0),
         )
         return maps.unflatten(0, agents)
 
-    def _seen(self, inputs: ModelInputs) -> Tensor:
-        """The maps (B · A, P, C, H, W) of all frames, each in its own; raises ConfigError if inputs lack something."""
+    def _frame_maps(self, inputs: ModelInputs) -> Tensor:
+        """Return the maps of all frames, each in its own frame, (B · A, P, C, H, W).
+
+        Raises ConfigError if inputs are missing.
+        """
         samples, frames = inputs.frame_valid.flatten(0, 1).shape
-        seen: list[Tensor] = []
-        if (cameras := self.config.cameras) is not None:
-            images = _given("images", inputs.images).flatten(0, 3)
+        maps: list[Tensor] = []
+        cameras = self.config.cameras
+        if cameras is not None:
+            images = _required("images", inputs.images).flatten(0, 3)
             if not images.is_floating_point():
                 images = normalised(images)
             if cameras.rows is not None:
                 images = functional.pad(images, (0, 0, 0, cameras.rows - images.shape[-2]))
             features = self.img_neck(self.img_backbone(images)).unflatten(0, (samples, frames, -1))
-            seen.append(self.transformer(features, _given("images", inputs.cameras).flattened()))
+            geometry = _required("images", inputs.cameras).flattened()
+            maps.append(self.transformer(features, geometry))
         if self.config.pillars is not None:
-            points, frame = _given("points", inputs.points), _given("points", inputs.point_frames)
-            seen.append(
-                self.pillars(points, frame, samples * frames).unflatten(0, (samples, frames))
-            )
-        if len(seen) == 1:
-            return seen[0]
-        return self.join(torch.cat(seen, 2).flatten(0, 1)).unflatten(0, (samples, frames))
+            points = _required("points", inputs.points)
+            point_frames = _required("points", inputs.point_frames)
+            point_maps = self.pillars(points, point_frames, samples * frames)
+            maps.append(point_maps.unflatten(0, (samples, frames)))
+        if len(maps) == 1:
+            return maps[0]
+        return self.join(torch.cat(maps, 2).flatten(0, 1)).unflatten(0, (samples, frames))
 
     def fused(self, maps: Tensor, inputs: ModelInputs) -> Tensor:
-        """One map (G, C, H, W) of each ego, in its own frame.
+        """Return one map of each ego, in its own frame, (G, C, H, W).
 
         Args:
-            maps: (B, A, C, H, W) of `encoded`.
-            inputs: who hears whom, and from where.
+            maps: Maps of `encoded`, shape (B, A, C, H, W).
+            inputs: The same inputs, which have the egos' partners and poses.
         """
         moment, agent = inputs.ego_rows.unbind(1)
         order = _ego_first(inputs.partners, agent)
         rows, egos = moment[:, None], torch.arange(len(order), device=order.device)[:, None]
         heard, ego_from_agent = inputs.partners[egos, order], inputs.ego_from_agent[egos, order]
         grid, warp = self.config.temporal.grid, self.config.temporal.warp
-        mask = (
-            agents_mask(heard, ego_from_agent, grid, warp=warp)
-            if self.v2x_fusion.hides_outside
-            else heard[:, :, None, None].expand(*heard.shape, *maps.shape[-2:])
-        )
+        if self.v2x_fusion.hides_outside:
+            mask = agents_mask(heard, ego_from_agent, grid, warp=warp)
+        else:
+            mask = heard[:, :, None, None].expand(*heard.shape, *maps.shape[-2:])
         return self.v2x_fusion(
             features_to_ego(maps[rows, order], ego_from_agent, grid, warp=warp),
             mask,
@@ -326,7 +322,10 @@ class V2XFormer(nn.Module):
         )
 
     def noise(self, egos: int, generator: torch.Generator) -> Tensor:
-        """What the draws of a prediction need, (draws, egos, latent, rows, columns), on the generator's device."""
+        """Draw the noise of a prediction, (draws, egos, latent, rows, columns).
+
+        It is on the generator's device.
+        """
         motion = self.config.motion
         cells = [-(-size // motion.upsample // 4) for size in self.config.labels.grid.shape]
         return torch.randn(
@@ -345,7 +344,7 @@ class TaskHeads(nn.Module):
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         kind = BevEncode if isinstance(config.bev, BevEncodeConfig) else BevUNet
-        names = (_BOTH,) if config.one_bev else (_DETECTION, _MOTION)
+        names = (_SHARED,) if config.one_bev else (_DETECTION, _MOTION)
         self.config = config
         self.taskfeat_encoders = nn.ModuleDict({name: kind(config.bev) for name in names})  # type: ignore[arg-type]
         self.task_decoders = nn.ModuleDict(
@@ -360,7 +359,7 @@ class TaskHeads(nn.Module):
         noise: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> ModelPredictions:
-        """The predictions from fused maps (G, C, H, W); the other arguments are those of `V2XFormer.forward`."""
+        """Predict from fused maps (G, C, H, W); other arguments as in `V2XFormer.forward`."""
         detection, motion = self._features(fused)
         return ModelPredictions(
             motion=self.task_decoders[_MOTION](motion, targets, noise=noise, generator=generator),
@@ -368,34 +367,38 @@ class TaskHeads(nn.Module):
         )
 
     def _features(self, fused: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the features for detection and for motion."""
         config = self.config
         if config.one_bev:
-            both = self.taskfeat_encoders[_BOTH](fused)
-            return both, both
+            features = self.taskfeat_encoders[_SHARED](fused)
+            return features, features
         motion_grid = config.labels.grid.with_orientation(config.grid.orientation)
-        return (
-            self.taskfeat_encoders[_DETECTION](fused),
-            self.taskfeat_encoders[_MOTION](crop(fused, config.grid, motion_grid)),
-        )
+        detection_features = self.taskfeat_encoders[_DETECTION](fused)
+        motion_map = crop(fused, config.grid, motion_grid)
+        return detection_features, self.taskfeat_encoders[_MOTION](motion_map)
 
 
 def _extent(grid: BevGrid) -> tuple[float, ...]:
-    """Where a grid begins and ends along x and y."""
+    """Return the start and the end of a grid along x and y."""
     return (*grid.x[:2], *grid.y[:2])
 
 
-def _given(name: str, value: _Input | None) -> _Input:
-    """An input that the model sees with; raises ConfigError if there is none."""
+def _required(name: str, value: _Input | None) -> _Input:
+    """Return an input that the model needs; raises ConfigError if there is none."""
     if value is None:
         raise ConfigError(
-            f"inputs: have no {name}, which this model sees with; make items by its config.inputs(…)"
+            f"inputs: have no {name}, which this model sees with; make items by its "
+            "config.inputs(…)"
         )
     return value
 
 
 def _ego_first(partners: Tensor, agent: Tensor) -> Tensor:
-    """For each ego, columns of agents (G, A'): itself, those that it hears, and others to fill up to the most heard."""
-    own = torch.nn.functional.one_hot(agent, partners.shape[1])
-    order = (2 * own + partners.long()).argsort(dim=1, descending=True, stable=True)
-    most = int((partners | own.bool()).sum(1).max()) if len(partners) else 1
-    return order[:, :most]
+    """Return columns of agents for each ego, (G, A'): itself, heard agents, and others.
+
+    The others fill rows up to the largest number of heard agents.
+    """
+    is_ego = torch.nn.functional.one_hot(agent, partners.shape[1])
+    order = (2 * is_ego + partners.long()).argsort(dim=1, descending=True, stable=True)
+    max_count = int((partners | is_ego.bool()).sum(1).max()) if len(partners) else 1
+    return order[:, :max_count]

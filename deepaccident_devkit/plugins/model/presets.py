@@ -1,4 +1,4 @@
-"""The presets: `released`, the model of the release with its quirks, and those that a laptop trains."""
+"""The presets: `released`, the model of the release with its quirks, and models for laptops."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ from deepaccident_devkit.plugins.model.network import CameraConfig, ModelConfig,
 from deepaccident_devkit.plugins.model.pillars import PillarConfig
 from deepaccident_devkit.plugins.model.temporal import TemporalConfig
 from deepaccident_devkit.support.json_text import as_record
-from deepaccident_devkit.support.text import choice as chosen_word
+from deepaccident_devkit.support.text import choice as checked_choice
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, ModelFusion, ModelPreset
 
 
-class _Described(msgspec.Struct):
-    """A `ModelChoice` in the notes of weights; all of it must be there."""
+class _ChoiceNotes(msgspec.Struct):
+    """A `ModelChoice` in the notes of weights; all of it must be present."""
 
     preset: ModelPreset
     fusion: ModelFusion | None
@@ -57,14 +57,16 @@ class _Described(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelChoice:
-    """A preset and what is changed in it: all that is needed to build a model again.
+    """A preset and its changes: everything that is needed to build a model again.
 
     Attributes:
         preset: `released`, `tiny`, `tiny_lidar` or `tiny_both`.
-        fusion: how agents are joined; None for the preset's.
-        horizon: seconds that motion is predicted; None for 2.
-        focal: focal length, pixels, of the virtual camera that images look as if taken by; None for their own.
-        labels: `fiery` for motion labels by FIERY's rules, as nuScenes is evaluated with; None for the preset's.
+        fusion: Fusion of the agents; None for the preset's.
+        horizon: Seconds of motion that are predicted; None for 2.
+        focal: Focal length, in pixels, of the virtual camera that images are converted to; None for
+            their own camera.
+        labels: `fiery` for motion labels by FIERY's rules, which nuScenes is evaluated with; None
+            for the preset's.
     """
 
     preset: ModelPreset = "tiny"
@@ -74,72 +76,67 @@ class ModelChoice:
     labels: Literal["fiery"] | None = None
 
     def __post_init__(self) -> None:
-        """Check; raises ChoiceError or ConfigError."""
+        """Check the choice; raises ChoiceError or ConfigError."""
         settle_choices(
             self, {"preset": get_args(ModelPreset), "fusion": (None, *get_args(ModelFusion))}
         )
         settle_choices(self, {"labels": (None, "fiery")})
-        self.config  # noqa: B018 - refuses what does not go together
+        self.config  # noqa: B018 - refuses settings that do not go together
 
     @property
     def config(self) -> ModelConfig:
-        """The whole configuration."""
+        """The complete configuration."""
         config = MODEL_PRESETS[self.preset]()
         if self.fusion is not None:
             config = replace(config, fusion=fusion_config(self.fusion, config.temporal.channels))
         if self.horizon is not None:
-            frames = self._frames(config)
+            frames = self._horizon_frames(config)
             config = replace(
                 config,
                 motion=replace(config.motion, future_frames=frames),
                 labels=replace(config.labels, future_frames=frames),
             )
         if self.labels is not None:
-            config = replace(config, labels=self._labels_of(config))
+            config = replace(config, labels=self._fiery_labels(config))
         if self.focal is not None:
-            config = replace(config, cameras=self._as_if_taken(config.cameras))
+            config = replace(config, cameras=self._virtual_cameras(config.cameras))
         return config
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, as JSON holds it."""
-        later = {
-            name: value
-            for name in ("focal", "labels")
-            if (value := getattr(self, name)) is not None
-        }
-        return {
-            "preset": self.preset,
-            "fusion": self.fusion,
-            "horizon": self.horizon,
-            **later,
-        }  # older runs lack these
+        """Return the choice as JSON holds it."""
+        choice = {"preset": self.preset, "fusion": self.fusion, "horizon": self.horizon}
+        for name in ("focal", "labels"):  # notes of older runs lack these
+            value = getattr(self, name)
+            if value is not None:
+                choice[name] = value
+        return choice
 
     @classmethod
     def from_dict(cls, described: Mapping[str, Any], path: Path) -> ModelChoice:
-        """The choice that the notes of a file's weights describe.
+        """Return the choice that the notes of a file's weights describe.
 
         Raises:
-            ConfigError: they do not describe one.
+            ConfigError: The notes describe no choice.
         """
         try:
-            return cls(**msgspec.structs.asdict(as_record(described, _Described)))
+            return cls(**msgspec.structs.asdict(as_record(described, _ChoiceNotes)))
         except ValueError as error:
             raise ConfigError(
-                f"{path}: does not say which model its weights are of ({error}); give weights of deepaccident train, "
-                "or begin a training from these: deepaccident train --from"
+                f"{path}: does not say which model its weights are of ({error}); give weights of "
+                "deepaccident train, or begin a training from these: deepaccident train --from"
             ) from error
 
-    def _labels_of(self, config: ModelConfig) -> MotionLabelConfig:
-        given = config.labels
+    def _fiery_labels(self, config: ModelConfig) -> MotionLabelConfig:
+        labels = config.labels
         return MotionLabelConfig.preset(
             "fiery",
-            grid=given.grid,
-            orientation=given.grid.orientation,
-            receptive_field=given.receptive_field,
-            future_frames=given.future_frames,
+            grid=labels.grid,
+            orientation=labels.grid.orientation,
+            receptive_field=labels.receptive_field,
+            future_frames=labels.future_frames,
         )
 
-    def _as_if_taken(self, cameras: CameraConfig | None) -> CameraConfig:
+    def _virtual_cameras(self, cameras: CameraConfig | None) -> CameraConfig:
         if cameras is None:
             raise ConfigError("focal: the model has no cameras; leave it out")
         images = cameras.images
@@ -149,21 +146,23 @@ class ModelChoice:
             cameras, images=replace(images, resize=None, crop=None, virtual_camera=virtual)
         )
 
-    def _frames(self, config: ModelConfig) -> int:
+    def _horizon_frames(self, config: ModelConfig) -> int:
         step = config.labels.step * FRAME_PERIOD
         frames = (self.horizon or 0.0) / step
         if not (1 <= frames < 100 and abs(frames - round(frames)) < 1e-6):
             raise ConfigError(
-                f"horizon: {self.horizon!r} s is no number of steps of {step:g} s; choose 0.5, 1, 1.5, …"
+                f"horizon: {self.horizon!r} s is no number of steps of {step:g} s; choose 0.5, 1, "
+                "1.5, …"
             )
         return round(frames)
 
 
 def load_model(path: str | os.PathLike[str]) -> V2XFormer:
-    """The model of a run's folder, or of a file of our own weights; on the CPU.
+    """Load the model of a run's folder, or of a file of our own weights, on the CPU.
 
     Raises:
-        ConfigError: there are no weights, they are not the devkit's, or they do not fit their own notes.
+        ConfigError: There are no weights, they are not the devkit's, or they do not fit their
+            notes.
     """
     weights = read_weights(path)
     model = V2XFormer(ModelChoice.from_dict(weights.meta, weights.path).config)
@@ -173,38 +172,41 @@ def load_model(path: str | os.PathLike[str]) -> V2XFormer:
 
 
 def fusion_config(name: str, channels: int) -> FusionConfig:
-    """A fusion by its name, in the size that fits so many channels; raises ChoiceError.
+    """Return the config of a fusion, in a size that suits the number of channels.
 
-    The release's own fusion is `released`. `disconet`, `cobevt` and `v2xvit` are written from those models' papers: the
-    paper's table names them, and the release has none of them.
+    The release's own fusion is `released`. `disconet`, `cobevt` and `v2xvit` are written from the
+    papers of these models: the paper's table names them, and the release has none of them. Raises
+    ChoiceError.
     """
-    small = channels < 64
-    made: Mapping[str, Callable[[], FusionConfig]] = {
+    is_small = channels < 64
+    constructors: Mapping[str, Callable[[], FusionConfig]] = {
         "mean": PoolFusionConfig,
         "max": lambda: PoolFusionConfig(by="max"),
         "released": lambda: ReleasedFusionConfig(channels=channels),
         "disconet": lambda: DiscoNetConfig(channels=channels),
         "cobevt": lambda: (
             CobevtConfig(channels=channels, depth=1, window=5)
-            if small
+            if is_small
             else CobevtConfig(channels=channels)
         ),
         "v2xvit": lambda: (
             V2XViTConfig(channels=channels, depth=1, windows=(5, 10, 20))
-            if small
+            if is_small
             else V2XViTConfig(channels=channels)
         ),
     }
-    return made[chosen_word("fusion", name, get_args(ModelFusion))]()
+    return constructors[checked_choice("fusion", name, get_args(ModelFusion))]()
 
 
 def released() -> ModelConfig:
-    """BEVerse-tiny with the released fusion: 83 million parameters, 704 × 256 pixels, 200 × 200 cells of 0.5 m.
+    """Return BEVerse-tiny with the released fusion.
 
-    Images are cut as in the released tests, in training too: its random scales, flips and turns of images are left out,
-    and so are an augmentation of its own for each agent and the mixed order of agents in batches, which are mistakes.
+    It has 83 million parameters, images of 704 × 256 pixels and 200 × 200 cells of 0.5 m. Images
+    are cut as in the released tests, in training too: the release's random scales, flips and
+    rotations of images are left out, and so are its separate augmentation for each agent and its
+    mixed order of agents in batches, which are mistakes.
     """
-    along = (-51.2, 51.2, 0.8)
+    axis = (-51.2, 51.2, 0.8)
     return ModelConfig(
         cameras=CameraConfig(
             images=ImageConfig(resize=(432, 768), crop=(176, 32, 256, 704), dtype="uint8"),
@@ -213,8 +215,8 @@ def released() -> ModelConfig:
                 in_channels=512,
                 channels=64,
                 depth=(1.0, 60.0, 1.0),
-                x=along,
-                y=along,
+                x=axis,
+                y=axis,
                 z=(-30.0, 30.0, 60.0),
                 image_size=(256, 704),
                 stride=16,
@@ -224,7 +226,7 @@ def released() -> ModelConfig:
         ),
         temporal=TemporalConfig(
             channels=64,
-            grid=BevGrid(x=along, y=along),
+            grid=BevGrid(x=axis, y=axis),
             frames=3,
             warp="stretched",
             chain="released",
@@ -233,7 +235,7 @@ def released() -> ModelConfig:
         fusion=ReleasedFusionConfig(channels=64),
         bev=BevEncodeConfig(),
         motion=MotionHeadConfig(posterior_ignore="keep", hidden_warp="none"),
-        detection=DetectionConfig(class_slots=RELEASED_CLASS_SLOTS, x=along, y=along),
+        detection=DetectionConfig(class_slots=RELEASED_CLASS_SLOTS, x=axis, y=axis),
         targets=TargetConfig(unknown_velocity="zero"),
         decoding=DecodingConfig(nms=RELEASED_NMS),
         labels=MotionLabelConfig.preset("deepaccident", orientation="released"),
@@ -242,12 +244,14 @@ def released() -> ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """Images of 160 × 90 pixels, features in cells of 1 m, labels `clean` of 0.5 m; none of the quirks.
+    """Return the config of images of 160 × 90 pixels, features in cells of 1 m, labels of 0.5 m.
 
-    Only points near the road count, and a cell has their mean, so that depths need not be learned from nothing. The
-    decoders have channels for the finer cells of the labels, in place of finer maps. docs/model.md has its numbers.
+    The labels are `clean`; the model has none of the quirks. Only points near the road count, and a
+    cell has their mean, so that depths need not be learned from scratch. The decoders have more
+    channels instead of finer maps, because the cells of the labels are finer. docs/model.md has its
+    numbers.
     """
-    along = (-50.0, 50.0, 1.0)
+    axis = (-50.0, 50.0, 1.0)
     return ModelConfig(
         cameras=CameraConfig(
             images=ImageConfig(resize=(90, 160), dtype="uint8", decode="scaled"),
@@ -257,8 +261,8 @@ def tiny() -> ModelConfig:
                 in_channels=48,
                 channels=32,
                 depth=(2.0, 50.0, 2.0),
-                x=along,
-                y=along,
+                x=axis,
+                y=axis,
                 z=(-10.0, 10.0, 20.0),
                 image_size=(96, 160),
                 stride=8,
@@ -266,9 +270,7 @@ def tiny() -> ModelConfig:
                 pooling="mean",
             ),
         ),
-        temporal=TemporalConfig(
-            channels=32, grid=BevGrid(x=along, y=along), frames=2, kind="concat"
-        ),
+        temporal=TemporalConfig(channels=32, grid=BevGrid(x=axis, y=axis), frames=2, kind="concat"),
         fusion=PoolFusionConfig(),
         bev=BevUNetConfig(),
         one_bev=True,
@@ -286,8 +288,8 @@ def tiny() -> ModelConfig:
             in_channels=32,
             shared_channels=24,
             class_slots=ONE_TASK,
-            x=along,
-            y=along,
+            x=axis,
+            y=axis,
             branches="joint",
             upsample=2,
         ),
@@ -296,7 +298,7 @@ def tiny() -> ModelConfig:
 
 
 def tiny_both() -> ModelConfig:
-    """`tiny`, which also sees with LiDARs."""
+    """Return `tiny` with LiDARs in addition to cameras."""
     config = tiny()
     return replace(
         config, pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid)
@@ -304,7 +306,7 @@ def tiny_both() -> ModelConfig:
 
 
 def tiny_lidar() -> ModelConfig:
-    """`tiny`, which sees with LiDARs in place of cameras."""
+    """Return `tiny` with LiDARs instead of cameras."""
     return replace(tiny_both(), cameras=None)
 
 

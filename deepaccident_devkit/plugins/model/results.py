@@ -1,4 +1,4 @@
-"""Predictions of samples by a trained model, and results files of them."""
+"""Predictions of samples by a trained model, and results files with them."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SamplePrediction(ShortRepr):
-    """What a model says of one sample.
+    """A model's prediction of one sample.
 
     Attributes:
-        token: of the sample.
-        motion: maps of all draws, the mean last.
-        accidents: none, or the one that the maps foresee together.
-        boxes: of the present, in the world.
+        token: Token of the sample.
+        motion: Maps of all draws, the mean last.
+        accidents: The accident that all maps together foresee, if any.
+        boxes: Boxes at the present, in the world frame.
     """
 
     token: str
@@ -65,16 +65,16 @@ class SamplePrediction(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictConfig:
-    """How samples are predicted.
+    """Rules for predicting samples.
 
     Attributes:
-        agents: who cooperates (`v2x.cooperating_agents`).
-        link: what happens to the partners' data; None for nothing. For a budget the payload `bev` is the model's own
-            features.
-        seed: of the latents' draws, which depend on it and on the sample alone.
-        device: where the model is.
-        workers: processes that read; 0 for this one.
-        images_cache: of `V2XConfig`.
+        agents: The cooperating agents (`v2x.cooperating_agents`).
+        link: Degradation of the partners' data; None for none. With a budget the payload `bev` is
+            the model's own features.
+        seed: Seed of the latents' draws, which only depend on it and on the sample.
+        device: Device of the model.
+        workers: Number of processes that read; 0 for this process.
+        images_cache: Cache of images, as in `V2XConfig`.
     """
 
     agents: Agents = "all"
@@ -93,19 +93,19 @@ def predictions(
     *,
     progress: bool = False,
 ) -> Iterator[SamplePrediction]:
-    """Predict samples one after another; the result does not depend on the others.
+    """Predict samples one after another; a prediction does not depend on other samples.
 
     Args:
-        model: in evaluation mode while this runs; on `config.device`.
-        dataset: the release.
-        tokens: of the samples.
-        config: who cooperates, and how.
-        progress: whether to show a bar.
+        model: The model on `config.device`; it is in evaluation mode while this runs.
+        dataset: The release.
+        tokens: Tokens of the samples.
+        config: Cooperating agents and other rules.
+        progress: Whether to show a progress bar.
 
     Raises:
-        DeepAccidentError: as of `V2XDataset`.
-        NotAvailableError: the release lacks what the model sees with.
-        WorkerError: a worker process was killed, or cannot send what it has read.
+        DeepAccidentError: As in `V2XDataset`.
+        NotAvailableError: The release lacks the sensors of the model.
+        WorkerError: A worker process was killed, or cannot send the data that it has read.
     """
     check_sensor_files(model.config, dataset, tokens[:1])
     data = V2XDataset(dataset, tokens, _inputs(model, config))
@@ -123,26 +123,30 @@ def predictions(
 
 
 def _inputs(model: V2XFormer, config: PredictConfig) -> V2XConfig:
-    """What the model sees, over a link that knows how large its features are."""
-    link, own = config.link, _features(model)[0]
-    link = replace(link, payload=own) if link is not None and link.payload == "bev" else link
+    """Return the config of the model's inputs, with the size of its features in the link."""
+    link = config.link
+    message_bytes = _message_size(model)[0]
+    if link is not None and link.payload == "bev":
+        link = replace(link, payload=message_bytes)
     return model.config.inputs(config.agents, link=link, images_cache=config.images_cache)
 
 
-def _features(model: V2XFormer) -> tuple[int, dict[str, Any]]:
-    """Bytes of a partner's message, its own map of the present (`V2XFormer.encoded`) and its pose; form of the map."""
-    shape, dtype = (
-        [model.config.temporal.channels, *model.config.grid.shape],
-        next(model.parameters()).dtype,
-    )
-    return (
-        POSE_BYTES + math.prod(shape) * dtype.itemsize,
-        {"shape": shape, "dtype": str(dtype).removeprefix("torch.")},
-    )
+def _message_size(model: V2XFormer) -> tuple[int, dict[str, Any]]:
+    """Return the bytes of a partner's message, and the shape and dtype of its map.
+
+    The message has its own map of the present (`V2XFormer.encoded`) and its pose.
+    """
+    shape = [model.config.temporal.channels, *model.config.grid.shape]
+    dtype = next(model.parameters()).dtype
+    form = {"shape": shape, "dtype": str(dtype).removeprefix("torch.")}
+    return POSE_BYTES + math.prod(shape) * dtype.itemsize, form
 
 
 def check_sensor_files(model: ModelConfig, dataset: Dataset, tokens: Sequence[str]) -> None:
-    """Raise NotAvailableError, with the remedy, if none of these samples has files of a kind that the model sees."""
+    """Raise NotAvailableError, with the remedy, if the samples lack files of the model's sensors.
+
+    It is raised if no sample has a file of one of the sensors.
+    """
     kinds = (
         (model.cameras, CAMERAS, "cameras", "images", "camera folders"),
         (model.pillars, (LIDAR,), "LiDARs", "point clouds", f"{LIDAR} folders"),
@@ -152,52 +156,56 @@ def check_sensor_files(model: ModelConfig, dataset: Dataset, tokens: Sequence[st
             dataset.sensor_path(f"{token}/{channel}") for token in tokens for channel in channels
         ]
         if part is not None and paths and not any(path.exists() for path in paths):
+            option = "cameras" if part is model.cameras else "all"
             raise NotAvailableError(
-                f"{paths[0]}: the model sees with {sensors}, and this release has no {files} of {tokens[0]}; unpack "
-                f"its {folders}, or make a release with them: deepaccident synth OUT --sensors "
-                f"{'cameras' if part is model.cameras else 'all'}"
+                f"{paths[0]}: the model sees with {sensors}, and this release has no {files} of "
+                f"{tokens[0]}; unpack its {folders}, or make a release with them: deepaccident "
+                f"synth OUT --sensors {option}"
             )
 
 
 def prediction_of(
     model: V2XFormer, batch: dict[str, Any], config: PredictConfig
 ) -> SamplePrediction:
-    """The prediction of a batch of one item of `training.torch.collate`, by a model in evaluation mode."""
+    """Predict a batch of one item of `training.torch.collate`, by a model in evaluation mode."""
     [token] = batch["token"]
+    model_config = model.config
     delay = 0 if config.link is None else config.link.latency_frames
-    inputs = model_inputs(batch, model.config.handedness, delay=delay).to(config.device)
+    inputs = model_inputs(batch, model_config.handedness, delay=delay).to(config.device)
     generator = torch.Generator().manual_seed(zlib.crc32(f"{config.seed} {token}".encode()))
     with torch.inference_mode():
-        predicted = model(inputs, noise=model.noise(1, generator).to(config.device))
-    [found] = decode_detections(predicted.detection, model.config.detection, model.config.decoding)
-    motion = motion_output(
-        PredictedMotionMaps(*(each[:, 0] for each in predicted.motion.maps)), model
+        outputs = model(inputs, noise=model.noise(1, generator).to(config.device))
+    [detections] = decode_detections(
+        outputs.detection, model_config.detection, model_config.decoding
     )
+    maps = PredictedMotionMaps(*(tensor[:, 0] for tensor in outputs.motion.maps))
+    motion = motion_output(maps, model)
     accident = foreseen_accident(
-        motion, step=model.config.labels.step * FRAME_PERIOD, labels=model.config.labels_protocol
+        motion, step=model_config.labels.step * FRAME_PERIOD, labels=model_config.labels_protocol
     )
+    boxes = mirrored_boxes(detections.boxes, model_config.handedness)
+    world_from_ego = batch["world_from_ego"][0]
     return SamplePrediction(
         token=token,
         motion=motion,
         accidents=[] if accident is None else [accident],
-        boxes=detected_boxes(
-            replace(found, boxes=mirrored_boxes(found.boxes, model.config.handedness)),
-            batch["world_from_ego"][0],
-        ),
+        boxes=detected_boxes(replace(detections, boxes=boxes), world_from_ego),
     )
 
 
 def motion_output(maps: PredictedMotionMaps, model: V2XFormer) -> MotionOutput:
-    """The devkit's form of the maps (K, T, …) of one ego: centres as probabilities, on the labels' grid."""
-    given = (
+    """Return the devkit's form of the maps (K, T, …) of one ego.
+
+    Centres become probabilities, and the grid is that of the labels.
+    """
+    tensors = (
         maps.segmentation,
         maps.instance_center.sigmoid(),
         maps.instance_offset,
         maps.instance_flow,
     )
-    return MotionOutput.from_arrays(
-        *(each.float().cpu().numpy() for each in given), grid=model.config.labels.grid
-    )
+    arrays = [tensor.float().cpu().numpy() for tensor in tensors]
+    return MotionOutput.from_arrays(*arrays, grid=model.config.labels.grid)
 
 
 def predict_results(
@@ -209,22 +217,24 @@ def predict_results(
     *,
     progress: bool = False,
 ) -> dict[ResultsTask, Path]:
-    """Predict samples, each once for all tasks, and write the results; nothing is left of a call that breaks off.
+    """Predict samples, each once for all tasks, and write the results.
+
+    An interrupted call leaves nothing behind.
 
     Args:
-        model: on the configuration's device.
-        dataset: the release.
-        tokens: of the samples.
-        out: the folder to write into.
-        config: who cooperates, and how; None for all agents on the CPU.
-        progress: whether to show a bar.
+        model: The model, on the configuration's device.
+        dataset: The release.
+        tokens: Tokens of the samples.
+        out: The folder to write into.
+        config: Cooperating agents and other rules; None for all agents on the CPU.
+        progress: Whether to show a progress bar.
 
     Returns:
-        Task → the file or folder written.
+        Task → the written file or folder.
 
     Raises:
-        ResultsError: results are there already, or cannot be written.
-        DeepAccidentError: as of `predictions`.
+        ResultsError: Results exist already, or cannot be written.
+        DeepAccidentError: As in `predictions`.
     """
     config = config or PredictConfig()
     folder = writable_folder(out)
@@ -233,60 +243,67 @@ def predict_results(
     }
     meta = _meta(model, dataset, tokens, config)
     labels = model.config.labels
-    form: dict[str, Any] = {
+    motion_options: dict[str, Any] = {
         "grid": labels.grid,
         "step": labels.step * FRAME_PERIOD,
         "labels": model.config.labels_protocol,
     }
+    step, protocol = motion_options["step"], motion_options["labels"]
     with worker_faults_named(), ExitStack() as stack:
-        writers = {
-            task: ResultsWriter(path, task, meta=meta, **(form if task == "motion" else {}))
-            for task, path in paths.items()
-        }
+        writers = {}
+        for task, path in paths.items():
+            options = motion_options if task == "motion" else {}
+            writers[task] = ResultsWriter(path, task, meta=meta, **options)
         for writer in writers.values():
             stack.enter_context(writer)
-        for found in predictions(model, dataset, tokens, config, progress=progress):
-            writers["motion"].add(found.token, found.motion)
-            writers["accident"].add(found.token, found.accidents)
-            writers["detection"].add(found.token, found.boxes)
-            writers["forecasting"].add(
-                found.token, _forecasts(dataset, found, form["step"], form["labels"])
-            )
+        for prediction in predictions(model, dataset, tokens, config, progress=progress):
+            token = prediction.token
+            writers["motion"].add(token, prediction.motion)
+            writers["accident"].add(token, prediction.accidents)
+            writers["detection"].add(token, prediction.boxes)
+            writers["forecasting"].add(token, _forecasts(dataset, prediction, step, protocol))
     return paths
 
 
 def _forecasts(
-    dataset: Dataset, found: SamplePrediction, step: float, labels: str
+    dataset: Dataset, prediction: SamplePrediction, step: float, labels: str
 ) -> list[Forecast]:
-    """Of the actors that labels show at a sample's present; none without labels, which say who is who."""
-    scenario, _, number = found.token.rsplit("/", 2)
+    """Return forecasts of the actors that labels show at a sample's present.
+
+    Without labels, which identify the actors, there are none.
+    """
+    token = prediction.token
+    scenario, _, number = token.rsplit("/", 2)
     boxes = scenario_tracks(dataset, scenario).at(int(number))
-    boxes = boxes.transform(dataset.world_from(found.token, "ego").inverse(), "ego")
-    return forecasts_of(found.motion, boxes.actor_id, boxes.center[:, :2], step=step, labels=labels)
+    boxes = boxes.transform(dataset.world_from(token, "ego").inverse(), "ego")
+    centers = boxes.center[:, :2]
+    return forecasts_of(prediction.motion, boxes.actor_id, centers, step=step, labels=labels)
 
 
 def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path: Path) -> str:
-    """IoU and VPQ of motion results at samples, beside what the notes of shipped weights expect of another release."""
-    rules = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
-    evaluator, results = MotionEvaluator(rules, trajectories=False), read_results(path)
-    for token, labels in zip(
-        tokens, motion_labels_of(dataset, tokens, model.config.labels), strict=True
-    ):
-        predicted: Any = results.prediction(token)
-        evaluator.update(token, predicted, labels)
-    here, told = evaluator.compute().ranges["100x100"], model.notes["scored"]
-    expected = "IoU {iou:.1%}, VPQ {vpq:.1%}".format_map(told["scores"])
+    """Return the IoU and VPQ of motion results at samples, and the scores in the weights' notes.
+
+    The notes of shipped weights have scores on another release.
+    """
+    protocol = replace(MOTION_PROTOCOLS["paper"], labels=model.config.labels_protocol)
+    evaluator, results = MotionEvaluator(protocol, trajectories=False), read_results(path)
+    all_labels = motion_labels_of(dataset, tokens, model.config.labels)
+    for token, labels in zip(tokens, all_labels, strict=True):
+        prediction: Any = results.prediction(token)
+        evaluator.update(token, prediction, labels)
+    scores, notes = evaluator.compute().ranges["100x100"], model.notes["scored"]
+    expected = "IoU {iou:.1%}, VPQ {vpq:.1%}".format_map(notes["scores"])
     return (
-        f"motion, labels {rules.labels}: IoU {here.iou:.1f}%, VPQ {here.pq:.1f}% within 100 m x 100 m here; "
-        f"{expected} on {told['synth']['scenarios']} synthetic scenarios that the training had not seen, with agents "
-        f"{told['agents']}"
+        f"motion, labels {protocol.labels}: IoU {scores.iou:.1f}%, VPQ {scores.pq:.1f}% within "
+        f"100 m x 100 m here; {expected} on {notes['synth']['scenarios']} synthetic scenarios that "
+        f"the training had not seen, with agents {notes['agents']}"
     )
 
 
 def _meta(
     model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig
 ) -> dict[str, Any]:
-    """The notes in the results."""
+    """Return the notes in the results."""
     return {
         "method": "V2XFormer of the devkit",
         "model": dict(model.notes),
@@ -295,16 +312,16 @@ def _meta(
         "seed": config.seed,
         "release": release_note(dataset, map(scenario_of, tokens)),
         "devkit": __version__,
-        "bytes": _sent(model, dataset, tokens, config),
+        "bytes": _sent_bytes_note(model, dataset, tokens, config),
     }
 
 
-def _sent(
+def _sent_bytes_note(
     model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig
 ) -> dict[str, Any]:
-    """The note on the bytes that partners send; those whose sensor files are not there send none."""
+    """Return the note on the bytes that partners send; partners without sensor files send none."""
     check_sensor_files(model.config, dataset, tokens[:1])
-    size, form = _features(model)
+    message_bytes, form = _message_size(model)
     senders = V2XDataset(dataset, tokens, replace(_inputs(model, config), past=1)).senders()
-    sent = [(size * (len(names) - 1), len(names) - 1) for names in senders]
+    sent = [(message_bytes * (len(names) - 1), len(names) - 1) for names in senders]
     return traffic_note(sent, config.link, "bev", **form)

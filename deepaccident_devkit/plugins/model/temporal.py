@@ -1,9 +1,10 @@
-"""Temporal models: one agent's BEV maps of the past and the present → one map of the present, before any fusion.
+"""Temporal models: one agent's BEV maps of the past and the present → one map of the present.
 
-The released TemporalBlock and Bottleneck3D, which it has from FIERY. The sequence is frames in the temporal model and
-agents in the released fusion's unused part. Attributes have the names of the released state dict.
+They run before any fusion. These are the released TemporalBlock and Bottleneck3D, which the release
+has from FIERY. The sequence is over frames in the temporal model, and over agents in the released
+fusion's unused part. Attributes have the names of the released state dict.
 
-Both take the same arguments; `temporal_model` makes the one that a config names.
+Both models take the same arguments; `temporal_model` builds the model that a config names.
 """
 
 from __future__ import annotations
@@ -28,9 +29,15 @@ from deepaccident_devkit.plugins.model.warps import (
 )
 from deepaccident_devkit.support.text import settle_choices
 
+# Channels that an egomotion takes: a 6-vector, the same in all cells.
+EGOMOTION_CHANNELS = 6
+
 
 class ConvBnRelu3d(nn.Module):
-    """A convolution (kernel: steps, rows, columns) without bias, batch norm and ReLU; keeps T, H and W."""
+    """A convolution without bias, batch norm and ReLU; T, H and W stay the same.
+
+    Its kernel is (steps, rows, columns).
+    """
 
     def __init__(
         self, in_channels: int, out_channels: int, kernel: tuple[int, int, int] = (1, 1, 1)
@@ -41,46 +48,47 @@ class ConvBnRelu3d(nn.Module):
         self.norm = nn.BatchNorm3d(out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T, H, W) → (B, C', T, H, W); the steps before the first are zeros."""
-        earlier = self.conv.kernel_size[0] - 1
-        if earlier:
-            x = functional.pad(x, (0, 0, 0, 0, earlier, 0))
+        """Transform (B, C, T, H, W) to (B, C', T, H, W); steps before the first one are zeros."""
+        padding_steps = self.conv.kernel_size[0] - 1
+        if padding_steps:
+            x = functional.pad(x, (0, 0, 0, 0, padding_steps, 0))
         return functional.relu(self.norm(self.conv(x)))
 
 
 class PooledStep(nn.Module):
-    """The mean over the map and over each step and the one before, through a 1×1×1 convolution; in every cell."""
+    """The mean over the map and two successive steps, after a 1×1×1 convolution, in every cell."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
         self.conv_bn_relu = ConvBnRelu3d(in_channels, out_channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T, H, W) → (B, C', T, H, W); the first step is its own mean.
+        """Transform (B, C, T, H, W) to (B, C', T, H, W); the first step is its own mean.
 
-        As in the released code a further step, the last one's own mean, counts in the batch statistics.
+        As in the released code an additional step, the last one's own mean, counts in the batch
+        statistics.
         """
         means = x.mean((-2, -1), keepdim=True)
-        pairs = torch.cat(
-            [means[:, :, :1], (means[:, :, 1:] + means[:, :, :-1]) / 2, means[:, :, -1:]], 2
-        )
-        return self.conv_bn_relu(pairs)[:, :, :-1].expand(-1, -1, -1, *x.shape[-2:])
+        first_mean = means[:, :, :1]
+        pair_means = (means[:, :, 1:] + means[:, :, :-1]) / 2
+        padded_means = torch.cat([first_mean, pair_means, means[:, :, -1:]], 2)
+        return self.conv_bn_relu(padded_means)[:, :, :-1].expand(-1, -1, -1, *x.shape[-2:])
 
 
 class PyramidPooling(nn.Module):
-    """The released pyramid of one level, the whole map."""
+    """The released pyramid with one level, the complete map."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
         self.features = nn.ModuleList([PooledStep(in_channels, out_channels)])
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T, H, W) → (B, C', T, H, W)."""
+        """Transform (B, C, T, H, W) to (B, C', T, H, W)."""
         return torch.cat([level(x) for level in self.features], 1)
 
 
 class TemporalBlock(nn.Module):
-    """Three convolution paths and a pooled one over a step and the one before, added to the input."""
+    """Three convolution paths and a pooled one over two successive steps, added to the input."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -94,24 +102,22 @@ class TemporalBlock(nn.Module):
         )
         self.pyramid_pooling = PyramidPooling(in_channels, third)
         self.aggregation = nn.Sequential(ConvBnRelu3d(3 * half + third, out_channels))
-        self.projection = (
-            nn.Identity()
-            if in_channels == out_channels
-            else nn.Sequential(
+        self.projection: nn.Module = nn.Identity()
+        if in_channels != out_channels:
+            self.projection = nn.Sequential(
                 nn.Conv3d(in_channels, out_channels, 1, bias=False), nn.BatchNorm3d(out_channels)
             )
-        )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T, H, W) → (B, C', T, H, W)."""
+        """Transform (B, C, T, H, W) to (B, C', T, H, W)."""
         paths = [path(x) for path in self.convolution_paths]
-        return self.projection(x) + self.aggregation(
-            torch.cat([*paths, self.pyramid_pooling(x)], 1)
-        )
+        projected = self.projection(x)
+        pooled = self.pyramid_pooling(x)
+        return projected + self.aggregation(torch.cat([*paths, pooled], 1))
 
 
 class Bottleneck3d(nn.Module):
-    """1×1×1 to half the channels, 1×3×3, 1×1×1 back, added to the input."""
+    """1×1×1 convolution to half the channels, 1×3×3, 1×1×1 back; added to the input."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -122,12 +128,10 @@ class Bottleneck3d(nn.Module):
         self.layers.add_module("conv_up_project", ConvBnRelu3d(half, channels))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T, H, W) → the same shape."""
+        """Transform (B, C, T, H, W); return the same shape."""
         return x + self.layers(x)
 
 
-# Channels that an egomotion takes: a 6-vector, the same in all cells.
-EGOMOTION = 6
 EgomotionInput = Literal["raw", "augmented"]
 
 
@@ -136,14 +140,15 @@ class TemporalConfig:
     """A temporal model.
 
     Attributes:
-        channels: C of the maps, in and out.
-        grid: the maps' cells.
-        frames: P, the past ones and the present.
-        kind: `blocks`, the released 3D convolutions, or `concat`, two 2D convolutions over all frames at once.
-        warp: where a warp samples (`warps.warp_features`).
-        chain: the order in which motions are multiplied (`warps.present_from_past_batch`).
-        egomotion_input: with a BEV augmentation A, the motion that the convolutions see: `augmented` is
-            A · E · A⁻¹, as the maps move; `raw` is E, the released code's.
+        channels: Channels C of the maps, in and out.
+        grid: Cells of the maps.
+        frames: Number P of frames, including the present.
+        kind: `blocks`, the released 3D convolutions, or `concat`, two 2D convolutions over all
+            frames together.
+        warp: Sampling rule of a warp (`warps.warp_features`).
+        chain: Order in which motions are multiplied (`warps.present_from_past_batch`).
+        egomotion_input: With a BEV augmentation A, the motion that the convolutions see:
+            `augmented` is A · E · A⁻¹, as the maps move; `raw` is E, as in the released code.
     """
 
     channels: int
@@ -158,7 +163,8 @@ class TemporalConfig:
         """Check the numbers and words; raises ConfigError."""
         if self.channels < 1 or self.frames < 1:
             raise ConfigError(
-                f"TemporalConfig: expected at least 1 channel and 1 frame, found {self.channels} and {self.frames}"
+                "TemporalConfig: expected at least 1 channel and 1 frame, found "
+                f"{self.channels} and {self.frames}"
             )
         words = {
             "kind": ("blocks", "concat"),
@@ -170,20 +176,21 @@ class TemporalConfig:
 
 
 def temporal_model(config: TemporalConfig) -> Temporal3D | TemporalConcat:
-    """The temporal model that a config names."""
+    """Return the temporal model that a config names."""
     return Temporal3D(config) if config.kind == "blocks" else TemporalConcat(config)
 
 
 class Temporal3D(nn.Module):
-    """The released Temporal3DConvModel: P − 1 causal blocks over the warped frames; one frame stays as it is.
+    """The released Temporal3DConvModel: P − 1 causal blocks over the warped frames.
 
-    State-dict keys are the released ones (`temporal_model.` and these).
+    A single frame stays unchanged. State-dict keys are the released ones (`temporal_model.` and
+    these).
     """
 
     def __init__(self, config: TemporalConfig) -> None:
         super().__init__()
         self.config = config
-        widths = [config.channels + EGOMOTION] + [config.channels] * (config.frames - 1)
+        widths = [config.channels + EGOMOTION_CHANNELS] + [config.channels] * (config.frames - 1)
         self.model = nn.Sequential(*map(TemporalBlock, widths[:-1], widths[1:]))
 
     def forward(
@@ -193,12 +200,18 @@ class Temporal3D(nn.Module):
         valid: Tensor,
         bev_transform: Tensor | None = None,
     ) -> Tensor:
-        """Maps (N, P, C, H, W), each in its own frame, the present last → the present's (N, C, H, W).
+        """Return the present's map (N, C, H, W).
 
-        Frames up to the *first* one that is not `valid` (N, P) are replaced by the frame after it, as the released code
-        does; of [no, no, yes] frame 0 so becomes frame 1. In its batches invalid frames repeat the present with
-        identity motion, so that this does no harm. Row t of `egomotion` (N, P, 6) moves frame t to t + 1, in the
-        handedness of the maps, before their BEV augmentation (N, 4, 4); the last row is not used.
+        Frames up to the *first* one that is not `valid` are replaced by the frame after it, as the
+        released code does; with [no, no, yes] frame 0 becomes frame 1. In the released batches
+        invalid frames repeat the present with identity motion, so this does no harm.
+
+        Args:
+            features: Maps, each in its own frame, the present last, shape (N, P, C, H, W).
+            egomotion: 6-vectors, shape (N, P, 6): row t moves frame t to t + 1, in the handedness
+                of the maps, before their BEV augmentation; the last row is not used.
+            valid: Whether each frame is valid, shape (N, P).
+            bev_transform: BEV augmentation, shape (N, 4, 4); None without one.
         """
         present = features[:, -1]
         if self.config.frames == 1:
@@ -211,14 +224,17 @@ class Temporal3D(nn.Module):
 
 
 class TemporalConcat(nn.Module):
-    """All warped frames and motions through a 1×1 and a 3×3 convolution, each with batch norm and ReLU."""
+    """All warped frames and motions, transformed by a 1×1 and a 3×3 convolution.
+
+    Each convolution has batch norm and ReLU.
+    """
 
     def __init__(self, config: TemporalConfig) -> None:
         super().__init__()
         self.config = config
         width, past = config.channels, config.frames - 1
         self.mix = nn.Sequential(
-            nn.Conv2d(config.frames * width + past * EGOMOTION, width, 1, bias=False),
+            nn.Conv2d(config.frames * width + past * EGOMOTION_CHANNELS, width, 1, bias=False),
             nn.BatchNorm2d(width),
             nn.ReLU(),
             nn.Conv2d(width, width, 3, padding=1, bias=False),
@@ -233,31 +249,25 @@ class TemporalConcat(nn.Module):
         valid: Tensor,
         bev_transform: Tensor | None = None,
     ) -> Tensor:
-        """One map of the present; arguments and result as `Temporal3D.forward`.
+        """Return the present's map; arguments and result as in `Temporal3D.forward`.
 
-        A past frame that is not valid is replaced by the present, and its motion by none at all.
+        A past frame that is not valid is replaced by the present, and its motion by zeros.
         """
-        past = valid[:, :-1]
-        egomotion = torch.cat(
-            [
-                egomotion[:, :-1].masked_fill(~past[..., None], 0),
-                torch.zeros_like(egomotion[:, -1:]),
-            ],
-            1,
-        )
+        past_valid = valid[:, :-1]
+        past_motion = egomotion[:, :-1].masked_fill(~past_valid[..., None], 0)
+        egomotion = torch.cat([past_motion, torch.zeros_like(egomotion[:, -1:])], 1)
         warped = _warped_to_present(features, egomotion, bev_transform, self.config)
         present = features[:, -1:]
         warped = torch.where(valid[..., None, None, None], warped, present)
         motion = _motion_input(egomotion[:, :-1], bev_transform, self.config)
-        return self.mix(
-            torch.cat([warped.flatten(1, 2), _as_maps(motion, warped).flatten(1, 2)], 1)
-        )
+        motion_maps = _as_maps(motion, warped)
+        return self.mix(torch.cat([warped.flatten(1, 2), motion_maps.flatten(1, 2)], 1))
 
 
 def _warped_to_present(
     features: Tensor, egomotion: Tensor, bev_transform: Tensor | None, config: TemporalConfig
 ) -> Tensor:
-    """(N, P, C, H, W) in the present's frame; the present itself is not warped."""
+    """Return the maps (N, P, C, H, W) in the present's frame; the present itself is not warped."""
     past = features[:, :-1]
     chain = present_from_past_batch(
         egomotion[:, :-1], chain=config.chain, bev_transform=bev_transform
@@ -269,7 +279,7 @@ def _warped_to_present(
 def _motion_input(
     egomotion: Tensor, bev_transform: Tensor | None, config: TemporalConfig
 ) -> Tensor:
-    """(N, T, 6) the motions that the convolutions see."""
+    """Return the motions that the convolutions see, shape (N, T, 6)."""
     if bev_transform is None or config.egomotion_input == "raw":
         return egomotion
     matrix = bev_transform[:, None]
@@ -277,14 +287,15 @@ def _motion_input(
 
 
 def _as_maps(motion: Tensor, maps: Tensor) -> Tensor:
-    """(N, T, 6) → (N, T, 6, H, W) of the maps' dtype, the same in all cells."""
-    return motion.to(maps.dtype)[..., None, None].expand(-1, -1, -1, *maps.shape[-2:])
+    """Return motions (N, T, 6) as maps (N, T, 6, H, W) of the maps' dtype, equal in all cells."""
+    rows, columns = maps.shape[-2:]
+    return motion.to(maps.dtype)[..., None, None].expand(-1, -1, -1, rows, columns)
 
 
 def _without_invalid(frames: Tensor, valid: Tensor) -> Tensor:
-    """Frames (N, P, …) in which those up to the first invalid one are the frame after it."""
-    first = (~valid).to(torch.uint8).argmax(1, keepdim=True)
+    """Return frames (N, P, …); each frame up to the first invalid one is the frame after that."""
+    first_invalid = (~valid).to(torch.uint8).argmax(1, keepdim=True)
     steps = torch.arange(frames.shape[1], device=frames.device)
-    replaced = (steps <= first) & ~valid.all(1, keepdim=True)
-    source = torch.where(replaced, first + 1, steps).clamp(max=frames.shape[1] - 1)
+    is_replaced = (steps <= first_invalid) & ~valid.all(1, keepdim=True)
+    source = torch.where(is_replaced, first_invalid + 1, steps).clamp(max=frames.shape[1] - 1)
     return frames[torch.arange(len(frames), device=frames.device)[:, None], source]

@@ -1,4 +1,4 @@
-"""`train`: from a release to a folder with weights, log and curves; a killed run goes on where it was."""
+"""`train`: from a release to a folder with weights, log and curves; a killed run resumes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from tqdm.auto import tqdm
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.checkpoint import (
-    BEST,
-    FINAL,
+    BEST_FILE,
+    FINAL_FILE,
     load_weights,
     read_weights,
     write_weights,
@@ -65,8 +65,8 @@ from deepaccident_devkit.support.text import differing_text
 from deepaccident_devkit.support.version import __version__
 
 logger = logging.getLogger(__name__)
-RUN: Final = "run.json"
-CURVES: Final = "curves.png"
+RUN_FILE: Final = "run.json"
+CURVES_FILE: Final = "curves.png"
 Say = Callable[[str], None]
 
 
@@ -83,71 +83,79 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
     also: SecondSource | None = None,
     say: Say | None = None,
 ) -> Path:
-    """Train a model; the same call goes on with a run that was stopped or killed.
+    """Train a model; the same call resumes a run that was stopped or killed.
 
-    On one CPU, with the same number of threads, a run that was resumed has the bits of one that was not. `torchrun`
-    starts it on several GPUs.
+    On one CPU, with the same number of threads, a resumed run has the same bits as an uninterrupted
+    one. `torchrun` starts it on several GPUs.
 
     Args:
-        dataset: the release.
-        out: the run's folder: `run.json`, `log.jsonl`, `curves.png`, `best.safetensors`, `last.safetensors`.
-        choice: the preset and its changes.
-        config: how to train; None for the defaults.
-        weights: to begin from (`checkpoint.read_weights`); what they lack begins at random.
+        dataset: The release.
+        out: The run's folder: `run.json`, `log.jsonl`, `curves.png`, `best.safetensors`,
+            `last.safetensors`.
+        choice: The preset and its changes.
+        config: Rules of the training; None for the defaults.
+        weights: Weights to begin from (`checkpoint.read_weights`); missing parts begin at random.
         device: `auto`, `cpu`, `cuda`, …
-        workers: processes that read; 0 for this one.
-        images_cache: of `V2XConfig`.
-        also: another source to learn from, whose moments come between those of `dataset`; it is not validated.
-        say: told each validation; None for silence, and no progress bar.
+        workers: Number of processes that read; 0 for this process.
+        images_cache: Cache of images, as in `V2XConfig`.
+        also: Another source to learn from; its moments come between the moments of `dataset`, and
+            it is not validated.
+        say: Function that is called with a text after each validation; None for silence, and no
+            progress bar.
 
     Returns:
         The path of the best weights; the last ones if nothing was validated.
 
     Raises:
-        ConfigError: another run is in the folder, there is no such device, or weights do not fit.
-        NotAvailableError: the split has no labelled samples, or the release lacks what the model sees with.
-        WorkerError: a worker process was killed, or cannot send what it has read.
-        DeepAccidentError: as of `AllEgosDataset`.
+        ConfigError: Another run is in the folder, there is no such device, or weights do not fit.
+        NotAvailableError: The split has no labelled samples, or the release lacks the sensors of
+            the model.
+        WorkerError: A worker process was killed, or cannot send the data that it has read.
+        DeepAccidentError: As in `AllEgosDataset`.
     """
     config = TrainConfig() if config is None else config
-    with processes(device) as place:
-        say = say if place.is_first else None
+    with processes(device) as process:
+        say = say if process.is_first else None
         folder = writable_folder(out)
-        moments: Moments | MixedMoments = (first := _moments(dataset, choice, config, images_cache))
+        own_moments = _moments(dataset, choice, config, images_cache)
+        moments: Moments | MixedMoments = own_moments
         if also is not None:
-            there = replace(
-                config, split=also.split, agents="available"
-            )  # nuScenes has no partners
-            moments = MixedMoments((first, _moments(also.dataset, choice, there, None)), also.mix)
+            # nuScenes has no partners.
+            also_config = replace(config, split=also.split, agents="available")
+            also_moments = _moments(also.dataset, choice, also_config, None)
+            moments = MixedMoments((own_moments, also_moments), also.mix)
+        notes = _notes(dataset, choice, config, weights)
+        if also:
+            notes["also"] = also.as_dict()
         run = _Run(
             folder=folder,
-            notes=_notes(dataset, choice, config, weights)
-            | ({"also": also.as_dict()} if also else {}),
+            notes=notes,
             dataset=dataset,
             moments=moments,
-            validated=validation_samples(dataset, config),
+            validation_tokens=validation_samples(dataset, config),
             config=config,
-            place=place,
+            process=process,
             predict=PredictConfig(
                 agents=config.agents,
-                device=place.device,
+                device=process.device,
                 workers=workers,
                 images_cache=images_cache,
             ),
             say=say or (lambda _text: None),
-            bar=say is not None,
+            shows_progress=say is not None,
         )
-        model = new_model(choice, config, weights, run.say)  # what is refused leaves no run behind
-        if place.is_first:
+        # Refused settings or weights leave no run behind, so the model comes before the notes.
+        model = new_model(choice, config, weights, run.say)
+        if process.is_first:
             _claim(folder, run.notes)
         with worker_faults_named():
-            return run.trained(model.to(place.device))
+            return run.train_model(model.to(process.device))
 
 
 def _moments(
     dataset: Dataset, choice: ModelChoice, config: TrainConfig, images_cache: Any
 ) -> Moments:
-    """Those of a source that has what the model sees with."""
+    """Return the moments of a source that has the model's sensors; raises NotAvailableError."""
     moments = Moments(dataset, choice.config, config, images_cache=images_cache)
     check_sensor_files(choice.config, dataset, moments.data.egos[0])
     return moments
@@ -156,7 +164,7 @@ def _moments(
 def new_model(
     choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say
 ) -> V2XFormer:
-    """The model before the first step."""
+    """Return the model before the first step."""
     torch.manual_seed(config.seed)
     model = V2XFormer(choice.config)
     if weights is not None:
@@ -171,7 +179,7 @@ def _notes(
     config: TrainConfig,
     weights: str | os.PathLike[str] | None,
 ) -> dict[str, Any]:
-    """What a run notes of itself, and what must be the same to go on with it."""
+    """Return a run's notes on itself, which must be equal to resume it."""
     return {
         **choice.as_dict(),
         "training": config.as_dict(),
@@ -182,84 +190,102 @@ def _notes(
 
 
 def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
-    """Write a run's notes, or compare them with those that are there; raises ConfigError if they differ."""
-    path = folder / RUN
-    if path.is_file():
-        try:
-            there = parsed_json(read_bytes(path, "bundle"))
-        except (OSError, ValueError) as error:
-            raise ConfigError(
-                f"{path}: cannot be read ({fault_text(error)}); remove it, or train elsewhere"
-            ) from error
-        if text := differing_text(there if isinstance(there, dict) else {}, notes):
-            raise ConfigError(
-                f"{path}: is of another run ({text}); give the same options to go on with it, or another folder"
-            )
+    """Write a run's notes, or raise ConfigError if existing ones differ."""
+    path = folder / RUN_FILE
+    if not path.is_file():
+        write_bytes(path, json.dumps(notes, indent=1).encode())
         return
-    write_bytes(path, json.dumps(notes, indent=1).encode())
+    try:
+        stored_notes = parsed_json(read_bytes(path, "bundle"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({fault_text(error)}); remove it, or train elsewhere"
+        ) from error
+    difference = differing_text(stored_notes if isinstance(stored_notes, dict) else {}, notes)
+    if difference:
+        raise ConfigError(
+            f"{path}: is of another run ({difference}); give the same options to go on with it, or "
+            "another folder"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Run:
     """A run on one process."""
 
+    # Files.
     folder: Path
     notes: Mapping[str, Any]
+    # Data.
     dataset: Dataset
     moments: Moments | MixedMoments
-    validated: Sequence[str]
+    validation_tokens: Sequence[str]
+    # Rules.
     config: TrainConfig
-    place: RunProcess
+    process: RunProcess
     predict: PredictConfig
+    # Messages.
     say: Say
-    bar: bool
+    shows_progress: bool
 
-    def trained(self, model: V2XFormer) -> Path:
-        """Take all steps that are left."""
-        optimizer = optimizer_of(model, self.config)
-        progress = load_state(self.folder, model, optimizer, self.config.steps)
-        step = self._wrapped(model)
-        if self.place.is_first:
+    def train_model(self, model: V2XFormer) -> Path:
+        """Take all remaining steps; return the path of the weights."""
+        config = self.config
+        optimizer = optimizer_of(model, config)
+        progress = load_state(self.folder, model, optimizer, config.steps)
+        training_step = self._training_step(model)
+        if self.process.is_first:
             cut_log(self.folder, progress.step)
         numbers = self.moments.numbers(
-            self.config,
-            first=progress.step * self.config.moments,
-            rank=self.place.rank,
-            ranks=self.place.ranks,
+            config,
+            start=progress.step * config.moments,
+            rank=self.process.rank,
+            ranks=self.process.ranks,
         )
-        given = batches(self.moments, numbers, self.config, workers=self.predict.workers)
-        steps = range(progress.step, self.config.steps)
+        moment_batches = batches(self.moments, numbers, config, workers=self.predict.workers)
         with tqdm(
-            steps, initial=progress.step, total=self.config.steps, unit="step", disable=not self.bar
+            range(progress.step, config.steps),
+            initial=progress.step,
+            total=config.steps,
+            unit="step",
+            disable=not self.shows_progress,
         ) as bar:
             for number in bar:
-                row = self._step(number, step, optimizer, given)
+                row = self._take_step(number, training_step, optimizer, moment_batches)
                 bar.set_postfix(loss=f"{row['loss']:.3g}")
-                progress = self._after(number + 1, row, model, optimizer, progress)
-        best = self.folder / BEST
-        return best if best.is_file() else self._weights(model, progress)
+                progress = self._finish_step(number + 1, row, model, optimizer, progress)
+        best_path = self.folder / BEST_FILE
+        return best_path if best_path.is_file() else self._write_weights(model, progress)
 
-    def _wrapped(self, model: V2XFormer) -> nn.Module:
-        if self.place.ranks == 1:
+    def _training_step(self, model: V2XFormer) -> nn.Module:
+        """Return the model with its losses, connected to the other processes."""
+        if self.process.ranks == 1:
             return TrainingStep(model)
-        if self.place.device.startswith("cuda"):
+        if self.process.device.startswith("cuda"):
             model = nn.SyncBatchNorm.convert_sync_batchnorm(model)
         return DistributedDataParallel(TrainingStep(model))
 
-    def _step(self, number: int, step: nn.Module, optimizer: AdamW, given: Any) -> dict[str, Any]:
-        """One step of the optimizer; all that is random depends on its number."""
-        began = time.perf_counter()
-        step.train()
+    def _take_step(
+        self, number: int, training_step: nn.Module, optimizer: AdamW, moment_batches: Any
+    ) -> dict[str, Any]:
+        """Take a step of the optimizer; return its row of the log.
+
+        All random draws depend on its number.
+        """
+        start_time = time.perf_counter()
+        training_step.train()
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(number, self.config)
         optimizer.zero_grad(set_to_none=True)
-        asked = time.perf_counter()
-        batch = next(given)
-        waited = time.perf_counter() - asked
-        losses = self._losses(step, batch, number)
+        request_time = time.perf_counter()
+        batch = next(moment_batches)
+        waiting_seconds = time.perf_counter() - request_time
+        losses = self._losses(training_step, batch, number)
         torch.stack(list(losses.values())).sum().backward()
-        trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-        norm = float(nn.utils.clip_grad_norm_(trained, self.config.clip))
+        parameters = [
+            parameter for group in optimizer.param_groups for parameter in group["params"]
+        ]
+        norm = float(nn.utils.clip_grad_norm_(parameters, self.config.clip))
         optimizer.step()
         values = {name: float(loss.detach()) for name, loss in losses.items()}
         return {
@@ -268,63 +294,61 @@ class _Run:
             "losses": values,
             "rate": learning_rate(number, self.config),
             "norm": norm,
-            "seconds": time.perf_counter() - began,
-            "waiting": waited,
+            "seconds": time.perf_counter() - start_time,
+            "waiting": waiting_seconds,
         }
 
-    def _losses(self, step: nn.Module, batch: Mapping[str, Any], number: int) -> dict[str, Tensor]:
-        seeds = (
-            self.config.seed,
-            number,
-            0,
-            self.place.rank,
-        )  # the 0 keeps the draws of published runs
+    def _losses(
+        self, training_step: nn.Module, batch: Mapping[str, Any], number: int
+    ) -> dict[str, Tensor]:
+        """Return the losses of a batch by name."""
+        # The 0 preserves the random draws of published runs.
+        seeds = (self.config.seed, number, 0, self.process.rank)
         generator = generator_of(*seeds)
         torch.manual_seed(generator_of(*seeds).initial_seed())  # dropout, and the latents' noise
         inputs, targets = training_batch(batch, self.moments.model, self.config, generator)
         inputs = with_dropped_partners(inputs, self.config, generator)
-        device = self.place.device
-        kind = torch.device(device).type
-        with torch.autocast(kind, dtype=torch.bfloat16, enabled=self.config.bf16):
-            losses: dict[str, Tensor] = step(inputs.to(device), targets.to(device))
+        device = self.process.device
+        device_type = torch.device(device).type
+        with torch.autocast(device_type, dtype=torch.bfloat16, enabled=self.config.bf16):
+            losses: dict[str, Tensor] = training_step(inputs.to(device), targets.to(device))
         return losses
 
-    def _after(
+    def _finish_step(
         self,
-        done: int,
+        step_count: int,
         row: dict[str, Any],
         model: V2XFormer,
         optimizer: AdamW,
         progress: TrainingProgress,
     ) -> TrainingProgress:
-        """Log a step and, every now and then, validate and save."""
-        config, last = self.config, done == self.config.steps
-        progress = replace(progress, step=done)
-        if self.validated and (done % config.validate_every == 0 or last):
-            own = self.validated[self.place.rank :: self.place.ranks]
-            scores = validated(model, self.dataset, own, self.predict)
+        """Log a step, and at regular intervals validate and save; return the progress."""
+        config = self.config
+        is_last = step_count == config.steps
+        progress = replace(progress, step=step_count)
+        if self.validation_tokens and (step_count % config.validate_every == 0 or is_last):
+            tokens = self.validation_tokens[self.process.rank :: self.process.ranks]
+            scores = validated(model, self.dataset, tokens, self.predict)
             row["validation"] = scores
-            self.say(
-                f"step {done:,}: {', '.join(f'{name} {value:.3f}' for name, value in scores.items())}"
-            )
+            scores_text = ", ".join(f"{name} {value:.3f}" for name, value in scores.items())
+            self.say(f"step {step_count:,}: {scores_text}")
             if progress.best is None or scores[SCORE] > progress.best:
                 progress = replace(progress, best=scores[SCORE])
-                self._weights(model, progress, BEST)
-        if self.place.is_first:
+                self._write_weights(model, progress, BEST_FILE)
+        if self.process.is_first:
             add_to_log(self.folder, row)
-            if last or done % config.save_every == 0 or "validation" in row:
+            if is_last or step_count % config.save_every == 0 or "validation" in row:
                 save_state(self.folder, model, optimizer, progress, self.notes)
-            if last or "validation" in row:
-                save_training(read_log(self.folder), self.folder.name, self.folder / CURVES)
+            if is_last or "validation" in row:
+                save_training(read_log(self.folder), self.folder.name, self.folder / CURVES_FILE)
         return progress
 
-    def _weights(self, model: V2XFormer, progress: TrainingProgress, name: str = FINAL) -> Path:
-        """Write the weights alone, on the first process."""
+    def _write_weights(
+        self, model: V2XFormer, progress: TrainingProgress, name: str = FINAL_FILE
+    ) -> Path:
+        """Write the weights without the optimizer, on the first process; return their path."""
         path = self.folder / name
-        if self.place.is_first:
-            write_weights(
-                path,
-                model.state_dict(),
-                {**self.notes, "step": progress.step, "score": progress.best},
-            )
+        if self.process.is_first:
+            notes = {**self.notes, "step": progress.step, "score": progress.best}
+            write_weights(path, model.state_dict(), notes)
         return path

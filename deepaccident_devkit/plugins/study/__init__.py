@@ -1,7 +1,9 @@
-"""Studies: what a recipe trains and compares, cell by cell, with tables, figures and a page (docs/studies.md).
+"""Studies: a recipe trains and compares models cell by cell, with tables, figures and a page.
 
-`recipe` (what is asked), `cells` (what is made once, and kept), `predict` (what a row predicts), `numbers` (of rows and
-their differences), `summary` (all of them, from counts), `figures`, `page`, and `run`, which does all of it.
+docs/studies.md explains them. The modules are `recipe` (what a study asks for), `cells` (what is
+made once and stored), `predict` (the predictions of a row), `numbers` (of rows and their
+differences), `summary` (all numbers, from counts), `figures`, `page`, and `run`, which runs a
+study.
 """
 
 from deepaccident_devkit.plugins.study.recipe import Recipe, read_recipe

@@ -1,14 +1,15 @@
-"""The cells of a study: releases, weights of each seed, rows of each seed. Each is made once, and kept under its key.
+"""The cells of a study, each made once and stored: releases, and weights and rows of each seed.
 
-A key is a digest of all that decides a cell: its part of the recipe, the keys of the cells that it stands on, and the
-devkit's version. So a study that is run again makes what is not there: after a kill the rest, after a change of the
-recipe what has changed; and studies with the same folder share what they have in common. The folder has
+A cell's key is a digest of everything that decides it: its part of the recipe, the keys of the
+cells that it depends on, and the devkit's version. So a study that runs again only makes what is
+missing: after a kill the remaining cells, after a change of the recipe the changed ones; and
+studies with the same folder share their common cells. The folder has
 
-    release/KEY         a release that was made
-    weights/KEY         a training, which goes on from its own last checkpoint
+    release/KEY         a synthetic release
+    weights/KEY         a training, which resumes from its latest checkpoint
     row/KEY             a row's results files, as `deepaccident predict` writes them
     splits/DIGEST.txt   a list of scenarios
-    cells/              the store of what is done: notes, and the counts of each row
+    cells/              the store of finished cells: notes, and the counts of each row
 """
 
 from __future__ import annotations
@@ -53,17 +54,17 @@ if TYPE_CHECKING:
     from deepaccident_devkit.plugins.model import ModelChoice, SecondSource, TrainConfig
     from deepaccident_devkit.support.parallel import Engine
 
-# Makes a cell in its folder, and gives what is kept of it, as JSON holds it.
+# Makes a cell in its folder and returns its notes, as JSON holds them.
 _Work = Callable[[Path], dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
-    """Where cells are made; cheap to pickle.
+class Workspace:
+    """The folder and the device that cells are made with; cheap to pickle.
 
     Attributes:
-        out: the folder; absolute.
-        device: of models.
+        out: Absolute path of the folder.
+        device: Device of models.
     """
 
     out: Path
@@ -71,32 +72,38 @@ class Bench:
 
     @property
     def store(self) -> Store:
-        """What is done."""
+        """The store of finished cells."""
         return Store(self.out / "cells", self.out, "makes cells of a study", ConfigError)
 
     def cell(self, kind: str, name: str, work: _Work, **decides: Any) -> StudyCell:
-        """A cell, with all that decides it, as JSON holds it."""
-        return StudyCell(
-            self, kind, name, digest_of({"devkit": __version__, "kind": kind, **decides}), work
-        )
+        """Return a cell; `decides` is everything that decides it, as JSON holds it."""
+        key = digest_of({"devkit": __version__, "kind": kind, **decides})
+        return StudyCell(self, kind, name, key, work)
 
     def split(self, scenarios: Sequence[str]) -> Path:
-        """A split file of scenarios, named by what it holds."""
+        """Write a split file of scenarios, named by a digest of its content; return its path."""
         path = self.out / "splits" / f"{digest_of(scenarios)}.txt"
         write_split_file(path, scenarios)
         return path
 
-    def make(
-        self, cells: Iterable[StudyCell], label: str, reads: tuple[Path, ...], **how: Unpack[Engine]
+    def make_cells(
+        self,
+        cells: Iterable[StudyCell],
+        label: str,
+        reads: tuple[Path, ...],
+        **engine: Unpack[Engine],
     ) -> None:
-        """Make the cells that are not there, those of one key once; raises SomeFailedError and more, as `Store.run`.
+        """Make the missing cells; cells with the same key are made once.
 
-        `reads` are folders outside that workers must see.
+        `reads` are folders outside the workspace that workers read. Raises SomeFailedError, and the
+        errors of `Store.run`.
         """
-        missing = {f"{each.kind}/{each.key}": each for each in cells if each.kept is None}
-        self.store.run(
-            make, missing, label=label, places=Places(reads=reads, writes=(self.out,)), **how
-        )
+        missing = {}
+        for cell in cells:
+            if cell.notes is None:
+                missing[f"{cell.kind}/{cell.key}"] = cell
+        places = Places(reads=reads, writes=(self.out,))
+        self.store.run(make_cell, missing, label=label, places=places, **engine)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +111,14 @@ class StudyCell:
     """A cell; cheap to pickle.
 
     Attributes:
-        bench: where it is made.
+        workspace: The folder and the device to make it with.
         kind: `release`, `weights` or `row`.
-        name: in the recipe, with the seed.
-        key: the digest of all that decides it.
-        work: makes it.
+        name: Name in the recipe, with the seed.
+        key: Digest of everything that decides the cell.
+        work: Function that makes the cell.
     """
 
-    bench: Bench
+    workspace: Workspace
     kind: str
     name: str
     key: str
@@ -119,54 +126,54 @@ class StudyCell:
 
     @property
     def folder(self) -> Path:
-        """Of its files."""
-        return self.bench.out / self.kind / self.key
+        """The folder of its files."""
+        return self.workspace.out / self.kind / self.key
 
     @property
-    def kept(self) -> dict[str, Any] | None:
-        """What was kept of it; None if it, or its folder, is not there."""
-        content = self.bench.store.kept(f"{self.kind}/{self.key}", self.key, "results")
+    def notes(self) -> dict[str, Any] | None:
+        """The stored notes of the cell; None if they or its folder are missing."""
+        content = self.workspace.store.kept(f"{self.kind}/{self.key}", self.key, "results")
         if content is None or not self.folder.is_dir():
             return None
-        told: dict[str, Any] = parsed_json(gzip.decompress(content), constants=True)
-        return told
+        notes: dict[str, Any] = parsed_json(gzip.decompress(content), constants=True)
+        return notes
 
 
-def make(cell: StudyCell) -> None:
-    """Make a cell, if it is not there; its error names it."""
-    if cell.kept is not None:
+def make_cell(cell: StudyCell) -> None:
+    """Make a cell if it is missing; errors are prefixed with its name."""
+    if cell.notes is not None:
         return
-    began = time.monotonic()
+    start_time = time.monotonic()
     try:
-        told = cell.work(cell.folder)
+        work_notes = cell.work(cell.folder)
     except DeepAccidentError as error:
         raise type(error)(f"{cell.name}: {error}") from error
     notes = {
-        "seconds": round(time.monotonic() - began, 1),
-        "machine": machine(cell.bench.device),
-        **told,
+        "seconds": round(time.monotonic() - start_time, 1),
+        "machine": machine_text(cell.workspace.device),
+        **work_notes,
     }
-    cell.bench.store.keep(
-        f"{cell.kind}/{cell.key}", cell.key, gzip.compress(json.dumps(notes).encode(), mtime=0)
-    )
+    content = gzip.compress(json.dumps(notes).encode(), mtime=0)
+    cell.workspace.store.keep(f"{cell.kind}/{cell.key}", cell.key, content)
 
 
-def machine(device: str) -> str:
-    """What one needs to know of a machine to understand times and last digits."""
+def machine_text(device: str) -> str:
+    """Return a description of the machine, which explains durations and last digits."""
     torch = sys.modules.get("torch")
     packages = f"numpy {np.__version__}" + (f", torch {torch.__version__}" if torch else "")
-    return f"{platform.platform()}, {usable_cores()} cores, Python {platform.python_version()}, {packages}, {device}"
+    python = f"Python {platform.python_version()}"
+    return f"{platform.platform()}, {usable_cores()} cores, {python}, {packages}, {device}"
 
 
-def taken(file: Path, folder: Path) -> dict[str, Any]:
-    """The work on weights that are there: a copy of them, so that they stay as they are."""
-    from deepaccident_devkit.plugins.model.checkpoint import FINAL
+def copy_weights(file: Path, folder: Path) -> dict[str, Any]:
+    """Copy existing weights into a cell's folder, so that the file may change later."""
+    from deepaccident_devkit.plugins.model.checkpoint import FINAL_FILE
 
-    write_bytes(folder / FINAL, read_bytes(file, "weights"))
+    write_bytes(folder / FINAL_FILE, read_bytes(file, "weights"))
     return {}
 
 
-def trained(
+def train_weights(
     dataset: DeepAccident,
     choice: ModelChoice,
     config: TrainConfig,
@@ -175,9 +182,10 @@ def trained(
     device: str,
     folder: Path,
 ) -> dict[str, Any]:
-    """The work on weights that are trained, on a release or two, from others or from random ones (None).
+    """Train weights on one or two releases, from other weights or from random ones (`start` None).
 
-    It notes the mean loss of the last 50 steps, and the seconds of all, before a kill too.
+    Returns the mean loss of the last 50 steps, and the seconds of all steps, including steps before
+    a kill.
     """
     from deepaccident_devkit.plugins.model import train
     from deepaccident_devkit.plugins.model.training_run import one_thread, read_log
@@ -192,16 +200,16 @@ def trained(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Counting:
+class RowEvaluation:
     """The work on a row with one seed: its samples are predicted and counted.
 
     Attributes:
-        dataset: the release of the test.
-        row: of the recipe.
-        selection: the samples.
-        labels: of which motion is predicted, as far ahead as the row looks.
-        weights: of a model.
-        device: where it is.
+        dataset: The release of the test.
+        row: The row of the recipe.
+        selection: The selected samples.
+        labels: Config of the motion labels that are predicted; it has the row's horizon.
+        weights: Weights of a model; None without a model.
+        device: Device of the model.
     """
 
     dataset: DeepAccident
@@ -212,58 +220,64 @@ class Counting:
     device: str
 
     def __call__(self, folder: Path) -> dict[str, Any]:
-        """Write the results files, if they are not there; `counts`: what evaluates them → token → counts."""
+        """Write the results files, if they are missing, and count them.
+
+        Returns `counts`: evaluator → token → counts.
+        """
         if not folder.is_dir():
-            self._predict(folder)
-        dataset, counts, hidden = self.dataset, {}, HiddenActors()
+            self._write_results(folder)
+        counts = {}
         for task, setup in self._setups.items():
-            if task == "accident" and dataset.layout == "nuScenes":
-                continue  # it has none
-            run = evaluate_results(
-                dataset, folder / RESULTS_NAMES[task], setup, self.selection, workers=1
-            )
+            if task == "accident" and self.dataset.layout == "nuScenes":
+                continue  # nuScenes has no accidents
+            path = folder / RESULTS_NAMES[task]
+            run = evaluate_results(self.dataset, path, setup, self.selection, workers=1)
             counts[str(task)] = dict(run.evaluator.counts)
-        motion, boxes = (
-            read_results(folder / RESULTS_NAMES[task]) for task in ("motion", "detection")
-        )
-        for token in self.selection.tokens(dataset):
-            moved, found = (
-                cast("Any", motion.prediction(token)),
-                cast("Any", boxes.prediction(token)),
+        counts[HIDDEN] = self._hidden_actor_counts(folder)
+        return {"counts": counts}
+
+    def _hidden_actor_counts(self, folder: Path) -> dict[str, Any]:
+        """Return the counts of hidden actors by sample token."""
+        hidden_actors = HiddenActors()
+        motion_results = read_results(folder / RESULTS_NAMES["motion"])
+        detection_results = read_results(folder / RESULTS_NAMES["detection"])
+        for token in self.selection.tokens(self.dataset):
+            motion = cast("Any", motion_results.prediction(token))
+            detections = cast("Any", detection_results.prediction(token))
+            ego_from_world = self.dataset.world_from(token, "ego").inverse()
+            ego_detections = DetectedBoxes(
+                boxes=detections.boxes.transform(ego_from_world, "ego"), scores=detections.scores
             )
-            own = found.boxes.transform(dataset.world_from(token, "ego").inverse(), "ego")
-            hidden.update(
-                token, dataset, self.labels, moved, DetectedBoxes(boxes=own, scores=found.scores)
-            )
-        return {"counts": {**counts, HIDDEN: dict(hidden.counts)}}
+            hidden_actors.update(token, self.dataset, self.labels, motion, ego_detections)
+        return dict(hidden_actors.counts)
 
     @property
     def _setups(self) -> Mapping[ResultsTask, EvaluationSetup]:
         horizon = self.labels.future_frames * self.labels.step * FRAME_PERIOD
         return setups_of(str(self.labels.protocol), horizon)
 
-    def _predict(self, place: Path) -> None:
-        labels, tokens, dataset = self.labels, self.selection.tokens(self.dataset), self.dataset
-        motion: Any = {
+    def _write_results(self, path: Path) -> None:
+        """Predict all samples and write one results file a task into a new folder."""
+        labels = self.labels
+        tokens = self.selection.tokens(self.dataset)
+        meta = {"method": self.row.name, "devkit": __version__}
+        motion_options: Any = {
             "grid": labels.grid,
             "step": labels.step * FRAME_PERIOD,
             "labels": labels.protocol,
         }
-        meta = {"method": self.row.name, "devkit": __version__}
-        with replacing_folder(place) as folder, ExitStack() as stack:
-            writers = [
-                ResultsWriter(
-                    folder / RESULTS_NAMES[task],
-                    task,
-                    meta=meta,
-                    **(motion if task == "motion" else {}),
+        with replacing_folder(path) as folder, ExitStack() as stack:
+            writers = []
+            for task in self._setups:
+                options = motion_options if task == "motion" else {}
+                writers.append(
+                    ResultsWriter(folder / RESULTS_NAMES[task], task, meta=meta, **options)
                 )
-                for task in self._setups
-            ]
             for writer in writers:
                 stack.enter_context(writer)
-            for token, found in predictions_of(
-                self.row, self.weights, self.device, dataset, tokens, labels
-            ):
-                for writer, each in zip(writers, cast("Any", found), strict=True):
-                    writer.add(token, each)
+            predictions = predictions_of(
+                self.row, self.weights, self.device, self.dataset, tokens, labels
+            )
+            for token, outputs in predictions:
+                for writer, output in zip(writers, cast("Any", outputs), strict=True):
+                    writer.add(token, output)

@@ -45,13 +45,15 @@ Examples:
 def study(recipe: str, out: Path, smoke: bool, device: str, **options: Any) -> None:
     """Train and compare what RECIPE says, and write tables, figures and a page into OUT/NAME.
 
-    RECIPE is a YAML file, or the name of one that the devkit ships; docs/studies.md explains it. If the command is
-    interrupted or killed, the same command goes on. Studies with the same OUT share releases, weights and rows.
+    RECIPE is a YAML file, or the name of one that the devkit ships; docs/studies.md explains it. If
+    the command is interrupted or killed, the same command goes on. Studies with the same OUT share
+    releases, weights and rows.
     """
     use_threads_sparingly()
-    chosen = read_recipe(recipe, smoke=smoke)
-    if not chosen.weights:
+    study_recipe = read_recipe(recipe, smoke=smoke)
+    if not study_recipe.weights:
         refuse_unused("with a recipe without weights", "device")
-    report = run_study(chosen, out, device=device, progress=True, **engine_of(options))
+    report = run_study(study_recipe, out, device=device, progress=True, **engine_of(options))
+    folder = out / study_recipe.name
     click.echo(report.to_text())
-    click.echo(f"written: {out / chosen.name}; open {out / chosen.name / PAGE_FILE} in a browser")
+    click.echo(f"written: {folder}; open {folder / PAGE_FILE} in a browser")

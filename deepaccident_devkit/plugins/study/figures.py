@@ -1,4 +1,4 @@
-"""Figures of a study: its rows with intervals, and rows over a number such as the latency."""
+"""Figures of a study: rows with intervals, and series of rows over a number such as the latency."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Inches: the width of a panel.
-_PANEL: Final = 2.7
+_PANEL_WIDTH_INCHES: Final = 2.7
 _UNITS: Final = {
     "latency": "s",
     "pose_noise": "m",
@@ -38,95 +37,104 @@ _NOTE: Final = "lines: intervals of 95 % over pairs; pale dots: seeds"
 
 @in_own_settings
 def rows_figure(summary: Mapping[str, Any]) -> Figure:
-    """The rows as dots with their intervals, and pale dots for single seeds; a panel for each main number.
+    """Draw the rows as dots with intervals, and pale dots for single seeds.
 
-    It is one for files (`render.figures.write_report_figure`); in a paper's column it has the first two numbers.
+    There is a panel for each main number; a figure for a paper's column has only the first two.
+    Save it with `render.figures.write_report_figure`.
     """
     rows = summary["rows"]
-    fig, panels = _panels(summary, beside=1.8, height=1.2 + 0.26 * len(rows), sharey=True)
+    height = 1.2 + 0.26 * len(rows)
+    fig, panels = _figure_with_panels(summary, margin=1.8, height=height, sharey=True)
     for number, ax in panels.items():
-        _draw(
-            ax,
-            range(len(rows)),
-            [each["groups"][ALL][number] for each in rows.values()],
-            upright=False,
-        )
+        estimates = [row["groups"][ALL][number] for row in rows.values()]
+        _draw_estimates(ax, range(len(rows)), estimates, upright=False)
         with_light_grid(ax, "x")
-    first = next(iter(panels.values()))
-    first.set_yticks(range(len(rows)), list(rows), fontsize=text_size())
-    first.set_ylim(len(rows) - 0.4, -0.6)
+    left_panel = next(iter(panels.values()))
+    left_panel.set_yticks(range(len(rows)), list(rows), fontsize=text_size())
+    left_panel.set_ylim(len(rows) - 0.4, -0.6)
     return fig
 
 
-def curves_of(summary: Mapping[str, Any]) -> list[str]:
-    """The keys over whose numbers rows vary."""
-    return list(dict.fromkeys(each["over"][0] for each in summary["rows"].values() if each["over"]))
+def series_keys(summary: Mapping[str, Any]) -> list[str]:
+    """Return the keys with a series of rows, such as `latency`."""
+    keys = [row["over"][0] for row in summary["rows"].values() if row["over"]]
+    return list(dict.fromkeys(keys))
 
 
 @in_own_settings
 def curves_figure(summary: Mapping[str, Any], key: str) -> Figure:
-    """The main numbers over one of `curves_of`, such as `latency`: a line for each series of rows; as `rows_figure`."""
-    rows = [each for each in summary["rows"].values() if each["over"] and each["over"][0] == key]
-    fig, panels = _panels(summary, beside=0.6, height=3.0)
+    """Draw the main numbers over one of `series_keys`: a line for each series of rows.
+
+    Its panels and its file are as of `rows_figure`.
+    """
+    rows = [row for row in summary["rows"].values() if row["over"] and row["over"][0] == key]
+    fig, panels = _figure_with_panels(summary, margin=0.6, height=3.0)
+    series_names = list(dict.fromkeys(row["over"][2] for row in rows))
     for number, ax in panels.items():
-        for at, name in enumerate(dict.fromkeys(row["over"][2] for row in rows)):
-            own = [row for row in rows if row["over"][2] == name]
-            found = [row["groups"][ALL][number] for row in own]
-            color = SERIES_COLORS[at % len(SERIES_COLORS)]
-            _draw(ax, [row["over"][1] for row in own], found, upright=True, color=color, label=name)
+        for index, name in enumerate(series_names):
+            series = [row for row in rows if row["over"][2] == name]
+            positions = [row["over"][1] for row in series]
+            estimates = [row["groups"][ALL][number] for row in series]
+            color = SERIES_COLORS[index % len(SERIES_COLORS)]
+            _draw_estimates(ax, positions, estimates, upright=True, color=color, label=name)
         ax.set_xlabel(f"{key.replace('_', ' ')} ({_UNITS[key]})", fontsize=text_size())
         with_light_grid(ax, "both")
-    fig.legend(
-        *next(iter(panels.values())).get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=3,
-        fontsize=text_size(),
-    )
+    handles, labels = next(iter(panels.values())).get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=text_size())
     return fig
 
 
-def _panels(
-    summary: Mapping[str, Any], *, beside: float, height: float, **shared: Any
+def _figure_with_panels(
+    summary: Mapping[str, Any], *, margin: float, height: float, **shared_axes: Any
 ) -> tuple[Figure, dict[str, Axes]]:
-    """A figure with a panel for each main number; inches of the room beside them, and of its height."""
-    numbers = main_numbers(summary)[: 2 if current_style().room == "column" else None]
-    fig = report_figure((beside + _PANEL * len(numbers), height), column=1.1)
-    panels = dict(
-        zip(numbers, fig.subplots(1, len(numbers), squeeze=False, **shared)[0], strict=True)
-    )
+    """Return a figure with a panel for each main number; its margin and height are in inches."""
+    numbers = main_numbers(summary)
+    if current_style().room == "column":
+        numbers = numbers[:2]
+    fig = report_figure((margin + _PANEL_WIDTH_INCHES * len(numbers), height), column=1.1)
+    axes = fig.subplots(1, len(numbers), squeeze=False, **shared_axes)[0]
+    panels = dict(zip(numbers, axes, strict=True))
     for number, ax in panels.items():
         set_title(ax, NUMBERS[number][2], fontsize=text_size())
     fig.supxlabel(_NOTE, fontsize=text_size(), color=MUTED_COLOR)
     return fig, panels
 
 
-def _draw(
+def _draw_estimates(
     ax: Axes,
-    places: Iterable[float],
-    found: Sequence[Mapping[str, Any]],
+    positions: Iterable[float],
+    estimates: Sequence[Mapping[str, Any]],
     *,
     upright: bool,
     color: str = ESTIMATE_COLOR,
     label: str = "",
 ) -> None:
-    """Numbers with intervals and seeds at some places, joined by a line if they stand upright; what is None not."""
-    values, low, high = (
-        np.array([each[name] for each in found], dtype=float) for name in ("value", "low", "high")
+    """Draw numbers with intervals and seeds at positions along an axis.
+
+    Upright numbers stand over the x axis and are joined by a line. Missing values are not drawn.
+    """
+    values, lows, highs = (
+        np.array([estimate[name] for estimate in estimates], dtype=float)
+        for name in ("value", "low", "high")
     )
-    at = np.array(list(places), dtype=float)
-    seeds = [
-        (x, value) for x, each in zip(at, found, strict=True) for value in each["seeds"].values()
-    ]
-    alone = np.array(seeds, dtype=float).reshape(-1, 2).T
-    (ax.vlines if upright else ax.hlines)(at, low, high, color=color, linewidth=1.4)
+    coordinates = np.array(list(positions), dtype=float)
+    seed_points = []
+    for position, estimate in zip(coordinates, estimates, strict=True):
+        for value in estimate["seeds"].values():
+            seed_points.append((position, value))
+    seed_positions, seed_values = np.array(seed_points, dtype=float).reshape(-1, 2).T
+    if upright:
+        ax.vlines(coordinates, lows, highs, color=color, linewidth=1.4)
+        seed_xy, value_xy, marker = (seed_positions, seed_values), (coordinates, values), "o-"
+    else:
+        ax.hlines(coordinates, lows, highs, color=color, linewidth=1.4)
+        seed_xy, value_xy, marker = (seed_values, seed_positions), (values, coordinates), "o"
+    ax.plot(*seed_xy, "o", color=SERIES_COLORS[-1], markersize=3, zorder=1.5)
     ax.plot(
-        *(alone if upright else alone[::-1]), "o", color=SERIES_COLORS[-1], markersize=3, zorder=1.5
-    )
-    ax.plot(
-        *((at, values) if upright else (values, at)),
-        "o-" if upright else "o",
+        *value_xy,
+        marker,
         color=color,
         label=label,
         markersize=5,
-        clip_on=False,  # the whole dot at the end of a range
+        clip_on=False,  # so that a dot at the end of the range is drawn completely
     )

@@ -1,4 +1,4 @@
-"""What a row predicts: by a model, also with spoilt inputs, by a baseline, or what needs no thought."""
+"""The predictions of a row: by a model, also with spoilt inputs, by a baseline, or trivial ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -23,14 +23,26 @@ from deepaccident_devkit.plugins.baselines import (
     predict_detections,
     predict_motion,
 )
+from deepaccident_devkit.plugins.baselines.outlook import MotionModel
 from deepaccident_devkit.plugins.study.recipe import StudyRow
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.cooperation import visible_actors
 
-# Of an item of `V2XDataset`, what is the ego's or no agent's; all else has a place for each agent.
-_OWN: Final = ("token", "agents", "agent_valid", "world_from_ego", "augmentation", "files_missing")
-# Of a sample: motion, accidents, and boxes in world.
-Predicted = tuple[MotionOutput, list[Accident], DetectedBoxes]
+if TYPE_CHECKING:
+    from deepaccident_devkit.plugins.model import PredictConfig, V2XFormer
+    from deepaccident_devkit.plugins.model.results import SamplePrediction
+
+# The parts of an item of `V2XDataset` that are not per agent; all other parts are indexed by agent.
+_SHARED_PARTS: Final = (
+    "token",
+    "agents",
+    "agent_valid",
+    "world_from_ego",
+    "augmentation",
+    "files_missing",
+)
+# The outputs of a sample: motion, accidents, and boxes in the world frame.
+Prediction = tuple[MotionOutput, list[Accident], DetectedBoxes]
 
 
 def predictions_of(
@@ -40,154 +52,183 @@ def predictions_of(
     dataset: Dataset,
     tokens: Sequence[str],
     labels: MotionLabelConfig,
-) -> Iterator[tuple[str, Predicted]]:
-    """Predict samples, one after another; yields their tokens, too.
+) -> Iterator[tuple[str, Prediction]]:
+    """Yield samples' tokens and predictions, one after another.
 
     Args:
-        row: what predicts.
-        weights: of a row that has some.
-        device: where a model is.
-        dataset: the release.
-        tokens: of the samples.
-        labels: of which motion is predicted.
+        row: The row of the recipe.
+        weights: Weights of a model; None without a model.
+        device: Device of the model.
+        dataset: The release.
+        tokens: Tokens of the samples.
+        labels: Config of the motion labels that are predicted.
 
     Raises:
-        ConfigError: the weights were trained for other labels, or latency is longer than a sample's past.
-        NotAvailableError: there is no other pair of scenarios to take partners from.
-        DeepAccidentError: as of `model.predictions`, or of the baselines.
+        ConfigError: The weights were trained for other labels, or latency is longer than a sample's
+            past.
+        NotAvailableError: There is no other pair of scenarios to take partners from.
+        DeepAccidentError: As in `model.predictions`, or the baselines.
     """
     if weights is not None:
-        yield from _by_model(row, weights, device, dataset, tokens, labels)
+        yield from _model_predictions(row, weights, device, dataset, tokens, labels)
         return
     for token in tokens:
-        yield token, _without_model(row, dataset, token, labels)
+        yield token, _prediction_without_model(row, dataset, token, labels)
 
 
-def _without_model(
+def _prediction_without_model(
     row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig
-) -> Predicted:
-    step, seeing = labels.step * FRAME_PERIOD, dict[str, Any](agents=row.cooperating, link=row.link)
+) -> Prediction:
+    """Return the prediction of a baseline or a trivial row."""
     if row.baseline is not None:
-        motion = predict_motion(dataset, token, model=row.baseline, config=labels, **seeing)
-        ahead = predict_accidents(
-            dataset, token, model=row.baseline, horizon=labels.future_frames * step, **seeing
-        )
-        return motion, ahead, predict_detections(dataset, token, **seeing)
+        return _baseline_prediction(row, row.baseline, dataset, token, labels)
     if row.trivial == "labels":
-        told = motion_labels(dataset, token, replace(labels, agents=row.cooperating)).to_present()
-        seen = {OWN_BOX_ID, *visible_actors(dataset, token, **seeing).tolist()}
-        known = [
-            number for actor, number in told.id_map.items() if actor in seen
-        ]  # not who comes into sight later
-        motion = MotionOutput(
-            grid=labels.grid,
-            instances=np.where(np.isin(told.instance, known), told.instance, 0)[None],
-        )
-        foreseen = foreseen_accident(motion, step=step, labels=str(labels.protocol))
-        return (
-            motion,
-            [] if foreseen is None else [foreseen],
-            predict_detections(dataset, token, **seeing),
-        )
-    maps = np.full(
-        (1, labels.label_frames, *labels.grid.shape), row.trivial == "everything", dtype=np.int32
-    )
-    empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
-    return (
-        MotionOutput(grid=labels.grid, instances=maps),
-        [],
-        DetectedBoxes(boxes=empty, scores=np.zeros(0)),
-    )
+        return _label_prediction(row, dataset, token, labels)
+    fill_value = row.trivial == "everything"
+    maps = np.full((1, labels.label_frames, *labels.grid.shape), fill_value, dtype=np.int32)
+    motion = MotionOutput(grid=labels.grid, instances=maps)
+    no_boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
+    return motion, [], DetectedBoxes(boxes=no_boxes, scores=np.zeros(0))
 
 
-def _by_model(
+def _baseline_prediction(
+    row: StudyRow,
+    motion_model: MotionModel,
+    dataset: Dataset,
+    token: str,
+    labels: MotionLabelConfig,
+) -> Prediction:
+    """Return the extrapolation of the actors that the cooperating agents see."""
+    cooperation = dict[str, Any](agents=row.cooperating, link=row.link)
+    motion = predict_motion(dataset, token, model=motion_model, config=labels, **cooperation)
+    horizon = labels.future_frames * (labels.step * FRAME_PERIOD)
+    accidents = predict_accidents(
+        dataset, token, model=motion_model, horizon=horizon, **cooperation
+    )
+    return motion, accidents, predict_detections(dataset, token, **cooperation)
+
+
+def _label_prediction(
+    row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig
+) -> Prediction:
+    """Return the labels of the actors that the agents see at the present."""
+    cooperation = dict[str, Any](agents=row.cooperating, link=row.link)
+    agent_labels = replace(labels, agents=row.cooperating)
+    truth = motion_labels(dataset, token, agent_labels).to_present()
+    visible_ids = {OWN_BOX_ID, *visible_actors(dataset, token, **cooperation).tolist()}
+    # Actors that only come into sight later are left out.
+    visible_numbers = [number for actor, number in truth.id_map.items() if actor in visible_ids]
+    instances = np.where(np.isin(truth.instance, visible_numbers), truth.instance, 0)
+    motion = MotionOutput(grid=labels.grid, instances=instances[None])
+    step = labels.step * FRAME_PERIOD
+    accident = foreseen_accident(motion, step=step, labels=str(labels.protocol))
+    accidents = [] if accident is None else [accident]
+    return motion, accidents, predict_detections(dataset, token, **cooperation)
+
+
+def _model_predictions(
     row: StudyRow,
     weights: Path,
     device: str,
     dataset: Dataset,
     tokens: Sequence[str],
     labels: MotionLabelConfig,
-) -> Iterator[tuple[str, Predicted]]:
+) -> Iterator[tuple[str, Prediction]]:
+    """Yield samples' tokens and predictions by a model."""
     from deepaccident_devkit.plugins.model import PredictConfig, load_model, predictions
-    from deepaccident_devkit.plugins.model.results import prediction_of
     from deepaccident_devkit.plugins.model.training_run import one_thread
-    from deepaccident_devkit.training.torch import V2XDataset, collate
 
     model = load_model(weights).to(device).eval()
-    if (learned := model.config.labels_protocol) != labels.protocol:
+    trained_labels = model.config.labels_protocol
+    if trained_labels != labels.protocol:
         raise ConfigError(
-            f"{weights}: was trained with the labels {learned}; give `labels: {learned}` in the recipe's `test`"
+            f"{weights}: was trained with the labels {trained_labels}; give "
+            f"`labels: {trained_labels}` in the recipe's `test`"
         )
     config = PredictConfig(agents=row.cooperating, link=row.link, device=device)
     if row.control is None:
-        found = predictions(model, dataset, tokens, config)
+        outputs = predictions(model, dataset, tokens, config)
     else:
-        given = model.config.inputs(config.agents, link=config.link)
-        items: Any = V2XDataset(dataset, tokens, given)
-        foreign: Any = (
-            V2XDataset(dataset, strangers_of(tokens), given) if row.control == "strangers" else None
-        )
-        changed = (
-            blanked(items[at]) if foreign is None else with_strangers(items[at], foreign[at])
-            for at in range(len(items))
-        )
-        found = (prediction_of(model, collate([item]), config) for item in changed)
+        outputs = _spoilt_predictions(row, model, dataset, tokens, config)
     with one_thread():
-        for each in found:
-            ahead = (
-                each.accidents
-                if row.baseline is None
-                else detected_accidents(
-                    dataset, each.token, each.boxes, horizon=model.config.horizon
+        for output in outputs:
+            accidents = output.accidents
+            if row.baseline is not None:
+                accidents = detected_accidents(
+                    dataset, output.token, output.boxes, horizon=model.config.horizon
                 )
-            )
-            yield each.token, (each.motion, ahead, each.boxes)
+            yield output.token, (output.motion, accidents, output.boxes)
+
+
+def _spoilt_predictions(
+    row: StudyRow,
+    model: V2XFormer,
+    dataset: Dataset,
+    tokens: Sequence[str],
+    config: PredictConfig,
+) -> Iterator[SamplePrediction]:
+    """Return the model's predictions from inputs that are spoilt by the row's control."""
+    from deepaccident_devkit.plugins.model.results import prediction_of
+    from deepaccident_devkit.training.torch import V2XDataset, collate
+
+    inputs = model.config.inputs(config.agents, link=config.link)
+    items: Any = V2XDataset(dataset, tokens, inputs)
+    spoilt_items: Iterator[dict[str, Any]]
+    if row.control == "strangers":
+        stranger_items: Any = V2XDataset(dataset, strangers_of(tokens), inputs)
+        spoilt_items = (
+            with_strangers(items[index], stranger_items[index]) for index in range(len(items))
+        )
+    else:
+        spoilt_items = (blanked(items[index]) for index in range(len(items)))
+    return (prediction_of(model, collate([item]), config) for item in spoilt_items)
 
 
 def strangers_of(tokens: Sequence[str]) -> list[str]:
-    """For each sample one at the same place in the list of another pair's scenario, whose partners take part in it.
+    """Return a sample of another pair of scenarios for each sample; partners are taken from it.
 
-    Raises NotAvailableError: all are of one pair.
+    It has the same rank among the samples of its scenario. Raises NotAvailableError: all samples
+    are of one pair.
     """
-    scenarios: dict[str, list[str]] = {}
+    tokens_by_scenario: dict[str, list[str]] = {}
     for token in tokens:
-        scenarios.setdefault(scenario_of(token), []).append(token)
-    names, chosen = list(scenarios), []
-    for at, name in enumerate(names):
+        tokens_by_scenario.setdefault(scenario_of(token), []).append(token)
+    scenarios = list(tokens_by_scenario)
+    strangers = []
+    for index, scenario in enumerate(scenarios):
+        candidates = scenarios[index:] + scenarios[:index]
         other = next(
-            (each for each in names[at:] + names[:at] if cluster_of(each) != cluster_of(name)), None
+            (name for name in candidates if cluster_of(name) != cluster_of(scenario)), None
         )
         if other is None:
             raise NotAvailableError(
-                f"{name}: there is no other pair to take strangers from; test on several pairs"
+                f"{scenario}: there is no other pair to take strangers from; test on several pairs"
             )
-        chosen += [
-            scenarios[other][min(rank, len(scenarios[other]) - 1)]
-            for rank in range(len(scenarios[name]))
-        ]
-    return chosen
+        other_tokens = tokens_by_scenario[other]
+        for rank in range(len(tokens_by_scenario[scenario])):
+            strangers.append(other_tokens[min(rank, len(other_tokens) - 1)])
+    return strangers
 
 
 def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
-    """An item of `V2XDataset` with all images black, and no point in any cloud."""
-    images = {name: item[name] * 0 for name in ("images",) if name in item}
-    points = {
-        name: [[cloud[:0] for cloud in each] for each in item[name]]
-        for name in ("points",)
-        if name in item
-    }
-    return {**item, **images, **points}
+    """Return an item of `V2XDataset` with black images and clouds without points."""
+    blank = dict(item)
+    if "images" in item:
+        blank["images"] = item["images"] * 0
+    if "points" in item:
+        blank["points"] = [[cloud[:0] for cloud in clouds] for clouds in item["points"]]
+    return blank
 
 
 def with_strangers(item: Mapping[str, Any], stranger: Mapping[str, Any]) -> dict[str, Any]:
-    """An item whose partners' sensors and poses are those of another item's agents with the same names."""
-    changed = {
-        name: copy(value) if isinstance(value, list) else value.clone()
-        for name, value in item.items()
-        if name not in _OWN
-    }
+    """Return an item with partners' sensors and poses from another item's agents of these names."""
+    changed = {}
+    for name, value in item.items():
+        if name not in _SHARED_PARTS:
+            changed[name] = copy(value) if isinstance(value, list) else value.clone()
     for slot, name in enumerate(item["agents"]):
         if slot and name in stranger["agents"]:
+            stranger_slot = stranger["agents"].index(name)
             for key, values in changed.items():
-                values[slot] = stranger[key][stranger["agents"].index(name)]
+                values[slot] = stranger[key][stranger_slot]
     return {**item, **changed}

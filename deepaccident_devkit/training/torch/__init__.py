@@ -9,10 +9,11 @@
     data = V2XDataset(da, da.training_samples("train"), config)
     loader = DataLoader(data, batch_size=2, shuffle=True, num_workers=4, collate_fn=collate)
 
-`V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch; without `collate_fn` a loader uses
-`collate`. `AllEgosDataset` and `collate_all_egos` have the targets of all agents for one reading of their sensors.
-docs/training.md has a training loop. `merged_evaluator` is for several GPUs.
-Only this package imports torch; importing it without torch raises MissingExtraError.
+`V2XDataset` describes an item, `collate` and `collate_fusion` describe a batch; without
+`collate_fn` a loader uses `collate`. `AllEgosDataset` and `collate_all_egos` have the targets of
+all agents for one reading of their sensors. docs/training.md has a training loop.
+`merged_evaluator` is for several GPUs. Only this package imports torch; importing it without torch
+raises MissingExtraError.
 """
 
 from deepaccident_devkit.errors import MissingExtraError
@@ -21,8 +22,8 @@ try:
     import torch  # noqa: F401 - nothing here works without it
 except ModuleNotFoundError as error:
     raise MissingExtraError(
-        "the torch adapter needs PyTorch: in a checkout, pip install '.[torch]' "
-        "(for its CPU build alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
+        "the torch adapter needs PyTorch: in a checkout, pip install '.[torch]' (for its CPU build "
+        "alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
     ) from error
 
 from deepaccident_devkit.export.images import ImageConfig

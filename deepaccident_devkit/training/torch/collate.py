@@ -1,7 +1,8 @@
-"""Items of a `V2XDataset`, batches of them for a DataLoader's `collate_fn`, and one evaluator of several ranks' counts.
+"""Items of a `V2XDataset`, batches of them for a DataLoader, and a merge of several ranks' counts.
 
-Training on several ranks needs nothing else of the devkit's: `V2XDataset` draws augmentations by position and epoch, so
-ranks that take different positions from torch's `DistributedSampler` draw different ones.
+Training on several ranks needs no other part of the devkit: `V2XDataset` draws augmentations by
+position and epoch, so ranks that take different positions from torch's `DistributedSampler` draw
+different ones.
 """
 
 from __future__ import annotations
@@ -27,181 +28,184 @@ _MATRICES: Final = (
     "ego_from_camera",
     "image_from_ego",
 )
-# Tensors whose first axis counts agents.
-_OF_AGENTS: Final = ("agent_valid", "files_missing", "images", *_MATRICES)
-_OF_BOXES: Final = ("boxes", "velocity_known", "categories", "actor_ids")
+# Keys of tensors with the agents as their first axis.
+_AGENT_KEYS: Final = ("agent_valid", "files_missing", "images", *_MATRICES)
+_BOX_KEYS: Final = ("boxes", "velocity_known", "categories", "actor_ids")
 # Keys that stay lists with one entry for each item: texts, and tensors of different lengths.
-_LISTS: Final = ("token", "agents", "points", *_OF_BOXES)
-# Keys of `AllEgosDataset` items alone.
-_OF_EGOS: Final = ("egos", "partners", "targets")
+_LIST_KEYS: Final = ("token", "agents", "points", *_BOX_KEYS)
+# Keys that only `AllEgosDataset` items have.
+_EGO_KEYS: Final = ("egos", "partners", "targets")
+# Size up to which a tensor is copied, because shared memory takes 1 ms to set up.
+_MAX_COPIED_BYTES: Final = 1 << 16
 
 
 class V2XItem(dict[str, Any]):
-    """An item of a `V2XDataset`: a dict that prints in a line, and that a DataLoader without `collate_fn` can batch."""
+    """An item of a `V2XDataset`: a dict with a short text, which torch batches by `collate`."""
 
     def __repr__(self) -> str:
-        """Its token, its agents, and the names of what else it holds."""
-        others = [name for name in self if name not in ("token", "agents")]
-        return f"V2XItem({self.get('token')}, agents {self.get('agents')}: {', '.join(others)})"
+        """Return its token, its agents, and the names of its other contents."""
+        names = [name for name in self if name not in ("token", "agents")]
+        return f"V2XItem({self.get('token')}, agents {self.get('agents')}: {', '.join(names)})"
 
 
 class _WorkersBatch(dict[str, Any]):
-    """A batch in a worker, which its receiver gets as a dict."""
+    """A batch in a worker; the process that receives it gets a dict."""
 
 
 def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """B items as one dict with an axis of agents: for models with a fixed number of agents, or with a mask for them.
+    """Return B items as one dict with an axis of agents.
 
-    `token`, `agents`, `points` and the boxes (`boxes`, `velocity_known`, `categories`, `actor_ids`) of the items
-    (`V2XDataset`) become lists of B. All other tensors are stacked, (B, …). If items have different numbers of agents,
-    (B, A, …) is filled with agents whose `agent_valid` is False, images are 0 and matrices are the identity.
+    It is for models with a fixed number of agents, or with a mask for them. `token`, `agents`,
+    `points` and the boxes (`boxes`, `velocity_known`, `categories`, `actor_ids`) of the items
+    (`V2XDataset`) become lists of B. All other tensors are stacked, (B, …). If items have different
+    numbers of agents, (B, A, …) is filled with agents with `agent_valid` False, images of 0 and
+    identity matrices.
 
     Raises:
-        ConfigError: there are no items, or they do not fit together: other configurations, images of different sizes.
+        ConfigError: There are no items, or they do not fit together: other configurations, images
+            of different sizes.
     """
     from torch.utils.data import get_worker_info
 
     _check_alike(items)
-    agents = max(len(item["agents"]) for item in items)
+    agent_count = max(len(item["agents"]) for item in items)
     batch: dict[str, Any] = {} if get_worker_info() is None else _WorkersBatch()
     for key in items[0]:
         values = [item[key] for item in items]
-        if key in _LISTS:
+        if key in _LIST_KEYS:
             batch[key] = values
-        elif key in _OF_AGENTS:
-            batch[key] = _joined(key, [_with_agents(key, value, agents)[None] for value in values])
+        elif key in _AGENT_KEYS:
+            padded = [_with_agents(key, value, agent_count)[None] for value in values]
+            batch[key] = _joined(key, padded)
         else:
             batch[key] = _joined(key, [value[None] for value in values])
     return batch
 
 
 def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """B items as one dict with the agents of all items one after another: for V2X fusion models like those of OpenCOOD.
+    """Return B items as one dict with the agents of all items one after another.
 
-    Agents whose present data did not arrive are left out (for the others, `agent_valid` still says which past data are
-    missing); the sample's own agent is always the first of its item. N is the number of remaining agents in the whole
-    batch. The dict is that of `collate`, but tensors of agents are (N, …) instead of (B, A, …), `points` is a list of
-    N, and `agents` is a list of B tuples of names. In addition:
+    It is for V2X fusion models such as OpenCOOD's. Agents with no data at the present are left
+    out (for the others, `agent_valid` still marks missing past data); the sample's own agent is
+    always the first of its item. N is the number of remaining agents in the complete batch. The
+    dict is that of `collate`, but tensors of agents are (N, …) instead of (B, A, …), `points` is a
+    list of N, and `agents` is a list of B tuples of names. In addition:
 
-    - `record_len` (B,) int64: how many agents each item has; they add up to N.
-    - `pairwise_t_matrix` (B, L, L, 4, 4) float32, L = 5: [b, i, j] converts points of agent i's ego frame to agent j's,
-      `j_from_i` = `ego_from_j`⁻¹ · `ego_from_i`, at the present, so that [b, i, 0] gives the sample's own ego frame.
-      It is augmented like the points, with the link's errors; the identity on the diagonal and beyond `record_len`.
+    - `record_len` (B,) int64: number of agents of each item; the sum is N.
+    - `pairwise_t_matrix` (B, L, L, 4, 4) float32, L = 5: [b, i, j] converts points of agent i's ego
+      frame to agent j's, `j_from_i` = `ego_from_j`⁻¹ · `ego_from_i`, at the present, so that [b, i,
+      0] leads to the sample's own ego frame. It is augmented like the points, with the link's
+      errors; the identity on the diagonal and beyond `record_len`.
 
-    OpenCOOD's own frames are those of the LiDARs, left-handed like CARLA's; these are ego frames, right-handed.
+    OpenCOOD's own frames are the LiDARs' frames, left-handed like CARLA's; these are ego frames,
+    right-handed.
 
     Raises:
-        ConfigError: there are no items, or they do not fit together: other configurations, images of different sizes.
+        ConfigError: There are no items, or they do not fit together: other configurations, images
+            of different sizes.
     """
     import torch
 
     _check_alike(items)
-    present = [item["agent_valid"][:, -1] for item in items]
-    batch = collate(
-        [{key: value for key, value in item.items() if key not in _OF_AGENTS} for item in items]
-    )
-    for key in _OF_AGENTS:
+    batch = collate([_without_keys(item, _AGENT_KEYS) for item in items])
+    masks = [item["agent_valid"][:, -1] for item in items]
+    for key in _AGENT_KEYS:
         if key in items[0]:
-            batch[key] = _joined(
-                key, [item[key][kept] for item, kept in zip(items, present, strict=True)]
-            )
-    kept_rows = [kept.nonzero()[:, 0].tolist() for kept in present]
-    batch["agents"] = [
-        tuple(item["agents"][row] for row in rows)
-        for item, rows in zip(items, kept_rows, strict=True)
-    ]
+            parts = [item[key][mask] for item, mask in zip(items, masks, strict=True)]
+            batch[key] = _joined(key, parts)
+    rows_of_items = [mask.nonzero()[:, 0].tolist() for mask in masks]
+    names, points = [], []
+    for item, rows in zip(items, rows_of_items, strict=True):
+        names.append(tuple(item["agents"][row] for row in rows))
+        if "points" in batch:
+            points += [item["points"][row] for row in rows]
+    batch["agents"] = names
     if "points" in batch:
-        batch["points"] = [
-            item["points"][row] for item, rows in zip(items, kept_rows, strict=True) for row in rows
-        ]
-    batch["record_len"] = torch.tensor([len(rows) for rows in kept_rows])
-    batch["pairwise_t_matrix"] = torch.stack(
-        [
-            _pairwise(item["ego_from_agent"][kept, -1])
-            for item, kept in zip(items, present, strict=True)
-        ]
-    )
+        batch["points"] = points
+    batch["record_len"] = torch.tensor([len(rows) for rows in rows_of_items])
+    transforms = []
+    for item, mask in zip(items, masks, strict=True):
+        transforms.append(_pairwise_transforms(item["ego_from_agent"][mask, -1]))
+    batch["pairwise_t_matrix"] = torch.stack(transforms)
     return batch
 
 
 def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """B moments as one dict, with an axis of the G egos of all of them one after another.
+    """Return B moments as one dict, with an axis of the G egos of all of them one after another.
 
-    Sensor data are as of `collate`, (B, A, …). In addition:
+    Sensor data are as in `collate`, (B, A, …). In addition:
 
-    - `egos`: list of G tokens. `ego_rows` (G, 2) int64: the item and the agent that each ego is.
-    - `partners` (G, A) bool: which agents of that item cooperate with it.
-    - the targets: stacked, (G, …), or for boxes lists of G.
+    - `egos`: list of G tokens. `ego_rows` (G, 2) int64: the item and the agent of each ego.
+    - `partners` (G, A) bool: the agents of that item that cooperate with it.
+    - the targets: stacked, (G, …), or lists of G for boxes.
 
     Raises:
-        ConfigError: as of `collate`.
+        ConfigError: As in `collate`.
     """
     import torch
 
     _check_alike(items)
-    batch = collate(
-        [{key: value for key, value in item.items() if key not in _OF_EGOS} for item in items]
-    )
-    batch["egos"] = [ego for item in items for ego in item["egos"]]
-    names = [
-        (b, item["agents"].index(ego.rsplit("/", 2)[1]))
-        for b, item in enumerate(items)
-        for ego in item["egos"]
-    ]
-    batch["ego_rows"] = torch.tensor(names, dtype=torch.int64).reshape(-1, 2)
-    agents = max(len(item["agents"]) for item in items)
-    padded = [
-        torch.nn.functional.pad(item["partners"], (0, agents - len(item["agents"])))
-        for item in items
-    ]
-    batch["partners"] = torch.cat(padded)
-    targets = [target for item in items for target in item["targets"]]
+    batch = collate([_without_keys(item, _EGO_KEYS) for item in items])
+    agent_count = max(len(item["agents"]) for item in items)
+    egos, ego_rows, partners, targets = [], [], [], []
+    for index, item in enumerate(items):
+        for ego in item["egos"]:
+            agent = ego.rsplit("/", 2)[1]
+            egos.append(ego)
+            ego_rows.append((index, item["agents"].index(agent)))
+        missing_count = agent_count - len(item["agents"])
+        partners.append(torch.nn.functional.pad(item["partners"], (0, missing_count)))
+        targets += item["targets"]
+    batch["egos"] = egos
+    batch["ego_rows"] = torch.tensor(ego_rows, dtype=torch.int64).reshape(-1, 2)
+    batch["partners"] = torch.cat(partners)
     for key in targets[0]:
         values = [target[key] for target in targets]
-        batch[key] = values if key in _OF_BOXES else torch.stack(values)
+        batch[key] = values if key in _BOX_KEYS else torch.stack(values)
     return batch
 
 
+def _without_keys(item: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    """Return an item without some keys."""
+    return {key: value for key, value in item.items() if key not in keys}
+
+
 def _collate_by_default(items: Sequence[V2XItem], **_: object) -> dict[str, Any]:
-    """`collate` or, for all egos, `collate_all_egos`, as torch calls it for a type of item."""
+    """Collate with `collate` or, for all egos, `collate_all_egos`; torch calls this for items."""
     return collate_all_egos(items) if "egos" in items[0] else collate(items)
 
 
-with suppress(ImportError):  # torch's documented registry, which has no public place
+with suppress(ImportError):  # torch's documented registry, which has no public module
     from torch.utils.data._utils.collate import default_collate_fn_map
 
-    default_collate_fn_map.update(
-        {V2XItem: _collate_by_default}
-    )  # the site's mock of torch takes no items
+    # The documentation's mock of torch does not support assignment by key.
+    default_collate_fn_map.update({V2XItem: _collate_by_default})
 
 
 class _ByValue:
-    """A small tensor, as an array: copied where others become shared memory."""
+    """A small tensor as an array: it is copied, whereas larger tensors become shared memory."""
 
     def __init__(self, array: AnyArray) -> None:
         self._array = array
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Unpickled, the tensor itself."""
+        """Return the tensor itself when it is unpickled."""
         import torch
 
         return torch.from_numpy, (self._array,)
 
 
 def _sent(value: Any) -> Any:
-    """A part of an item or a batch, as a worker hands it over."""
+    """Return a part of an item or a batch in the form in which a worker sends it."""
     import torch
 
     if type(value) in (list, tuple):
         return type(value)(map(_sent, value))
     if isinstance(value, dict):
-        return {key: _sent(each) for key, each in value.items()}
-    if (
-        isinstance(value, torch.Tensor) and value.nbytes <= 1 << 16
-    ):  # shared memory takes 1 ms to set up
-        with suppress(
-            TypeError, RuntimeError
-        ):  # numpy lacks its type, or it is on a GPU, or has a gradient
+        return {key: _sent(part) for key, part in value.items()}
+    if isinstance(value, torch.Tensor) and value.nbytes <= _MAX_COPIED_BYTES:
+        # numpy may lack its type, or it may be on a GPU, or have a gradient.
+        with suppress(TypeError, RuntimeError):
             return _ByValue(value.numpy())
     return value
 
@@ -211,18 +215,23 @@ ForkingPickler.register(_WorkersBatch, lambda batch: (dict, (_sent(batch),)))
 
 
 def _check_alike(items: Sequence[dict[str, Any]]) -> None:
+    """Check that there are items, and that all have equal keys; raises ConfigError."""
     if not items:
         raise ConfigError("batch: expected at least one item, found none")
     for item in items[1:]:
         differing = sorted(item.keys() ^ items[0].keys())
         if differing:
             raise ConfigError(
-                f"batch: only some of the items have {differing[0]!r}; batch items of one V2XConfig at a time"
+                f"batch: only some of the items have {differing[0]!r}; batch items of one "
+                "V2XConfig at a time"
             )
 
 
 def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
-    """Parts (n, …) one after another (N, …), a single one as it is; raises ConfigError if other axes differ."""
+    """Return parts (n, …) one after another (N, …); a single part is unchanged.
+
+    Raises ConfigError if other axes differ.
+    """
     import torch
     from torch.utils.data import default_collate
 
@@ -240,61 +249,65 @@ def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(parts))
 
 
-def _pairwise(ego_from_agent: Tensor) -> Tensor:
-    """(L, L, 4, 4) of (n, 4, 4), padded with identities."""
+def _pairwise_transforms(ego_from_agent: Tensor) -> Tensor:
+    """Return the transforms (L, L, 4, 4) between n agents (n, 4, 4), padded with identities."""
     import torch
 
     count = len(ego_from_agent)
     exact = ego_from_agent.double()
-    result = torch.eye(4).repeat(len(AGENTS), len(AGENTS), 1, 1)
-    result[:count, :count] = (torch.linalg.inv(exact)[None, :] @ exact[:, None]).float()
-    result[range(count), range(count)] = torch.eye(4)
-    return result
+    transforms = torch.eye(4).repeat(len(AGENTS), len(AGENTS), 1, 1)
+    transforms[:count, :count] = (torch.linalg.inv(exact)[None, :] @ exact[:, None]).float()
+    transforms[range(count), range(count)] = torch.eye(4)
+    return transforms
 
 
 def _with_agents(key: str, value: Tensor, count: int) -> Tensor:
-    """A tensor (A, …), filled at the end with blank agents up to `count`."""
+    """Return a tensor (A, …), filled at the end with blank agents up to `count`."""
     import torch
 
-    missing = count - len(value)
-    if not missing:
+    missing_count = count - len(value)
+    if not missing_count:
         return value
-    blank = torch.zeros((missing, *value.shape[1:]), dtype=value.dtype)
+    blank = torch.zeros((missing_count, *value.shape[1:]), dtype=value.dtype)
     if key in _MATRICES:
         blank[...] = torch.eye(value.shape[-1])
     return torch.cat([value, blank])
 
 
 def merged_evaluator(evaluator: EvaluatorT, group: ProcessGroup | None = None) -> EvaluatorT:
-    """All ranks' counts in one new evaluator, on every rank; to be called by all of them.
+    """Return all ranks' counts in one new evaluator, on every rank; all ranks must call it.
 
-    Counts are small and go by token, and are summed exactly: the result has the bits of one process that counted all
-    samples. A sample that ranks counted alike, as after `DistributedSampler`, counts once (`Evaluator.repeated`).
+    Counts are small and stored by token, and are summed exactly: the result has the bits of one
+    process that counted all samples. A sample that ranks counted alike, as after
+    `DistributedSampler`, counts once (`Evaluator.repeated`).
 
     Args:
-        evaluator: this rank's, which stays as it is.
-        group: whose processes take part; None for all. With NCCL, objects go over the GPUs, so each process first needs
-            `torch.cuda.set_device`; a group with `gloo` needs no GPU.
+        evaluator: This rank's evaluator, which is not changed.
+        group: Group of the processes that take part; None for all. With NCCL, objects go over the
+            GPUs, so each process first needs `torch.cuda.set_device`; a group with `gloo` needs no
+            GPU.
 
     Returns:
-        An evaluator with all samples; a copy of this one's where `torch.distributed` was not set up.
+        An evaluator with all samples; a copy of this evaluator if `torch.distributed` was not set
+        up.
 
     Raises:
-        EvaluationError: on all ranks, if one gave no evaluator, or one of other settings, or two counted the same
-            sample differently.
+        EvaluationError: On all ranks, if one passed no evaluator, or one of other settings, or two
+            counted the same sample differently.
     """
     from torch import distributed
 
-    gathered: list[Any] = [evaluator]
+    evaluators: list[Any] = [evaluator]
     if distributed.is_available() and distributed.is_initialized():
-        gathered = [None] * distributed.get_world_size(group)
-        distributed.all_gather_object(gathered, evaluator, group)
-    for rank, each in enumerate(gathered):
-        if not isinstance(each, Evaluator):
+        evaluators = [None] * distributed.get_world_size(group)
+        distributed.all_gather_object(evaluators, evaluator, group)
+    for rank, rank_evaluator in enumerate(evaluators):
+        if not isinstance(rank_evaluator, Evaluator):
             raise EvaluationError(
-                f"evaluator: expected an Evaluator, such as MotionEvaluator(), rank {rank} has {each!r}"
+                "evaluator: expected an Evaluator, such as MotionEvaluator(), rank "
+                f"{rank} has {rank_evaluator!r}"
             )
-    merged: EvaluatorT = gathered[0].fresh()
-    for each in gathered:
-        merged.merge(each)
+    merged: EvaluatorT = evaluators[0].fresh()
+    for rank_evaluator in evaluators:
+        merged.merge(rank_evaluator)
     return merged

@@ -31,41 +31,45 @@ from deepaccident_devkit.v2x.messages import Message, messages
 
 _NO_POINTS: Final = np.zeros((0, 4), dtype=np.float32)
 Received = Sequence[Mapping[AgentName, Message]]
-"""For each past frame, the present last: sender → its message, for messages that arrived."""
+"""For each past frame, the present last: sender → its message, if it arrived."""
 # Name → rows and columns.
 _MATRICES: Final = {"intrinsics": 3, "ego_from_camera": 4, "image_from_ego": 4}
 
 
 def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentName, ...]:
-    """The sample's own agent and those that cooperate with it; the errors are those of `v2x.cooperating_agents`."""
-    own = cooperating_agents(dataset, sample, "single")
-    return tuple(dict.fromkeys([*own, *cooperating_agents(dataset, sample, agents)]))
+    """Return the sample's own agent and the agents that cooperate with it.
+
+    Errors are as in `v2x.cooperating_agents`.
+    """
+    own_agent = cooperating_agents(dataset, sample, "single")
+    return tuple(dict.fromkeys([*own_agent, *cooperating_agents(dataset, sample, agents)]))
 
 
-def received(
+def received_messages(
     dataset: Dataset, sample: str, names: tuple[AgentName, ...], config: V2XConfig
 ) -> Received:
-    """The messages that arrive at a sample and at the `config.past` − 1 moments before it, each through the link.
+    """Return the messages that arrive at a sample and at the `config.past` − 1 moments before it.
 
-    A moment before the recording has no messages. If latency asks for data from before the recording, the moment has no
-    messages of partners; at the sample itself that raises ConfigError.
+    Each moment's messages come through the link. A moment before the recording has no messages. If
+    latency asks for data from before the recording, the moment has no messages of partners; at the
+    sample itself that raises ConfigError.
     """
     scenario, ego, number = sample.rsplit("/", 2)
-    result: list[dict[AgentName, Message]] = []
+    received: list[dict[AgentName, Message]] = []
     for steps_back in range(config.past - 1, -1, -1):
         index = int(number) - steps_back * (config.step or 1)
         if index < 1:
-            result.append({})
+            received.append({})
             continue
-        heard = names if not steps_back or _reaches(config.link, index) else names[:1]
-        then = sample_token(scenario, ego, index)
-        result.append(
-            {message.agent: message for message in messages(dataset, then, heard, config.link)}
-        )
-    return result
+        senders = names if not steps_back or _reaches(config.link, index) else names[:1]
+        moment = sample_token(scenario, ego, index)
+        moment_messages = messages(dataset, moment, senders, config.link)
+        received.append({message.agent: message for message in moment_messages})
+    return received
 
 
 def _reaches(link: Link | None, index: int) -> bool:
+    """Return whether data that arrive at a frame (from 1) are from the recording."""
     return link is None or index > link.latency_frames
 
 
@@ -79,54 +83,60 @@ def with_files(
     *,
     needs_own: bool = True,
 ) -> tuple[Received, IntArray]:
-    """The messages whose sensor files are all there, and how many files each agent and frame (A, P) lacks.
+    """Return the messages with all their sensor files, and the number of missing files (A, P).
 
-    With a cache, images are there if it has them.
+    The numbers are of each agent and frame. With a cache, images exist if the cache has them.
 
     Raises:
-        MissingFileError: a file is not there, by `on_missing`; or one of the sample's own at the present is not, and it
-            `needs_own`.
+        MissingFileError: A file is missing and `on_missing` forbids it; or a file of the sample's
+            own agent at the present is missing, and it `needs_own`.
     """
-    channels = (*[LIDAR] * config.points, *(() if config.images is None else config.images.cameras))
+    channels: list[str] = [LIDAR] if config.points else []
+    if config.images is not None:
+        channels += config.images.cameras
     skippable = MissingFiles(dataset.dataroot, config.on_missing)
-    necessary = MissingFiles(
-        dataset.dataroot, "skip"
-    )  # their error has another remedy than skipping
+    necessary = MissingFiles(dataset.dataroot, "skip")  # their error has another remedy
 
-    def lacks(token: str, channel: str, *, own: bool) -> bool:
+    def lacks(token: str, channel: str, *, is_own: bool) -> bool:
         if cache is not None and channel != LIDAR:
-            return (own or config.on_missing == "skip") and not cache.has(
-                token
-            )  # else the error comes from loading it
-        return not (necessary if own else skippable).has(dataset.sensor_path(token), channel)
+            # Otherwise loading the image raises the error.
+            return (is_own or config.on_missing == "skip") and not cache.has(token)
+        files = necessary if is_own else skippable
+        return not files.has(dataset.sensor_path(token), channel)
 
-    lacking = np.zeros((len(names), len(arrived)), dtype=np.int64)
-    for p in reversed(range(len(arrived))):  # the present first, whose lack cannot be helped
-        for name, message in arrived[p].items():
-            own = needs_own and message.sample == sample
-            absent = [
-                channel
-                for channel in channels
-                if lacks(f"{message.sample}/{channel}", channel, own=own)
-            ]
-            if own and absent:
-                where = "" if cache is None or absent[0] == LIDAR else " in the cache of images"
+    missing_counts = np.zeros((len(names), len(arrived)), dtype=np.int64)
+    # The present comes first, because its missing files are an error.
+    for frame in reversed(range(len(arrived))):
+        for name, message in arrived[frame].items():
+            is_own = needs_own and message.sample == sample
+            missing = []
+            for channel in channels:
+                if lacks(f"{message.sample}/{channel}", channel, is_own=is_own):
+                    missing.append(channel)
+            if is_own and missing:
+                location = "" if cache is None or missing[0] == LIDAR else " in the cache of images"
                 raise MissingFileError(
-                    f"{dataset.sensor_path(f'{sample}/{absent[0]}')}: no such file{where}; {sample} lacks "
-                    f"{len(absent)} of the {len(channels)} files of its own agent, which cannot be skipped; unpack the "
-                    "archives that hold them, choose other sensors, or take only samples that have them: "
-                    f"da.training_samples(split, sensors={list(channels)})"
+                    f"{dataset.sensor_path(f'{sample}/{missing[0]}')}: no such file{location}; "
+                    f"{sample} lacks {len(missing)} of the {len(channels)} files of its own agent, "
+                    "which cannot be skipped; unpack the archives that hold them, choose other "
+                    "sensors, or take only samples that have them: "
+                    f"da.training_samples(split, sensors={channels})"
                 )
-            lacking[names.index(name), p] = len(absent)
-    there = [
-        {name: message for name, message in moment.items() if not lacking[names.index(name), p]}
-        for p, moment in enumerate(arrived)
-    ]
-    return there, lacking
+            missing_counts[names.index(name), frame] = len(missing)
+    complete = []
+    for frame, moment in enumerate(arrived):
+        complete.append(
+            {
+                name: message
+                for name, message in moment.items()
+                if not missing_counts[names.index(name), frame]
+            }
+        )
+    return complete, missing_counts
 
 
 def valid_mask(names: Sequence[AgentName], arrived: Received) -> BoolArray:
-    """(A, P) bool, which messages arrived."""
+    """Return whether each message arrived, (A, P) bool."""
     return np.array([[name in moment for moment in arrived] for name in names])
 
 
@@ -137,45 +147,57 @@ def relative_poses(
     arrived: Received,
     augmentation: Augmentation,
 ) -> AnyArray:
-    """`ego_from_agent` (A, P, 4, 4) float32: augmented, with the link's errors; the identity without a message."""
+    """Return `ego_from_agent` (A, P, 4, 4) float32: augmented, with the link's errors.
+
+    It is the identity without a message.
+    """
     ego_from_world = dataset.world_from(sample, "ego").inverse()
     poses = np.tile(np.eye(4), (len(names), len(arrived), 1, 1))
-    for a, name in enumerate(names):
-        for p, moment in enumerate(arrived):
+    for agent, name in enumerate(names):
+        for frame, moment in enumerate(arrived):
             if name in moment and moment[name].sample != sample:
                 pose = moment[name].target_from(dataset, "ego", ego_from_world).matrix
-                poses[a, p] = augmented_pose(pose, augmentation)
+                poses[agent, frame] = augmented_pose(pose, augmentation)
     return poses.astype(np.float32)
 
 
 def own_motions(
     dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> AnyArray:
-    """`agent_from_past` (A, P, 4, 4) float32: augmented, exact; the identity without a message."""
+    """Return `agent_from_past` (A, P, 4, 4) float32: augmented, exact.
+
+    It is the identity without a message.
+    """
     poses = np.tile(np.eye(4), (len(names), len(arrived), 1, 1))
-    for a, name in enumerate(names):
+    for agent, name in enumerate(names):
         if name not in arrived[-1]:
             continue
         agent_from_world = dataset.world_from(arrived[-1][name].sample, "ego").inverse()
-        for p, moment in enumerate(arrived[:-1]):
+        for frame, moment in enumerate(arrived[:-1]):
             if name in moment:
                 pose = (agent_from_world @ dataset.world_from(moment[name].sample, "ego")).matrix
-                poses[a, p] = augmented_pose(pose, augmentation)
+                poses[agent, frame] = augmented_pose(pose, augmentation)
     return poses.astype(np.float32)
 
 
 def point_clouds(
     dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> list[list[AnyArray]]:
-    """For each agent and moment (N, 4) float32: x y z in the sender's own augmented ego frame, intensity."""
+    """Return the cloud (N, 4) float32 of each agent and moment; empty without a message.
 
-    def cloud(message: Message) -> AnyArray:
-        return augmented_points(dataset.load_point_cloud(message.sample, "ego"), augmentation)
-
-    return [
-        [cloud(moment[name]) if name in moment else _NO_POINTS for moment in arrived]
-        for name in names
-    ]
+    The columns are x y z in the sender's own augmented ego frame, and intensity.
+    """
+    clouds = []
+    for name in names:
+        agent_clouds: list[AnyArray] = []
+        for moment in arrived:
+            cloud = _NO_POINTS
+            if name in moment:
+                points = dataset.load_point_cloud(moment[name].sample, "ego")
+                cloud = augmented_points(points, augmentation)
+            agent_clouds.append(cloud)
+        clouds.append(agent_clouds)
+    return clouds
 
 
 def camera_arrays(
@@ -186,61 +208,63 @@ def camera_arrays(
     config: ImageConfig,
     cache: ImageCache | None,
 ) -> dict[str, AnyArray]:
-    """All agents' C cameras; without a message, images are 0 and matrices are the identity.
+    """Return the arrays of all agents' C cameras.
 
-    `images` (A, P, C, 3, h, w) as the configuration says, and, all float32, `intrinsics` (A, P, C, 3, 3),
-    `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders' own augmented ego frames.
+    Without a message, images are 0 and matrices are the identity. The arrays are `images` (A, P, C,
+    3, h, w) as configured, and, all float32, `intrinsics` (A, P, C, 3, 3), `ego_from_camera` (A, P,
+    C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders' own augmented ego frames.
     Raises ConfigError if images have different sizes, or the crop reaches beyond them.
     """
     from torch.utils.data import get_worker_info
 
     load = partial(config.load, dataset) if cache is None else partial(cache.load, config, dataset)
-    mapped = map if cache is not None or get_worker_info() is not None else _by_threads
+    map_function = map if cache is not None or get_worker_info() is not None else _map_in_threads
     shape = (len(names), len(arrived), len(config.cameras))
     keep_freed()
-    images: ByteArray = np.zeros(
-        (*shape, 3, 0, 0), dtype=np.uint8
-    )  # until the first one tells the size
-    result = {
+    images: ByteArray = np.zeros((*shape, 3, 0, 0), dtype=np.uint8)  # until the size is known
+    matrices = {
         key: np.tile(np.eye(size, dtype=np.float32), (*shape, 1, 1))
         for key, size in _MATRICES.items()
     }
-    for p, moment in enumerate(arrived):
+    for frame, moment in enumerate(arrived):
         for name, message in moment.items():
-            a, intrinsics = names.index(name), []
-            for c, (pixels, intrinsic) in enumerate(
-                mapped(load, [f"{message.sample}/{each}" for each in config.cameras])
-            ):
+            agent, intrinsics = names.index(name), []
+            tokens = [f"{message.sample}/{channel}" for channel in config.cameras]
+            for camera, (pixels, intrinsic) in enumerate(map_function(load, tokens)):
                 if not images.size:
                     images = np.zeros((*shape, 3, *pixels.shape[:2]), dtype=np.uint8)
                 if images.shape[4:] != pixels.shape[:2]:
                     raise ConfigError(
-                        f"images have different sizes, {images.shape[4:]} and {pixels.shape[:2]}; choose resize="
+                        f"images have different sizes, {images.shape[4:]} and {pixels.shape[:2]}; "
+                        "choose resize="
                     )
-                images[a, p, c] = pixels.transpose(2, 0, 1)
+                images[agent, frame, camera] = pixels.transpose(2, 0, 1)
                 intrinsics.append(intrinsic)
-            matrices = _matrices(
+            message_matrices = _camera_matrices(
                 dataset, message.sample, augmentation, config, np.stack(intrinsics)
             )
-            for key, each in matrices.items():
-                result[key][a, p] = each
-    return {"images": config.values(images, valid_mask(names, arrived)), **result}
+            for key, matrix in message_matrices.items():
+                matrices[key][agent, frame] = matrix
+    return {"images": config.values(images, valid_mask(names, arrived)), **matrices}
 
 
-def _by_threads(function: Callable[[str], Any], values: Iterable[str]) -> list[Any]:
-    """As `map`, for decoding where no workers share the cores: it is done outside of the interpreter's lock."""
+def _map_in_threads(function: Callable[[str], Any], values: Iterable[str]) -> list[Any]:
+    """Map in threads, for decoding if no workers share the cores.
+
+    Decoding runs outside of the interpreter's lock.
+    """
     with own_threads() as pool:
         return list(pool.map(function, values))
 
 
-def _matrices(
+def _camera_matrices(
     dataset: Dataset,
     sample: str,
     augmentation: Augmentation,
     config: ImageConfig,
     intrinsics: FloatArray,
 ) -> dict[str, AnyArray]:
-    """One agent's cameras at one moment: the matrices of `camera_arrays` without the first two axes."""
+    """Return the matrices of `camera_arrays` of one agent at a moment, without two axes."""
     ego_from_world = dataset.world_from(sample, "ego").inverse()
     poses = [
         (ego_from_world @ dataset.world_from(sample, channel)).matrix for channel in config.cameras

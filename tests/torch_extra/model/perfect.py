@@ -12,7 +12,7 @@ def perfect_maps(targets: list[TaskTargets]) -> list[TaskMaps]:
         samples, _, rows, columns = target.heatmap.shape
         code = torch.zeros(samples, 10, rows * columns)
         sample, slot = target.mask.nonzero(as_tuple=True)
-        code[sample, :, target.place[sample, slot]] = target.box[sample, slot]
+        code[sample, :, target.cell_index[sample, slot]] = target.box[sample, slot]
         parts = code.view(samples, 10, rows, columns).split([2, 1, 3, 2, 2], dim=1)
         maps.append(TaskMaps(*parts, torch.where(target.heatmap == 1, 9.0, -9.0)))
     return maps

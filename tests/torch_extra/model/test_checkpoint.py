@@ -16,8 +16,8 @@ from torch_extra.model.small_model import small, small_released
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.checkpoint import (
-    BEST,
-    FINAL,
+    BEST_FILE,
+    FINAL_FILE,
     load_weights,
     read_weights,
     write_weights,
@@ -87,9 +87,9 @@ def test_what_is_missing_begins_at_random_unless_all_are_needed(tmp_path: Path) 
     weights, fresh = read_weights(path), model(1)
     done = load_weights(fresh, weights)
     assert done.unused == ("other.weight",)
-    assert not any(name.startswith("img_") for name in done.kept)
+    assert not any(name.startswith("img_") for name in done.unchanged)
     assert same(
-        *[{name: each.state_dict()[name] for name in done.kept} for each in (fresh, model(1))]
+        *[{name: each.state_dict()[name] for name in done.unchanged} for each in (fresh, model(1))]
     )
     lacking, strange = (
         r"weights do not fit this model: \d+ of the model are missing",
@@ -228,7 +228,7 @@ def test_of_a_run_the_best_weights_are_read(tmp_path: Path) -> None:
     assert_refused(
         (lambda: read_weights(tmp_path), ConfigError, r"best\.safetensors: weights cannot be read")
     )
-    for name in (FINAL, BEST):
+    for name in (FINAL_FILE, BEST_FILE):
         write_weights(tmp_path / name, {name: torch.ones(2)}, META)
         weights = read_weights(tmp_path)
         assert (weights.path, list(weights.tensors)) == (tmp_path / name, [name])

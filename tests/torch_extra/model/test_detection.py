@@ -116,7 +116,7 @@ def test_boxes_outside_or_of_no_category_are_left_out() -> None:
     )  # in the folded first column; beyond the last row; no width
     categories = torch.tensor([0, 0, 0, 0, -1, 5])
     cars, *_ = detection_targets([boxes], [categories], replace(SMALL, class_slots=((0,), (1, 2))))
-    assert cars.place[cars.mask].tolist() == [6 * 16 + 8, 6 * 16]
+    assert cars.cell_index[cars.mask].tolist() == [6 * 16 + 8, 6 * 16]
     assert cars.box[0, 1, 0] == pytest.approx(-0.9, abs=1e-5)
 
 

@@ -17,7 +17,7 @@ from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.plugins.model import presets
 from deepaccident_devkit.plugins.model.bev import BevUNetConfig
-from deepaccident_devkit.plugins.model.checkpoint import FINAL, write_weights
+from deepaccident_devkit.plugins.model.checkpoint import FINAL_FILE, write_weights
 from deepaccident_devkit.plugins.model.fusion import (
     CobevtConfig,
     DiscoNetConfig,
@@ -129,7 +129,7 @@ def test_a_model_is_loaded_by_its_notes(tmp_path: Path, monkeypatch: pytest.Monk
     model, notes = V2XFormer(choice.config), {**choice.as_dict(), "step": 7}
 
     def loaded(notes: dict[str, Any]) -> V2XFormer:
-        write_weights(tmp_path / FINAL, model.state_dict(), notes)
+        write_weights(tmp_path / FINAL_FILE, model.state_dict(), notes)
         return load_model(tmp_path)
 
     found = loaded(notes)

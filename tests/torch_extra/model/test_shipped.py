@@ -15,16 +15,16 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError
 from deepaccident_devkit.plugins.model import read_weights
-from deepaccident_devkit.plugins.model.checkpoint import SHIPPED, write_weights
+from deepaccident_devkit.plugins.model.checkpoint import SHIPPED_FILES, write_weights
 
 demo: Any = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED_FILES)
 def test_they_are_small_halves_with_their_provenance(name: str) -> None:
     weights = read_weights(name)
     assert (weights.path, {each.dtype for each in weights.tensors.values()}) == (
-        SHIPPED[name],
+        SHIPPED_FILES[name],
         {torch.float16},
     )
     assert weights.path.stat().st_size < 1.3e6
@@ -33,7 +33,7 @@ def test_they_are_small_halves_with_their_provenance(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED_FILES)
 def test_they_score_what_their_notes_say(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a release that is made again from its seed; another machine may round otherwise, a
     little.
@@ -42,19 +42,19 @@ def test_they_score_what_their_notes_say(name: str, monkeypatch: pytest.MonkeyPa
     from benchmarks.shipping import scores
 
     told = read_weights(name).meta["scored"]
-    assert scores(SHIPPED[name], told) == pytest.approx(told["scores"], abs=0.01)
+    assert scores(SHIPPED_FILES[name], told) == pytest.approx(told["scores"], abs=0.01)
     assert told["scores"]["iou"] > 0.1
 
 
 def test_a_folder_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert read_weights("tiny").path == SHIPPED["tiny"]
+    assert read_weights("tiny").path == SHIPPED_FILES["tiny"]
     Path("tiny").mkdir()
     write_weights(Path("tiny/best.safetensors"), {"a": torch.ones(2)}, {})
     assert list(read_weights("tiny").tensors) == ["a"]
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED_FILES)
 def test_predict_takes_them_by_their_name(name: str, release_root: Path, tmp_path: Path) -> None:
     words = (
         "predict",

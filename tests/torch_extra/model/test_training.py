@@ -45,9 +45,9 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.plugins.model import training_loop as training
 from deepaccident_devkit.plugins.model.checkpoint import (
-    BEST,
-    FINAL,
-    LAST,
+    BEST_FILE,
+    FINAL_FILE,
+    STATE_FILE,
     read_weights,
     write_weights,
 )
@@ -80,7 +80,7 @@ SHORT = replace(RUN, steps=2, validation=None, save_every=1)
 TESTS = Path(__file__).parents[2]
 
 
-def tensors(folder: Path, name: str = LAST) -> dict[str, torch.Tensor]:
+def tensors(folder: Path, name: str = STATE_FILE) -> dict[str, torch.Tensor]:
     return load_file(folder / name)
 
 
@@ -135,18 +135,18 @@ def test_processes_share_each_epoch_and_go_on_in_its_middle(
 ) -> None:
     config = TrainConfig(seed=seed)
     length = 3 * count
-    whole = list(islice(positions(count, config, first=0), length * ranks))
+    whole = list(islice(positions(count, config, start=0), length * ranks))
     for epoch in range(3 * ranks):
         assert sorted(whole[epoch * count : (epoch + 1) * count]) == list(
             range(epoch * count, (epoch + 1) * count)
         )
     parts = [
-        list(islice(positions(count, config, first=0, rank=rank, ranks=ranks), length))
+        list(islice(positions(count, config, start=0, rank=rank, ranks=ranks), length))
         for rank in range(ranks)
     ]
     assert [part[index] for index in range(length) for part in parts] == whole
     for rank, part in enumerate(parts):
-        rest = list(islice(positions(count, config, first=first, rank=rank, ranks=ranks), length))
+        rest = list(islice(positions(count, config, start=first, rank=rank, ranks=ranks), length))
         assert rest[: max(length - first, 0)] == part[first:]
 
 
@@ -164,14 +164,14 @@ def test_two_sources_come_by_turns_each_in_its_own_order(
     sources = [type("Counted", (SimpleNamespace,), {"__len__": lambda _, count=count: count})(model=None, data=None)  # noqa: E501
                for count in (one, other)]  # fmt: skip
     moments = MixedMoments((sources[0], sources[1]), mix)
-    whole = list(islice(moments.numbers(config, first=0), 60 * ranks))
+    whole = list(islice(moments.numbers(config, start=0), 60 * ranks))
     assert abs(sum(source for source, _ in whole) - mix * len(whole)) <= 1
     for source, count in enumerate((one, other)):
         own = [number for of, number in whole if of == source]
-        assert own == list(islice(positions(count, config, first=0), len(own)))
+        assert own == list(islice(positions(count, config, start=0), len(own)))
     rank = ranks - 1
     mine = list(
-        islice(moments.numbers(config, first=first, rank=rank, ranks=ranks), 60 - min(first, 59))
+        islice(moments.numbers(config, start=first, rank=rank, ranks=ranks), 60 - min(first, 59))
     )
     assert mine[: max(60 - first, 0)] == whole[rank::ranks][first:]
 
@@ -277,7 +277,7 @@ def test_frozen_parameters_stay_bit_for_bit(da: DeepAccident, tmp_path: Path) ->
 def whole(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An undisturbed run, with curves."""
     folder, said = tmp_path_factory.mktemp("runs") / "whole", list[str]()
-    assert trained(da, folder, curves=True, say=said.append) == folder / BEST
+    assert trained(da, folder, curves=True, say=said.append) == folder / BEST_FILE
     assert [each.split(":")[0] for each in said] == ["step 4", "step 6"]
     return folder
 
@@ -287,8 +287,8 @@ def test_a_run_leaves_its_files(whole: Path) -> None:
         "run.json",
         "log.jsonl",
         "curves.png",
-        BEST,
-        LAST,
+        BEST_FILE,
+        STATE_FILE,
     }
     log = read_log(whole)
     assert [(row["step"], "validation" in row) for row in log] == [
@@ -317,10 +317,10 @@ def test_a_killed_run_goes_on_as_if_nothing_had_been(
     ended = other_process("-c", code)
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     assert [row["step"] for row in read_log(folder)] == list(range(1, step + 1))
-    assert read_weights(folder / LAST).meta["step"] == 2
+    assert read_weights(folder / STATE_FILE).meta["step"] == 2
     trained(da, folder)
     assert rows(folder) == rows(whole)
-    for name in (LAST, BEST):
+    for name in (STATE_FILE, BEST_FILE):
         assert_equal(tensors(folder, name), tensors(whole, name))
 
 
@@ -332,9 +332,9 @@ def test_other_options_in_the_same_folder_are_refused(
     assert_refused(
         (lambda: trained(da, whole, replace(RUN, seed=1)), ConfigError, seed),
         (
-            lambda: trained(da, whole, weights=whole / BEST),
+            lambda: trained(da, whole, weights=whole / BEST_FILE),
             ConfigError,
-            ("is of another run", "from: ", BEST),
+            ("is of another run", "from: ", BEST_FILE),
         ),
     )
     assert {path.name: path.read_bytes() for path in whole.iterdir()} == before
@@ -349,14 +349,14 @@ def test_other_options_in_the_same_folder_are_refused(
         lambda path, _: path.write_bytes(b""),
         lambda path, _: path.write_bytes(b"no weights"),
         lambda path, _: path.mkdir(),
-        lambda path, whole: path.write_bytes((whole / BEST).read_bytes()),
+        lambda path, whole: path.write_bytes((whole / BEST_FILE).read_bytes()),
     ],
     ids=["empty", "text", "folder", "weights alone"],
 )
 def test_a_checkpoint_of_another_run_is_refused(
     da: DeepAccident, whole: Path, tmp_path: Path, put: Any
 ) -> None:
-    put(tmp_path / LAST, whole)
+    put(tmp_path / STATE_FILE, whole)
     assert_refused(
         (
             lambda: trained(da, tmp_path),
@@ -406,10 +406,10 @@ def scaled(name: str, factor: float) -> Any:
 def test_a_changed_checkpoint_is_refused(
     whole: Path, tmp_path: Path, change: Any, told: str
 ) -> None:
-    weights = read_weights(whole / LAST)
+    weights = read_weights(whole / STATE_FILE)
     held, notes = dict(weights.tensors), dict(weights.meta)
     change(held, notes)
-    write_weights(tmp_path / LAST, held, notes)
+    write_weights(tmp_path / STATE_FILE, held, notes)
     model, told = V2XFormer(small()), rf"last\.safetensors: is no checkpoint of this run \(.*{told}"
     load = partial(load_state, tmp_path, model, optimizer_of(model, RUN), RUN.steps)
     assert_refused((load, ConfigError, told), (load, ConfigError, r"\A.{,600}\Z"))
@@ -430,15 +430,15 @@ def test_a_run_begins_from_weights(da: DeepAccident, whole: Path, tmp_path: Path
         da,
         tmp_path,
         replace(SHORT, learning_rate=1e-30, weight_decay=0),
-        weights=whole / BEST,
+        weights=whole / BEST_FILE,
         say=said.append,
     )
-    assert re.match(rf"{whole / BEST}: .* tensors loaded", said[0])
+    assert re.match(rf"{whole / BEST_FILE}: .* tensors loaded", said[0])
     names = [name for name, _ in V2XFormer(small()).named_parameters()]
     assert_equal(
         *[
             [held[name] for name in names]
-            for held in (tensors(tmp_path, FINAL), tensors(whole, BEST))
+            for held in (tensors(tmp_path, FINAL_FILE), tensors(whole, BEST_FILE))
         ]
     )
 
@@ -457,7 +457,7 @@ def test_the_best_weights_are_kept(da: DeepAccident, tmp_path: Path) -> None:
     assert (
         weights.meta["step"],
         weights.meta["score"],
-        read_weights(tmp_path / LAST).meta["best"],
+        read_weights(tmp_path / STATE_FILE).meta["best"],
     ) == (2, 0.6, 0.6)
     assert_equal(dict(weights.tensors), states[1])
 
@@ -491,14 +491,14 @@ def test_two_processes_train_one_model(root: str, tmp_path: Path) -> None:
         torch.load(folder / f"rank_{rank}.pth", weights_only=True) for rank in range(2)
     )
     assert_equal(first, second)
-    stored = tensors(folder, FINAL)
+    stored = tensors(folder, FINAL_FILE)
     assert_equal(
         {name: each.detach() for name, each in first.items()},
         {name: stored[name] for name in first},
     )
     assert [row["step"] for row in read_log(folder)] == [1, 2]
     assert {path.name for path in folder.iterdir()} == {
-        "run.json", "log.jsonl", LAST, FINAL, "rank_0.pth", "rank_1.pth",
+        "run.json", "log.jsonl", STATE_FILE, FINAL_FILE, "rank_0.pth", "rank_1.pth",
     }  # fmt: skip
 
 

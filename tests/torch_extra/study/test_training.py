@@ -326,7 +326,7 @@ def test_a_row_of_weights_and_a_baseline_has_alarms_from_the_boxes(
     da: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torch.set_num_threads(1)
-    likely = "deepaccident_devkit.plugins.baselines.predict._LIKELY"
+    likely = "deepaccident_devkit.plugins.baselines.predict._MIN_BOX_SCORE"
     monkeypatch.setattr(likely, 0.0)  # the weights are sure of little here
     tokens, shipped = (
         [f"{each['token']}/ego_vehicle/004" for each in da.scenario],

@@ -1,4 +1,4 @@
-"""From the head's maps to boxes, of which those that stand for the same object are suppressed."""
+"""Decoding of the head's maps to boxes, with suppression of boxes of the same object."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from deepaccident_devkit.support.text import settle_choices
 
 Method = Literal["rotated", "circle"]
 # Columns x, y, l, w, yaw of boxes x y z l w h yaw vx vy.
-_FOOTPRINT = [0, 1, 3, 4, 6]
+_FOOTPRINT_COLUMNS = [0, 1, 3, 4, 6]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,12 +42,13 @@ class NmsConfig:
     """Suppression within one task.
 
     Attributes:
-        method: `rotated` compares footprints by intersection over union, `circle` the distances of centres.
-        threshold: a worse box goes if its IoU with a kept one is above it or, of `circle`, if its centre is at most so
-            many metres away.
-        scale: lengths and widths are multiplied by it before `rotated` compares them: one number, or one a slot of the
-            task.
-        keep: boxes of a sample and task that stay at most.
+        method: `rotated` compares footprints by intersection over union, `circle` the distances of
+            centres.
+        threshold: A worse box is suppressed if its IoU with a retained box is larger, or for
+            `circle` if the distance of their centres in metres is at most this.
+        scale: Factors of lengths and widths before `rotated` compares them: one number, or one a
+            slot of the task.
+        keep: Maximum number of boxes of a sample and task.
     """
 
     method: Method = "rotated"
@@ -56,7 +57,7 @@ class NmsConfig:
     keep: int = 83
 
     def __post_init__(self) -> None:
-        """Check; raises ConfigError or ChoiceError."""
+        """Check the values; raises ConfigError or ChoiceError."""
         settle_choices(self, {"method": get_args(Method)})
         check_least(self, threshold=0, keep=1)
         if not self.scale or not min(self.scale) > 0:
@@ -75,78 +76,82 @@ RELEASED_NMS: tuple[NmsConfig, ...] = (
 )
 """The released settings, one a task.
 
-They were chosen for nuScenes' classes. No golden numbers test the `rotated` ones: the released code runs on CUDA alone.
+They were chosen for nuScenes' classes. No golden numbers test the `rotated` ones, because the
+released code only runs on CUDA.
 """
 
 
 def suppress(
     boxes: AnyArray, scores: AnyArray, slots: AnyArray, config: NmsConfig | None = None
 ) -> IntArray:
-    """Rows of the boxes that stay, the best first; of equal scores by what is in the boxes, whatever their order.
+    """Return the rows of the retained boxes, the best first.
 
+    Boxes of equal scores are ordered by their values, so the result does not depend on their order.
     Slots do not protect each other: a truck suppresses a van of the same task, as in the release.
 
     Args:
-        boxes: (N, 9) x y z l w h yaw vx vy; any one frame, metres and radians.
-        scores: (N,).
-        slots: (N,) number of each box's class within the task.
-        config: None for ours.
+        boxes: x y z l w h yaw vx vy in any common frame, metres and radians, shape (N, 9).
+        scores: Scores, shape (N,).
+        slots: Number of each box's class within the task, shape (N,).
+        config: Rules; None for ours.
     """
-    rules = config or NmsConfig()
+    config = config or NmsConfig()
     order = np.lexsort((*np.asarray(boxes).T[::-1], slots, -np.asarray(scores)))
     best_first = np.asarray(boxes, dtype=np.float64)[order]
-    if rules.method == "circle":
-        same = _near(best_first[:, :2], rules.threshold)
+    if config.method == "circle":
+        is_overlapping = _are_near(best_first[:, :2], config.threshold)
     else:
-        footprints = best_first[:, _FOOTPRINT]
-        scale = np.array(rules.scale)
+        footprints = best_first[:, _FOOTPRINT_COLUMNS]
+        scale = np.array(config.scale)
         footprints[:, 2:4] *= scale if len(scale) == 1 else scale[slots[order], None]
-        same = rotated_iou(footprints, footprints) > rules.threshold
-    return order[_greedy(same, rules.keep)]
+        is_overlapping = rotated_iou(footprints, footprints) > config.threshold
+    return order[_retained_rows(is_overlapping, config.keep)]
 
 
 def rotated_iou(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Intersection over union of rectangles on the ground: (N, 5) and (M, 5) → (N, M) in [0, 1].
+    """Return the intersection over union of N and M rectangles on the ground, (N, M) in [0, 1].
+
+    It is 0 for two rectangles without area.
 
     Args:
-        first: x, y, length, width, yaw: metres and radians.
-        second: the others, of the same frame.
-
-    Returns:
-        0 for two that have no area.
+        first: x, y, length, width, yaw: metres and radians, shape (N, 5).
+        second: Other rectangles in the same frame, shape (M, 5).
     """
-    common = intersection_areas(first, second)
-    union = (first[:, 2] * first[:, 3])[:, None] + second[:, 2] * second[:, 3] - common
-    return np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+    intersections = intersection_areas(first, second)
+    areas, other_areas = first[:, 2] * first[:, 3], second[:, 2] * second[:, 3]
+    unions = areas[:, None] + other_areas - intersections
+    return np.divide(intersections, unions, out=np.zeros_like(intersections), where=unions > 0)
 
 
-def _near(centers: FloatArray, radius: float) -> BoolArray:
-    apart = centers[:, None] - centers
-    return np.asarray(np.einsum("nmi,nmi->nm", apart, apart) <= radius**2)
+def _are_near(centers: FloatArray, radius: float) -> BoolArray:
+    """Return whether the centres (N, 2) of two boxes are within a radius, (N, N)."""
+    offsets = centers[:, None] - centers
+    return np.asarray(np.einsum("nmi,nmi->nm", offsets, offsets) <= radius**2)
 
 
-def _greedy(same: BoolArray, keep: int) -> IntArray:
-    """Rows kept, of boxes that are sorted by score, best first."""
-    gone = np.zeros(len(same), dtype=bool)
-    kept: list[int] = []
-    for row, others in enumerate(same):
-        if not gone[row]:
-            kept.append(row)
-            if len(kept) == keep:
+def _retained_rows(is_overlapping: BoolArray, max_count: int) -> IntArray:
+    """Return the retained rows of boxes that are sorted by score, best first."""
+    is_suppressed = np.zeros(len(is_overlapping), dtype=bool)
+    rows: list[int] = []
+    for row, overlaps in enumerate(is_overlapping):
+        if not is_suppressed[row]:
+            rows.append(row)
+            if len(rows) == max_count:
                 break
-            gone |= others
-    return np.array(kept, dtype=np.int64)
+            is_suppressed |= overlaps
+    return np.array(rows, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DecodingConfig:
-    """Which boxes are read from the maps.
+    """Rules for reading boxes from the maps.
 
     Attributes:
-        candidates: cells with the best scores that are looked at, for each sample and task.
-        score_threshold: scores must be above it.
-        center_range: least x, y, z and greatest x, y, z of the centres, metres, ego frame.
-        nms: suppression of each task, or one for all.
+        candidates: Number of cells with the best scores that are examined, for each sample and
+            task.
+        score_threshold: Scores must exceed it.
+        center_range: Lowest x, y, z and highest x, y, z of the centres, metres, ego frame.
+        nms: Suppression of each task, or one for all tasks.
     """
 
     candidates: int = 500
@@ -162,12 +167,10 @@ class DecodingConfig:
     nms: tuple[NmsConfig, ...] = (NmsConfig(),)
 
     def __post_init__(self) -> None:
-        """Check; raises ConfigError."""
+        """Check the values; raises ConfigError."""
         check_least(self, candidates=1)
-        if not all(
-            low < high
-            for low, high in zip(self.center_range[:3], self.center_range[3:], strict=True)
-        ):
+        lows, highs = self.center_range[:3], self.center_range[3:]
+        if not all(low < high for low, high in zip(lows, highs, strict=True)):
             raise ConfigError(
                 f"center_range: expected least x, y, z, then greatest, found {self.center_range!r}"
             )
@@ -179,10 +182,11 @@ class Candidates(NamedTuple):
     """The K best cells of one task for each of B samples, the best first.
 
     Attributes:
-        boxes: (B, K, 9) x y z l w h yaw vx vy, ego frame, z of the centre; metres, radians, m/s.
-        scores: (B, K) in (0, 1).
-        slots: (B, K) int64, heatmap channel in the task.
-        valid: (B, K) bool: above the score threshold, in the range and finite.
+        boxes: x y z l w h yaw vx vy, ego frame, z of the centre; metres, radians, m/s; shape (B, K,
+            9).
+        scores: Scores in (0, 1), shape (B, K).
+        slots: Heatmap channel in the task, (B, K) int64.
+        valid: Whether a cell is above the score threshold, in the range and finite, (B, K) bool.
     """
 
     boxes: Tensor
@@ -196,9 +200,10 @@ class Detections:
     """The boxes of one sample, the best first.
 
     Attributes:
-        boxes: (N, 9) x y z l w h yaw vx vy, ego frame, z of the centre; metres, radians, m/s.
-        scores: (N,) in (0, 1).
-        categories: (N,) int64, index into `taxonomy.CATEGORIES`.
+        boxes: x y z l w h yaw vx vy, ego frame, z of the centre; metres, radians, m/s; shape (N,
+            9).
+        scores: Scores in (0, 1), shape (N,).
+        categories: Index into `taxonomy.CATEGORIES`, (N,) int64.
     """
 
     boxes: Tensor
@@ -209,74 +214,76 @@ class Detections:
 def decode_candidates(
     maps: TaskMaps, head: DetectionConfig, config: DecodingConfig | None = None
 ) -> Candidates:
-    """The best cells of a task as boxes, before suppression; the released CenterPointBBoxCoder's.
+    """Return the best cells of a task as boxes, before suppression.
+
+    It is the released CenterPointBBoxCoder.
 
     Args:
-        maps: of the task.
-        head: cells.
-        config: None for the released rules.
+        maps: Maps of the task.
+        head: Cells of the maps.
+        config: Rules; None for the released ones.
     """
-    rules = config or DecodingConfig()
+    config = config or DecodingConfig()
     rows, columns = maps.heatmap.shape[-2:]
-    flat = precise(maps.heatmap).sigmoid().flatten(1)
-    scores, best = flat.topk(min(rules.candidates, flat.shape[1]), dim=1)
+    probabilities = precise(maps.heatmap).sigmoid().flatten(1)
+    count = min(config.candidates, probabilities.shape[1])
+    scores, best = probabilities.topk(count, dim=1)
     slots, cell = best // (rows * columns), best % (rows * columns)
     code = gather_cells(precise(maps.code), cell)
-    offset, z, size, turn, velocity = code.split(list(CODE_CHANNELS.values()), dim=2)
-    place = torch.stack([cell % columns, cell // columns], dim=2) + offset
-    center = place * place.new_tensor([head.x[2], head.y[2]]) + place.new_tensor(
-        [head.x[0], head.y[0]]
-    )
-    yaw = torch.atan2(turn[:, :, :1], turn[:, :, 1:])
+    offset, z, size, rotation, velocity = code.split(list(CODE_CHANNELS.values()), dim=2)
+    position = torch.stack([cell % columns, cell // columns], dim=2) + offset
+    cell_size = position.new_tensor([head.x[2], head.y[2]])
+    center = position * cell_size + position.new_tensor([head.x[0], head.y[0]])
+    yaw = torch.atan2(rotation[:, :, :1], rotation[:, :, 1:])
     boxes = torch.cat([center, z, size.exp(), yaw, velocity], dim=2)
-    low, high = boxes.new_tensor(rules.center_range).view(2, 3)
-    inside = ((boxes[:, :, :3] >= low) & (boxes[:, :, :3] <= high)).all(dim=2)
-    return Candidates(
-        boxes,
-        scores,
-        slots,
-        (scores > rules.score_threshold) & inside & boxes.isfinite().all(dim=2),
-    )
+    low, high = boxes.new_tensor(config.center_range).view(2, 3)
+    in_range = ((boxes[:, :, :3] >= low) & (boxes[:, :, :3] <= high)).all(dim=2)
+    is_finite = boxes.isfinite().all(dim=2)
+    valid = (scores > config.score_threshold) & in_range & is_finite
+    return Candidates(boxes, scores, slots, valid)
 
 
 def decode_detections(
     maps: Sequence[TaskMaps], head: DetectionConfig, config: DecodingConfig | None = None
 ) -> list[Detections]:
-    """The boxes of each of B samples, after suppression within each task.
+    """Return the boxes of each of B samples, after suppression within each task.
 
-    Boxes of slots that stand for no category are left out; they suppress others of their task before.
+    Boxes of slots without a category first suppress others of their task, and are then left out.
 
     Args:
-        maps: of each task, from the head.
-        head: cells and slots.
-        config: None for ours; `nms=RELEASED_NMS` for the released suppression of the six released tasks.
+        maps: Maps of each task, from the head.
+        head: Cells and slots.
+        config: Rules; None for ours; `nms=RELEASED_NMS` for the released suppression of the six
+            released tasks.
 
     Raises:
-        ConfigError: another number of `nms` than tasks, or of its scales than slots.
+        ConfigError: Another number of `nms` than tasks, or of its scales than slots.
     """
-    rules = config or DecodingConfig()
-    suppressions = _nms_of_tasks(rules.nms, head.class_slots)
-    parts: list[list[Detections]] = [[] for _ in range(len(maps[0].heatmap))]
-    for task, slots, nms in zip(maps, head.class_slots, suppressions, strict=True):
-        candidates = decode_candidates(task, head, rules)
-        for sample, found in enumerate(parts):
-            found.append(_kept(Candidates(*(each[sample] for each in candidates)), slots, nms))
-    return [_joined(found) for found in parts]
+    config = config or DecodingConfig()
+    suppressions = _nms_of_tasks(config.nms, head.class_slots)
+    parts_of_samples: list[list[Detections]] = [[] for _ in range(len(maps[0].heatmap))]
+    for task_maps, slots, nms in zip(maps, head.class_slots, suppressions, strict=True):
+        candidates = decode_candidates(task_maps, head, config)
+        for sample, parts in enumerate(parts_of_samples):
+            sample_candidates = Candidates(*(tensor[sample] for tensor in candidates))
+            parts.append(_retained_detections(sample_candidates, slots, nms))
+    return [_joined(parts) for parts in parts_of_samples]
 
 
 def detected_boxes(detections: Detections, world_from_ego: SE3 | ArrayLike) -> DetectedBoxes:
-    """One sample's detections for the devkit's evaluators and results files, in the world frame.
+    """Return one sample's detections in the world frame, for the devkit's evaluators and results.
 
     Args:
-        detections: right-handed; those of a model that works in left-handed axes must be mirrored first.
-        world_from_ego: pose of the sample's agent, (4, 4) if no SE3.
+        detections: Right-handed boxes; boxes of a model that works in left-handed axes must be
+            mirrored first.
+        world_from_ego: Pose of the sample's agent; (4, 4) if it is no SE3.
 
     Raises:
-        GeometryError: it is no rigid transform.
+        GeometryError: The pose is no rigid transform.
     """
     pose = world_from_ego if isinstance(world_from_ego, SE3) else SE3(world_from_ego)  # type: ignore[arg-type]
     boxes = detections.boxes.detach().cpu().double().numpy()
-    found = DetectedBoxes.from_arrays(
+    ego_boxes = DetectedBoxes.from_arrays(
         boxes[:, :3],
         boxes[:, 3:6],
         boxes[:, 6],
@@ -285,39 +292,45 @@ def detected_boxes(detections: Detections, world_from_ego: SE3 | ArrayLike) -> D
         velocity=boxes[:, 7:],
         frame="ego",
     )
-    return found.transform(pose, "world")
+    return ego_boxes.transform(pose, "world")
 
 
 def _nms_of_tasks(nms: tuple[NmsConfig, ...], class_slots: ClassSlots) -> tuple[NmsConfig, ...]:
-    every = nms * len(class_slots) if len(nms) == 1 else nms
-    if len(every) != len(class_slots):
+    """Return the suppression of each task; raises ConfigError if numbers do not fit."""
+    configs = nms * len(class_slots) if len(nms) == 1 else nms
+    if len(configs) != len(class_slots):
         raise ConfigError(
             f"nms: expected one NmsConfig, or {len(class_slots)}, one a task; found {len(nms)}"
         )
-    for task, (each, slots) in enumerate(zip(every, class_slots, strict=True)):
-        if len(each.scale) not in (1, len(slots)):
+    for task, (config, slots) in enumerate(zip(configs, class_slots, strict=True)):
+        if len(config.scale) not in (1, len(slots)):
             raise ConfigError(
-                f"nms: task {task} has {len(slots)} slots, found {len(each.scale)} scales; give one, or one a slot"
+                f"nms: task {task} has {len(slots)} slots, found {len(config.scale)} scales; give "
+                "one, or one a slot"
             )
-    return every
+    return configs
 
 
-def _kept(candidates: Candidates, slots: tuple[int | None, ...], nms: NmsConfig) -> Detections:
-    """What stays of one sample's candidates of one task."""
+def _retained_detections(
+    candidates: Candidates, slots: tuple[int | None, ...], nms: NmsConfig
+) -> Detections:
+    """Return the retained boxes of one sample's candidates of one task."""
     valid = candidates.valid
     boxes, scores, slot = candidates.boxes[valid], candidates.scores[valid], candidates.slots[valid]
-    rows, values, numbers = (each.detach().cpu().numpy() for each in (boxes, scores, slot))
-    stay = torch.from_numpy(suppress(rows, values, numbers, nms)).to(boxes.device)
-    codes = torch.tensor([-1 if each is None else each for each in slots], device=boxes.device)
-    category = codes[slot[stay]]
-    stay = stay[category >= 0]
-    return Detections(boxes=boxes[stay], scores=scores[stay], categories=codes[slot[stay]])
+    box_array, score_array, slot_array = (
+        tensor.detach().cpu().numpy() for tensor in (boxes, scores, slot)
+    )
+    rows = torch.from_numpy(suppress(box_array, score_array, slot_array, nms)).to(boxes.device)
+    category_numbers = [-1 if number is None else number for number in slots]
+    categories = torch.tensor(category_numbers, device=boxes.device)
+    rows = rows[categories[slot[rows]] >= 0]
+    return Detections(boxes=boxes[rows], scores=scores[rows], categories=categories[slot[rows]])
 
 
 def _joined(parts: Sequence[Detections]) -> Detections:
-    boxes, scores, categories = (
-        torch.cat([getattr(each, name) for each in parts])
-        for name in ("boxes", "scores", "categories")
-    )
+    """Return the boxes of all tasks, the best first."""
+    boxes = torch.cat([part.boxes for part in parts])
+    scores = torch.cat([part.scores for part in parts])
+    categories = torch.cat([part.categories for part in parts])
     order = scores.argsort(descending=True, stable=True)
     return Detections(boxes=boxes[order], scores=scores[order], categories=categories[order])

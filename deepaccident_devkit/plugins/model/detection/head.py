@@ -1,4 +1,4 @@
-"""The detection head: maps of box centres and box codes from features seen from above (CenterPoint)."""
+"""The detection head: maps of box centres and box codes from BEV features (CenterPoint)."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 ClassSlots = tuple[tuple[int | None, ...], ...]
 Branches = Literal["separate", "joint"]
 
-# Channels of a task's maps beside the heatmap, in the order of the box code.
+# Channels of a task's maps except the heatmap, in the order of the box code.
 CODE_CHANNELS = {"reg": 2, "height": 1, "dim": 3, "rot": 2, "vel": 2}
 CODE_SIZE = sum(CODE_CHANNELS.values())
 # Our tasks: cars; trucks and vans; cyclists and motorcycles; pedestrians.
 CLASS_SLOTS: ClassSlots = ((0,), (1, 2), (3, 4), (5,))
 RELEASED_CLASS_SLOTS: ClassSlots = (*CLASS_SLOTS, (None, None), (None, None))
-"""The release's six tasks with ten slots, by what they train on.
+"""The release's six tasks with ten slots, by the categories that they are trained on.
 
-The release names them (car) (truck, van) (invalid1, invalid2) (invalid3) (motorcycle, cyclist) (pedestrian, invalid4),
-but compares dataset indices with slot numbers, so that its last two tasks never see a box.
+The release names them (car) (truck, van) (invalid1, invalid2) (invalid3) (motorcycle, cyclist)
+(pedestrian, invalid4), but compares dataset indices with slot numbers, so that its last two tasks
+never see a box.
 """
 # All classes in one task, as in the small model.
 ONE_TASK: ClassSlots = (tuple(range(len(CATEGORIES))),)
@@ -39,16 +40,18 @@ class DetectionConfig:
     """Sizes, cells and classes of a `CenterHead`.
 
     Attributes:
-        in_channels: of the features.
-        shared_channels: of the convolution that all tasks share, and of the branches.
-        class_slots: for each task, which category each heatmap channel stands for: an index into
-            `taxonomy.CATEGORIES`, or None for a channel that no box trains. Boxes of a category without a slot are
-            background.
-        x: start, end and cell size of the output's columns, metres, ego frame.
-        y: the same of its rows.
-        branches: `separate` for the released two convolutions a quantity, `joint` for one 1×1 convolution a task.
-        upsample: how many times more rows and columns the output has than the features.
-        heatmap_bias: initial bias of the heatmap channels; −2.19 makes every cell a centre with probability 0.1.
+        in_channels: Channels of the features.
+        shared_channels: Channels of the convolution that all tasks share, and of the branches.
+        class_slots: For each task, the category of each heatmap channel: an index into
+            `taxonomy.CATEGORIES`, or None for a channel that no box trains. Boxes of a category
+            without a slot are background.
+        x: Start, end and cell size of the output's columns, metres, ego frame.
+        y: Start, end and cell size of the output's rows, metres, ego frame.
+        branches: `separate` for the released two convolutions a quantity, `joint` for one 1×1
+            convolution a task.
+        upsample: Factor between the rows and columns of the output and of the features.
+        heatmap_bias: Initial bias of the heatmap channels; −2.19 makes every cell a centre with
+            probability 0.1.
     """
 
     in_channels: int = 256
@@ -61,7 +64,7 @@ class DetectionConfig:
     heatmap_bias: float = -2.19
 
     def __post_init__(self) -> None:
-        """Check; raises ConfigError or ChoiceError."""
+        """Check the values; raises ConfigError or ChoiceError."""
         settle_choices(self, {"branches": get_args(Branches)})
         BevGrid(x=self.x, y=self.y)  # checks both axes
         check_least(self, in_channels=1, shared_channels=1, upsample=1)
@@ -74,15 +77,17 @@ class DetectionConfig:
 
 
 class TaskMaps(NamedTuple):
-    """What the head says for one task, for each of H × W cells (row = y, column = x, both rising).
+    """The head's output for one task, for each of H × W cells.
+
+    Rows are ordered by ascending y, columns by ascending x.
 
     Attributes:
-        reg: (B, 2, H, W) centre from the cell's lower corner: x, y, in cells.
-        height: (B, 1, H, W) z of the centre, metres.
-        dim: (B, 3, H, W) logarithms of length, width, height in metres.
-        rot: (B, 2, H, W) sine and cosine of the yaw, of any common scale.
-        vel: (B, 2, H, W) vx, vy, m/s.
-        heatmap: (B, slots, H, W) logits: is a box of this slot centred here?
+        reg: Centre from the cell's lower corner: x, y, in cells, shape (B, 2, H, W).
+        height: z of the centre, metres, shape (B, 1, H, W).
+        dim: Logarithms of length, width, height in metres, shape (B, 3, H, W).
+        rot: Sine and cosine of the yaw, with any common factor, shape (B, 2, H, W).
+        vel: vx, vy, m/s, shape (B, 2, H, W).
+        heatmap: Logits of a centre of each slot, shape (B, slots, H, W).
     """
 
     reg: Tensor
@@ -94,7 +99,7 @@ class TaskMaps(NamedTuple):
 
     @property
     def code(self) -> Tensor:
-        """The box code, (B, 10, H, W): all maps but the heatmap."""
+        """The box code, (B, 10, H, W): all maps except the heatmap."""
         return torch.cat(self[:-1], dim=1)
 
 
@@ -107,23 +112,23 @@ class ConvBlock(nn.Module):
         self.bn = nn.BatchNorm2d(out_channels)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, in, H, W) → (B, out, H, W)."""
+        """Transform (B, in, H, W) to (B, out, H, W)."""
         return functional.relu(self.bn(self.conv(features)))
 
 
 class SeparateHead(nn.Module):
-    """One task's released branches: for each quantity a `ConvBlock` and a convolution 3×3."""
+    """One task's released branches: a `ConvBlock` and a convolution 3×3 for each quantity."""
 
     def __init__(self, channels: int, slots: int, heatmap_bias: float) -> None:
         super().__init__()
         for name, count in {**CODE_CHANNELS, "heatmap": slots}.items():
-            last = nn.Conv2d(channels, count, 3, padding=1)
+            output_conv = nn.Conv2d(channels, count, 3, padding=1)
             if name == "heatmap":
-                nn.init.constant_(last.bias, heatmap_bias)  # type: ignore[arg-type]  # it has one
-            self.add_module(name, nn.Sequential(ConvBlock(channels, channels), last))
+                nn.init.constant_(output_conv.bias, heatmap_bias)  # type: ignore[arg-type]  # it has one
+            self.add_module(name, nn.Sequential(ConvBlock(channels, channels), output_conv))
 
     def forward(self, features: Tensor) -> TaskMaps:
-        """(B, channels, H, W) → maps of the same cells."""
+        """Return the maps of features (B, channels, H, W), with the same cells."""
         return TaskMaps(*(self.get_submodule(name)(features) for name in TaskMaps._fields))
 
 
@@ -138,14 +143,15 @@ class JointHead(nn.Module):
             self.maps.bias[CODE_SIZE:] = heatmap_bias  # type: ignore[index]  # it has one
 
     def forward(self, features: Tensor) -> TaskMaps:
-        """(B, channels, H, W) → maps of the same cells."""
+        """Return the maps of features (B, channels, H, W), with the same cells."""
         return TaskMaps(*self.maps(features).split(self._sizes, dim=1))
 
 
 class CenterHead(nn.Module):
     """Boxes as points on the ground: a shared convolution, then maps for each task.
 
-    With `branches="separate"` and no upsampling it is the released CenterHeadv1, with the same keys.
+    With `branches="separate"` and no upsampling it is the released CenterHeadv1, with the same
+    keys.
     """
 
     def __init__(self, config: DetectionConfig) -> None:
@@ -160,23 +166,26 @@ class CenterHead(nn.Module):
         )
 
     def forward(self, features: Tensor) -> list[TaskMaps]:
-        """The maps of each task.
+        """Return the maps of each task.
 
         Args:
-            features: (B, in_channels, rows, columns) of the configured grid, divided by `upsample`.
+            features: Features of the configured grid divided by `upsample`, shape (B, in_channels,
+                rows, columns).
 
         Raises:
-            ConfigError: features of another height or width.
+            ConfigError: Features of another height or width.
         """
-        rows, columns = self.config.shape
-        given = tuple(size * self.config.upsample for size in features.shape[-2:])
-        if given != (rows, columns):
+        config = self.config
+        rows, columns = config.shape
+        upsampled = tuple(size * config.upsample for size in features.shape[-2:])
+        if upsampled != (rows, columns):
             raise ConfigError(
-                f"features: {given[0]} × {given[1]} cells after upsampling by {self.config.upsample}, expected "
-                f"{rows} × {columns} of x={self.config.x}, y={self.config.y}; change x and y, or upsample"
+                f"features: {upsampled[0]} × {upsampled[1]} cells after upsampling by "
+                f"{config.upsample}, expected {rows} × {columns} of x={config.x}, y={config.y}; "
+                "change x and y, or upsample"
             )
         shared = self.shared_conv(features)
-        if self.config.upsample > 1:
+        if config.upsample > 1:
             shared = functional.interpolate(
                 shared, size=(rows, columns), mode="bilinear", align_corners=False
             )
@@ -184,11 +193,15 @@ class CenterHead(nn.Module):
 
 
 def _check_slots(class_slots: ClassSlots) -> None:
-    found = [category for slots in class_slots for category in slots if category is not None]
+    """Check the slots of all tasks; raises ConfigError."""
     if not class_slots or not all(class_slots):
         raise ConfigError(f"class_slots: expected tasks of one slot or more, found {class_slots!r}")
-    if len(set(found)) < len(found) or not set(found) <= set(range(len(CATEGORIES))):
+    categories = []
+    for slots in class_slots:
+        categories += [category for category in slots if category is not None]
+    is_repeated = len(set(categories)) < len(categories)
+    if is_repeated or not set(categories) <= set(range(len(CATEGORIES))):
         raise ConfigError(
-            f"class_slots: expected each category 0 to {len(CATEGORIES) - 1} at most once, and None for slots that "
-            f"nothing trains; found {class_slots!r}"
+            f"class_slots: expected each category 0 to {len(CATEGORIES) - 1} at most once, and "
+            f"None for slots that nothing trains; found {class_slots!r}"
         )

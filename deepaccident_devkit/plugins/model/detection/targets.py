@@ -1,4 +1,4 @@
-"""What the detection head should say, from boxes in the ego frame, and the losses where it says something else."""
+"""Targets of the detection head, from boxes in the ego frame, and its losses."""
 
 from __future__ import annotations
 
@@ -21,44 +21,56 @@ from deepaccident_devkit.support.arrays import check_least
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES
 
+# Smallest value of the heatmap in cells of ignored boxes: detections in such cells cost less than a
+# trillionth (`heatmap_loss`).
+_IGNORED_HEATMAP_VALUE = 1 - 1e-3
+# Smallest distance of probabilities from 0 and 1.
+_MIN_PROBABILITY = 1e-4
+
 
 def peak_radius(length: Tensor, width: Tensor, min_overlap: float) -> Tensor:
-    """Radius (N,) of boxes' peaks in the heatmap, cells, before rounding and the least radius; the released formula.
+    """Return the radius (N,) of boxes' peaks in the heatmap, in cells, by the released formula.
 
-    It is the smallest of three roots, in each of which the release divides by 2 where 2a would be right. Lengths and
-    widths are (N,) cells.
+    It is not rounded, and may be below the minimum radius. It is the smallest of three
+    roots; in each, the release divides by 2 where 2a would be right. Lengths and widths are (N,)
+    cells.
     """
-    total, area = length + width, length * width
+    half_perimeter, area = length + width, length * width
     quadratics = (
-        (1.0, total, area * (1 - min_overlap) / (1 + min_overlap)),
-        (4.0, 2 * total, (1 - min_overlap) * area),
-        (4 * min_overlap, -2 * min_overlap * total, (min_overlap - 1) * area),
+        (1.0, half_perimeter, area * (1 - min_overlap) / (1 + min_overlap)),
+        (4.0, 2 * half_perimeter, (1 - min_overlap) * area),
+        (4 * min_overlap, -2 * min_overlap * half_perimeter, (min_overlap - 1) * area),
     )
     roots = [(b + (b**2 - 4 * a * c).clamp(min=0).sqrt()) / 2 for a, b, c in quadratics]
     return torch.stack(roots).amin(dim=0)
 
 
 def draw_peaks(heatmap: Tensor, layer: Tensor, cell: Tensor, radius: Tensor) -> None:
-    """Draw Gaussians with σ = (2r + 1)/6 in squares of 2r + 1 cells; where they meet, the larger value stays.
+    """Draw Gaussians with σ = (2r + 1)/6 in squares of 2r + 1 cells; the larger value is retained.
 
-    The heatmap (L, H, W) is changed in place; each peak has a layer (N,), a cell (N, 2), column and row inside the map,
-    and a radius r (N,), cells; all int64.
+    The heatmap is changed in place.
+
+    Args:
+        heatmap: Heatmap, shape (L, H, W).
+        layer: Layer of each peak, (N,) int64.
+        cell: Column and row of each peak, in the map, (N, 2) int64.
+        radius: Radius r of each peak in cells, (N,) int64.
     """
     if not len(layer):
         return
     rows, columns = heatmap.shape[1:]
-    reach = int(radius.max())
-    offset = torch.arange(-reach, reach + 1, device=heatmap.device)
+    max_radius = int(radius.max())
+    offset = torch.arange(-max_radius, max_radius + 1, device=heatmap.device)
     column, row = cell[:, :1] + offset, cell[:, 1:] + offset  # (N, side)
     sigma = (2 * radius[:, None].to(heatmap.dtype) + 1) / 6
-    bell = torch.exp(-(offset.to(heatmap.dtype) ** 2) / (2 * sigma**2)) * (
-        offset.abs() <= radius[:, None]
-    )
-    # what lies beyond an edge is moved onto it, where the Gaussian itself is larger
-    place = row.clamp(0, rows - 1)[:, :, None] * columns + column.clamp(0, columns - 1)[:, None]
-    place = place + layer[:, None, None] * (rows * columns)
+    gaussian = torch.exp(-(offset.to(heatmap.dtype) ** 2) / (2 * sigma**2))
+    bell = gaussian * (offset.abs() <= radius[:, None])
+    # Values beyond an edge are moved to the edge, where the Gaussian itself is larger.
+    row, column = row.clamp(0, rows - 1), column.clamp(0, columns - 1)
+    index = row[:, :, None] * columns + column[:, None]
+    index = index + layer[:, None, None] * (rows * columns)
     peaks = bell[:, :, None] * bell[:, None]
-    heatmap.view(-1).scatter_reduce_(0, place.flatten(), peaks.flatten(), "amax")
+    heatmap.view(-1).scatter_reduce_(0, index.flatten(), peaks.flatten(), "amax")
 
 
 UnknownVelocity = Literal["ignore", "zero"]
@@ -66,13 +78,15 @@ UnknownVelocity = Literal["ignore", "zero"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetConfig:
-    """How boxes become targets.
+    """Rules for the targets of boxes.
 
     Attributes:
-        min_overlap: of a box with its like, shifted by the radius, from which the radius of its peak follows.
-        min_radius: of a peak in the heatmap, cells.
-        max_boxes: of a task and sample; further ones are left out.
-        unknown_velocity: `ignore` trains no velocity where none is known; `zero`, as released, trains 0.
+        min_overlap: Overlap of a box with a copy that is shifted by the radius; the radius of its
+            peak follows from it.
+        min_radius: Smallest radius of a peak in the heatmap, cells.
+        max_boxes: Maximum number of boxes of a task and sample; further boxes are left out.
+        unknown_velocity: `ignore` trains no velocity where none is known; `zero`, as released,
+            trains 0.
     """
 
     min_overlap: float = 0.1
@@ -81,7 +95,7 @@ class TargetConfig:
     unknown_velocity: UnknownVelocity = "ignore"
 
     def __post_init__(self) -> None:
-        """Check; raises ConfigError or ChoiceError."""
+        """Check the values; raises ConfigError or ChoiceError."""
         settle_choices(self, {"unknown_velocity": get_args(UnknownVelocity)})
         if not 0 < self.min_overlap < 1:
             raise ConfigError(
@@ -94,31 +108,32 @@ class TaskTargets(NamedTuple):
     """One task's targets for B samples.
 
     Attributes:
-        heatmap: (B, slots, H, W) in [0, 1], 1 at the cells of centres.
-        box: (B, max_boxes, 10) box codes: centre in the cell (x, y), z, log l, log w, log h, sin, cos, vx, vy; else 0.
-        place: (B, max_boxes) int64, row · W + column of each box's cell; 0 where there is none.
-        mask: (B, max_boxes) bool, where there is a box.
-        velocity_known: (B, max_boxes) bool, which boxes train their velocity.
+        heatmap: Values in [0, 1], 1 at the cells of centres, shape (B, slots, H, W).
+        box: Box codes: centre in the cell (x, y), z, log l, log w, log h, sin, cos, vx, vy; 0
+            without a box, shape (B, max_boxes, 10).
+        cell_index: row · W + column of each box's cell, (B, max_boxes) int64; 0 without a box.
+        mask: Whether there is a box, (B, max_boxes) bool.
+        velocity_known: Whether each box trains its velocity, (B, max_boxes) bool.
     """
 
     heatmap: Tensor
     box: Tensor
-    place: Tensor
+    cell_index: Tensor
     mask: Tensor
     velocity_known: Tensor
 
 
-class _Placed(NamedTuple):
-    """All boxes of a batch, N, on the grid."""
+class _GridBoxes(NamedTuple):
+    """All N boxes of a batch, on the grid."""
 
     sample: Tensor  # (N,)
-    task: Tensor  # (N,) −1 for those that no task has
-    slot: Tensor  # (N,) in the task
-    cell: Tensor  # (N, 2) column, row
+    task: Tensor  # (N,), −1 for boxes that belong to no task
+    slot: Tensor  # (N,), in the task
+    cell: Tensor  # (N, 2), column and row
     code: Tensor  # (N, 10)
-    radius: Tensor  # (N,) cells
+    radius: Tensor  # (N,), cells
     velocity_known: Tensor  # (N,)
-    inside: Tensor  # (N,) whether they have a cell
+    has_cell: Tensor  # (N,)
 
 
 def detection_targets(
@@ -129,147 +144,145 @@ def detection_targets(
     *,
     velocity_known: Sequence[Tensor] | None = None,
 ) -> list[TaskTargets]:
-    """The targets of each task, as the released CenterHeadv1 makes them.
+    """Return the targets of each task, as in the released CenterHeadv1.
 
-    A box belongs to the cell (x − x₀)/step, truncated toward zero: centres up to one cell below the lower edges count
-    in the first row or column. Other boxes outside are left out, and so are those without length, width or
-    height (of these, the release keeps boxes without height, whose logarithm is infinite).
+    A box belongs to the cell (x − x₀)/step, truncated toward zero: centres up to one cell below the
+    lower edges count in the first row or column. Other boxes outside are left out, and so are boxes
+    without length, width or height (of these, the release retains boxes without height, which have
+    an infinite logarithm).
 
     Args:
-        boxes: for each of B samples (M, 9): x y z l w h yaw vx vy, ego frame, z of the centre; metres, radians, m/s.
-        categories: for each sample (M,) indices into `taxonomy.CATEGORIES`; others are left out. Boxes of −1 are
-            ignored: where they lie, nothing that is found is wrong.
-        head: cells and slots.
-        config: None for ours.
-        velocity_known: for each sample (M,) bool; None where every finite velocity is known.
+        boxes: For each of B samples, x y z l w h yaw vx vy in the ego frame, z of the centre;
+            metres, radians, m/s; shape (M, 9).
+        categories: For each sample, indices into `taxonomy.CATEGORIES`, shape (M,); others are left
+            out. Boxes of −1 are ignored: detections in them are not wrong.
+        head: Cells and slots.
+        config: Rules; None for ours.
+        velocity_known: For each sample, whether a box's velocity is known, (M,) bool; None if every
+            finite velocity is known.
 
     Returns:
-        One a task, on the boxes' device and of their type.
+        Targets of each task, on the boxes' device and of their dtype.
     """
-    rules = config or TargetConfig()
-    placed = _placed(boxes, categories, velocity_known, head, rules)
-    made = [
-        _task_targets(placed, task, len(boxes), head, rules)
+    config = config or TargetConfig()
+    grid_boxes = _grid_boxes(boxes, categories, velocity_known, head, config)
+    targets = [
+        _task_targets(grid_boxes, task, len(boxes), head, config)
         for task in range(len(head.class_slots))
     ]
-    if all(bool((each >= 0).all()) for each in categories):
-        return made
-    ignored = torch.stack(
-        [_covered(box[each < 0], head) for box, each in zip(boxes, categories, strict=True)]
-    )[:, None]
-    return [
-        one._replace(heatmap=torch.where(ignored, one.heatmap.clamp(min=_ANYTHING), one.heatmap))
-        for one in made
-    ]
+    if all(bool((category >= 0).all()) for category in categories):
+        return targets
+    ignored_cells = []
+    for box, category in zip(boxes, categories, strict=True):
+        ignored_cells.append(_covered_cells(box[category < 0], head))
+    is_ignored = torch.stack(ignored_cells)[:, None]
+    masked_targets = []
+    for target in targets:
+        raised = target.heatmap.clamp(min=_IGNORED_HEATMAP_VALUE)
+        heatmap = torch.where(is_ignored, raised, target.heatmap)
+        masked_targets.append(target._replace(heatmap=heatmap))
+    return masked_targets
 
 
-def _covered(boxes: Tensor, head: DetectionConfig) -> Tensor:
-    """Which cells (H, W) have their middle in one of the boxes (M, 9)."""
+def _covered_cells(boxes: Tensor, head: DetectionConfig) -> Tensor:
+    """Return whether each cell (H, W) has its centre in one of the boxes (M, 9)."""
     y, x = (
         low + step * (torch.arange(count, device=boxes.device, dtype=boxes.dtype) + 0.5)
         for (low, _, step), count in zip((head.y, head.x), head.shape, strict=True)
     )
-    away_x, away_y = (
-        x[None, None] - boxes[:, 0, None, None],
-        y[None, :, None] - boxes[:, 1, None, None],
-    )
+    offset_x = x[None, None] - boxes[:, 0, None, None]
+    offset_y = y[None, :, None] - boxes[:, 1, None, None]
     cosine, sine = boxes[:, 6, None, None].cos(), boxes[:, 6, None, None].sin()
-    along, across = (away_x * cosine + away_y * sine).abs(), (away_y * cosine - away_x * sine).abs()
-    return ((along <= boxes[:, 3, None, None] / 2) & (across <= boxes[:, 4, None, None] / 2)).any(
-        dim=0
-    )
+    longitudinal = (offset_x * cosine + offset_y * sine).abs()
+    lateral = (offset_y * cosine - offset_x * sine).abs()
+    half_length, half_width = boxes[:, 3, None, None] / 2, boxes[:, 4, None, None] / 2
+    return ((longitudinal <= half_length) & (lateral <= half_width)).any(dim=0)
 
 
-def _placed(
+def _grid_boxes(
     boxes: Sequence[Tensor],
     categories: Sequence[Tensor],
     velocity_known: Sequence[Tensor] | None,
     head: DetectionConfig,
     config: TargetConfig,
-) -> _Placed:
+) -> _GridBoxes:
+    """Return the boxes of all samples on the grid."""
     box, category = torch.cat(list(boxes)), torch.cat(list(categories))
-    counts = torch.tensor([len(each) for each in boxes], device=box.device)
+    counts = torch.tensor([len(sample_boxes) for sample_boxes in boxes], device=box.device)
     rows, columns = head.shape
     low, step = box.new_tensor([head.x[0], head.y[0]]), box.new_tensor([head.x[2], head.y[2]])
-    place = (box[:, :2] - low) / step
-    cell = place.trunc()
+    position = (box[:, :2] - low) / step
+    cell = position.trunc()
     size = box[:, 3:5] / step
-    inside = ((cell >= 0) & (cell < box.new_tensor([columns, rows]))).all(dim=1) & (
-        box[:, 3:6] > 0
-    ).all(dim=1)
-    known = box[:, 7:].isfinite().all(dim=1)
+    in_grid = ((cell >= 0) & (cell < box.new_tensor([columns, rows]))).all(dim=1)
+    has_cell = in_grid & (box[:, 3:6] > 0).all(dim=1)
+    is_known = box[:, 7:].isfinite().all(dim=1)
     if velocity_known is not None:
-        known = known & torch.cat(list(velocity_known))
-    yaw, velocity = (
-        box[:, 6:7],
-        torch.where(known[:, None], box[:, 7:], torch.zeros_like(box[:, 7:])),
-    )
+        is_known = is_known & torch.cat(list(velocity_known))
+    yaw = box[:, 6:7]
+    velocity = torch.where(is_known[:, None], box[:, 7:], torch.zeros_like(box[:, 7:]))
     code = torch.cat(
-        [place - cell, box[:, 2:3], box[:, 3:6].log(), yaw.sin(), yaw.cos(), velocity], dim=1
+        [position - cell, box[:, 2:3], box[:, 3:6].log(), yaw.sin(), yaw.cos(), velocity], dim=1
     )
-    task, slot = _slots_of(category, head)
-    radius = (
-        peak_radius(size[:, 0], size[:, 1], config.min_overlap).long().clamp(min=config.min_radius)
-    )
-    return _Placed(
+    task, slot = _tasks_and_slots(category, head)
+    radius = peak_radius(size[:, 0], size[:, 1], config.min_overlap).long()
+    return _GridBoxes(
         sample=torch.repeat_interleave(torch.arange(len(boxes), device=box.device), counts),
         task=task,
         slot=slot,
         cell=cell.long(),
         code=code,
-        radius=radius,
-        velocity_known=known | (config.unknown_velocity == "zero"),
-        inside=inside,
+        radius=radius.clamp(min=config.min_radius),
+        velocity_known=is_known | (config.unknown_velocity == "zero"),
+        has_cell=has_cell,
     )
 
 
-def _slots_of(category: Tensor, head: DetectionConfig) -> tuple[Tensor, Tensor]:
-    """Task, and slot in it, of each category; task −1 for those that have none."""
-    places = {
-        each: (task, slot)
-        for task, slots in enumerate(head.class_slots)
-        for slot, each in enumerate(slots)
-    }
-    rows = [places.get(each, (-1, -1)) for each in range(len(CATEGORIES))]
-    table = torch.tensor([*rows, (-1, -1)], device=category.device)
-    known = (category >= 0) & (category < len(CATEGORIES))
-    found = table[torch.where(known, category, len(CATEGORIES))]
-    return found[:, 0], found[:, 1]
+def _tasks_and_slots(category: Tensor, head: DetectionConfig) -> tuple[Tensor, Tensor]:
+    """Return the task of each category, and its slot in the task; −1 for no task."""
+    rows = [(-1, -1)] * (len(CATEGORIES) + 1)  # the last row is that of unknown categories
+    for task, slots in enumerate(head.class_slots):
+        for slot, number in enumerate(slots):
+            if number is not None:
+                rows[number] = (task, slot)
+    table = torch.tensor(rows, device=category.device)
+    is_known = (category >= 0) & (category < len(CATEGORIES))
+    matches = table[torch.where(is_known, category, len(CATEGORIES))]
+    return matches[:, 0], matches[:, 1]
 
 
 def _task_targets(
-    placed: _Placed, task: int, samples: int, head: DetectionConfig, config: TargetConfig
+    boxes: _GridBoxes, task: int, samples: int, head: DetectionConfig, config: TargetConfig
 ) -> TaskTargets:
-    """Boxes stand in the order of their slots, then as given; one outside leaves its place empty, as in the release."""
+    """Return a task's targets.
+
+    Boxes are ordered by their slots, then as in the input; a box without a cell leaves its row
+    empty, as in the release.
+    """
     slots, (rows, columns) = len(head.class_slots[task]), head.shape
-    mine = torch.nonzero(placed.task == task)[:, 0]
-    mine = mine[torch.argsort(placed.sample[mine] * slots + placed.slot[mine], stable=True)]
-    first = torch.cumsum(torch.bincount(placed.sample[mine], minlength=samples), dim=0)
-    first = torch.cat([first.new_zeros(1), first[:-1]])
-    number = torch.arange(len(mine), device=mine.device) - first[placed.sample[mine]]
-    kept = placed.inside[mine] & (number < config.max_boxes)
-    mine, number = mine[kept], number[kept]
-    sample, cell = placed.sample[mine], placed.cell[mine]
+    selected = torch.nonzero(boxes.task == task)[:, 0]
+    order = torch.argsort(boxes.sample[selected] * slots + boxes.slot[selected], stable=True)
+    selected = selected[order]
+    ends = torch.cumsum(torch.bincount(boxes.sample[selected], minlength=samples), dim=0)
+    starts = torch.cat([ends.new_zeros(1), ends[:-1]])
+    all_numbers = torch.arange(len(selected), device=selected.device)
+    number = all_numbers - starts[boxes.sample[selected]]
+    is_retained = boxes.has_cell[selected] & (number < config.max_boxes)
+    selected, number = selected[is_retained], number[is_retained]
+    sample, cell = boxes.sample[selected], boxes.cell[selected]
     size = (samples, config.max_boxes)
-    box = placed.code.new_zeros((*size, CODE_SIZE))
-    place = mine.new_zeros(size)
-    mask, known = (
-        torch.zeros_like(place, dtype=torch.bool),
-        torch.zeros_like(place, dtype=torch.bool),
-    )
-    box[sample, number] = placed.code[mine]
-    place[sample, number] = cell[:, 1] * columns + cell[:, 0]
+    box = boxes.code.new_zeros((*size, CODE_SIZE))
+    cell_index = selected.new_zeros(size)
+    mask = torch.zeros_like(cell_index, dtype=torch.bool)
+    velocity_known = torch.zeros_like(cell_index, dtype=torch.bool)
+    box[sample, number] = boxes.code[selected]
+    cell_index[sample, number] = cell[:, 1] * columns + cell[:, 0]
     mask[sample, number] = True
-    known[sample, number] = placed.velocity_known[mine]
+    velocity_known[sample, number] = boxes.velocity_known[selected]
     heatmap = box.new_zeros((samples * slots, rows, columns))
-    draw_peaks(heatmap, sample * slots + placed.slot[mine], cell, placed.radius[mine])
-    return TaskTargets(heatmap.view(samples, slots, rows, columns), box, place, mask, known)
-
-
-# Of the heatmap, in cells of ignored boxes: what is found there costs less than a trillionth (`heatmap_loss`).
-_ANYTHING = 1 - 1e-3
-# Probabilities stay this far from 0 and 1.
-_CLIP = 1e-4
+    draw_peaks(heatmap, sample * slots + boxes.slot[selected], cell, boxes.radius[selected])
+    heatmap = heatmap.view(samples, slots, rows, columns)
+    return TaskTargets(heatmap, box, cell_index, mask, velocity_known)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,15 +290,15 @@ class DetectionLossConfig:
     """Weights of the losses, the released ones.
 
     Attributes:
-        weight: of all of them, beside the other tasks of the network.
-        box_weight: of the box codes' loss beside the heatmap's.
+        weight: Weight of all detection losses relative to the network's other tasks.
+        box_weight: Weight of the box codes' loss relative to the heatmap's.
     """
 
     weight: float = 0.5
     box_weight: float = 0.25
 
     def __post_init__(self) -> None:
-        """Check; raises ConfigError."""
+        """Check the values; raises ConfigError."""
         check_least(self, weight=0, box_weight=0)
 
 
@@ -294,47 +307,56 @@ def detection_losses(
     targets: Sequence[TaskTargets],
     config: DetectionLossConfig | None = None,
 ) -> dict[str, Tensor]:
-    """`task0.loss_heatmap`, `task0.loss_bbox`, … as the released CenterHeadv1 has them, times the weights.
+    """Return the weighted losses of the released CenterHeadv1.
+
+    They are `task0.loss_heatmap`, `task0.loss_bbox`, …
 
     Args:
-        maps: of each task, from the head.
-        targets: of each task.
-        config: None for the released weights.
+        maps: Maps of each task, from the head.
+        targets: Targets of each task.
+        config: Weights; None for the released ones.
 
     Returns:
         Scalars, in single precision or better.
     """
     weights = config or DetectionLossConfig()
     losses: dict[str, Tensor] = {}
-    for number, (map_, target) in enumerate(zip(maps, targets, strict=True)):
+    for number, (task_maps, target) in enumerate(zip(maps, targets, strict=True)):
         losses[f"task{number}.loss_heatmap"] = weights.weight * heatmap_loss(
-            map_.heatmap, target.heatmap
+            task_maps.heatmap, target.heatmap
         )
         losses[f"task{number}.loss_bbox"] = (
-            weights.weight * weights.box_weight * box_loss(map_.code, target)
+            weights.weight * weights.box_weight * box_loss(task_maps.code, target)
         )
     return losses
 
 
 def heatmap_loss(logits: Tensor, heatmap: Tensor) -> Tensor:
-    """Gaussian focal loss (CornerNet, α = 2, γ = 4) of (B, slots, H, W), summed, over the number of peaks or 1."""
-    found = precise(logits).sigmoid().clamp(_CLIP, 1 - _CLIP)
-    peak = heatmap == 1
-    missed = -((1 - found) ** 2) * found.log()
-    invented = -(found**2) * (1 - found).log() * (1 - heatmap) ** 4
-    return torch.where(peak, missed, invented).sum() / peak.sum().clamp(min=1)
+    """Return the Gaussian focal loss (CornerNet, α = 2, γ = 4) of (B, slots, H, W).
+
+    It is summed and divided by the number of peaks or 1.
+    """
+    probability = precise(logits).sigmoid().clamp(_MIN_PROBABILITY, 1 - _MIN_PROBABILITY)
+    is_peak = heatmap == 1
+    peak_losses = -((1 - probability) ** 2) * probability.log()
+    other_losses = -(probability**2) * (1 - probability).log() * (1 - heatmap) ** 4
+    return torch.where(is_peak, peak_losses, other_losses).sum() / is_peak.sum().clamp(min=1)
 
 
 def box_loss(code: Tensor, target: TaskTargets) -> Tensor:
-    """L1 distances of box codes (B, 10, H, W), summed, over the number of boxes; unknown velocities do not count."""
-    found = gather_cells(precise(code), target.place)
-    counts = target.mask[:, :, None].repeat(1, 1, found.shape[-1])
-    counts[:, :, -CODE_CHANNELS["vel"] :] &= target.velocity_known[:, :, None]
-    distance = (found - target.box).abs() * counts
+    """Return the sum of L1 distances of box codes (B, 10, H, W), over the number of boxes.
+
+    Unknown velocities do not count.
+    """
+    predicted = gather_cells(precise(code), target.cell_index)
+    is_counted = target.mask[:, :, None].repeat(1, 1, predicted.shape[-1])
+    is_counted[:, :, -CODE_CHANNELS["vel"] :] &= target.velocity_known[:, :, None]
+    distance = (predicted - target.box).abs() * is_counted
     return distance.sum() / (target.mask.sum() + 1e-4)
 
 
-def gather_cells(maps: Tensor, place: Tensor) -> Tensor:
-    """Values (B, C, H, W) at cells (B, K), given as row · W + column: (B, K, C)."""
+def gather_cells(maps: Tensor, cell_index: Tensor) -> Tensor:
+    """Return values (B, K, C) of maps (B, C, H, W) at cells (B, K), given as row · W + column."""
     channels = maps.shape[1]
-    return maps.flatten(2).gather(2, place[:, None].expand(-1, channels, -1)).transpose(1, 2)
+    index = cell_index[:, None].expand(-1, channels, -1)
+    return maps.flatten(2).gather(2, index).transpose(1, 2)

@@ -1,7 +1,8 @@
-"""Fusion of several agents' BEV maps: `fusion` makes the module of a config; all have the interface `Fusion`.
+"""Fusion of several agents' BEV maps.
 
-`PoolFusion` is a mean or maximum, `ReleasedFusion` what the released code does; `DiscoNetFusion`, `CobevtFusion` and
-`V2XViTFusion` are written after their own papers, since the released code has none of them.
+`fusion` builds the module of a config; all modules have the interface `Fusion`. `PoolFusion` is a
+mean or maximum, `ReleasedFusion` the released code's fusion; `DiscoNetFusion`, `CobevtFusion` and
+`V2XViTFusion` are written from their own papers, because the released code has none of them.
 """
 
 from collections.abc import Callable, Mapping
@@ -40,7 +41,10 @@ _MODULES: Final[Mapping[type, Callable[[Any], Fusion]]] = {
 
 
 def fusion(config: FusionConfig) -> Fusion:
-    """The fusion module that a config describes, with fresh weights. Raises ConfigError: another object."""
+    """Return the fusion module that a config describes, with fresh weights.
+
+    Raises ConfigError for another object.
+    """
     if type(config) not in _MODULES:
         raise ConfigError(f"fusion: expected the config of a fusion module, found {config!r}")
     return _MODULES[type(config)](config)

@@ -1,4 +1,4 @@
-"""Attention over agents and over windows of maps: the parts of the transformers CoBEVT and V2X-ViT."""
+"""Attention over agents and windows of maps: the parts of CoBEVT and V2X-ViT."""
 
 from __future__ import annotations
 
@@ -12,50 +12,60 @@ from torch.nn import functional
 
 from deepaccident_devkit.plugins.model.images.swin import relative_positions
 
+# Kinds of agents: vehicle 0, infrastructure 1.
+_KIND_COUNT = 2
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Windows:
-    """How maps are divided.
+    """The division of maps into windows.
 
-    If the size does not divide H or W, rows below and columns to the right are added; the mask tells them.
+    If the size does not divide H or W, rows are added after the last row and columns after the last
+    column; the mask marks them.
 
     Attributes:
-        size: rows and columns of a window.
-        strided: a window has cells spread evenly over the whole map (CoBEVT's grid), not neighbours.
+        size: Rows and columns of a window.
+        strided: Whether a window has cells that are spread evenly over the complete map (CoBEVT's
+            grid) instead of neighbours.
     """
 
     size: int
     strided: bool = False
 
     def split(self, x: Tensor) -> Tensor:
-        """Maps (B, A, H, W, C) → tokens (B · windows, A · size², C), by agent, row and column; added cells are 0."""
+        """Split maps (B, A, H, W, C) into tokens (B · windows, A · size², C).
+
+        Tokens are ordered by agent, row and column; added cells are 0.
+        """
         size = self.size
         padded = functional.pad(x, (0, 0, 0, -x.shape[3] % size, 0, -x.shape[2] % size))
         batch, agents, height, width, channels = padded.shape
-        down, along = height // size, width // size
+        rows, columns = height // size, width // size
         if self.strided:
-            parts = padded.view(batch, agents, size, down, size, along, channels).permute(
-                0, 3, 5, 1, 2, 4, 6
-            )
+            parts = padded.view(batch, agents, size, rows, size, columns, channels)
+            parts = parts.permute(0, 3, 5, 1, 2, 4, 6)
         else:
-            parts = padded.view(batch, agents, down, size, along, size, channels).permute(
-                0, 2, 4, 1, 3, 5, 6
-            )
-        return parts.reshape(batch * down * along, agents * size * size, channels)
+            parts = padded.view(batch, agents, rows, size, columns, size, channels)
+            parts = parts.permute(0, 2, 4, 1, 3, 5, 6)
+        return parts.reshape(batch * rows * columns, agents * size * size, channels)
 
     def join(self, tokens: Tensor, shape: torch.Size) -> Tensor:
-        """Tokens (B · windows, A · size², C) → maps (B, A, H, W, C) of the shape that `split` had."""
+        """Join tokens (B · windows, A · size², C) to maps (B, A, H, W, C).
+
+        `shape` is (B, A, H, W) of the maps before `split`.
+        """
         batch, agents, height, width = shape
         size = self.size
-        down, along = -(-height // size), -(-width // size)
-        parts = tokens.view(batch, down, along, agents, size, size, -1)
+        rows, columns = -(-height // size), -(-width // size)
+        parts = tokens.view(batch, rows, columns, agents, size, size, -1)
         order = (0, 3, 4, 1, 5, 2, 6) if self.strided else (0, 3, 1, 4, 2, 5, 6)
-        maps = parts.permute(order).reshape(batch, agents, down * size, along * size, -1)
+        maps = parts.permute(order).reshape(batch, agents, rows * size, columns * size, -1)
         return maps[:, :, :height, :width]
 
     def split_mask(self, mask: Tensor) -> Tensor:
-        """Masks (B, A, H, W) → (B · windows, A · size²) bool; added cells are False."""
-        return self.split(mask[..., None].to(torch.uint8))[..., 0].bool()
+        """Split masks (B, A, H, W) into (B · windows, A · size²) bool; added cells are False."""
+        tokens = self.split(mask[..., None].to(torch.uint8))
+        return tokens[..., 0].bool()
 
 
 class PreNorm(nn.Module):
@@ -66,9 +76,9 @@ class PreNorm(nn.Module):
         self.norm = nn.LayerNorm(channels)
         self.layer = layer
 
-    def forward(self, x: Tensor, *others: Any) -> Tensor:
-        """(…, C) → (…, C); the other arguments go to the layer as they are."""
-        return x + self.layer(self.norm(x), *others)
+    def forward(self, x: Tensor, *arguments: Any) -> Tensor:
+        """Transform (…, C) to (…, C); the other arguments are passed to the layer."""
+        return x + self.layer(self.norm(x), *arguments)
 
 
 class FeedForward(nn.Module):
@@ -85,47 +95,47 @@ class FeedForward(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """(…, C) → (…, C)."""
+        """Transform (…, C) to (…, C)."""
         return self.net(x)
 
 
 def attention(qkv: Tensor, heads: int, bias: Tensor, keys: Tensor | None) -> Tensor:
-    """Self-attention within M sets of L tokens, (M, L, 3 · C) → (M, L, C).
+    """Attend within M sets of L tokens, (M, L, 3 · C); return (M, L, C).
 
-    Queries, keys and values have the heads' channels one after the other. The bias (heads or 1, L, L), [query, key], is
-    added to the scaled products; `keys` (M, L) bool can be attended to, at least one a set; None for all.
+    Queries, keys and values have the heads' channels one after the other. The bias (heads or 1, L,
+    L), [query, key], is added to the scaled products. `keys` (M, L) bool are the tokens that can be
+    attended to, at least one a set; None for all.
     """
     query, key, value = qkv.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4)
     score = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
-    score += bias  # in place, here and below: scores are by far the largest tensors of a module
+    # In place, here and in the next lines: scores are by far the largest tensors of a module.
+    score += bias
     if keys is not None:
         score.masked_fill_(~keys[:, None, None, :], -torch.inf)
     return (score.softmax(-1).to(value.dtype) @ value).transpose(1, 2).flatten(2)
 
 
-# Vehicle 0, infrastructure 1.
-_KINDS = 2
-
-
 class LinearByKind(nn.Module):
-    """A linear layer with other weights for each kind of agent."""
+    """A linear layer with separate weights for each kind of agent."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         bound = channels**-0.5
-        self.weight = nn.Parameter(torch.empty(_KINDS, channels, channels).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.empty(_KINDS, channels).uniform_(-bound, bound))
+        self.weight = nn.Parameter(
+            torch.empty(_KIND_COUNT, channels, channels).uniform_(-bound, bound)
+        )
+        self.bias = nn.Parameter(torch.empty(_KIND_COUNT, channels).uniform_(-bound, bound))
 
     def forward(self, x: Tensor, kind: Tensor) -> Tensor:
-        """(B, A, M, C) and kinds (B, A) → (B, A, M, C)."""
+        """Transform (B, A, M, C), with kinds (B, A), to (B, A, M, C)."""
         return x @ self.weight[kind].transpose(-1, -2) + self.bias[kind][:, :, None]
 
 
 class AgentAttention(nn.Module):
-    """Each agent attends to all agents' features of the same cell.
+    """Attention of each agent to all agents' features of the same cell.
 
-    With kinds τ: a_ij = q_iᵀ W_att[τ_i, τ_j] k_j / √d, a `softmax` over the agents j that the mask shows,
-    o_i = Out_{τ_i} Σ_j a_ij (v_j W_msg[τ_i, τ_j]); for each head.
+    With kinds τ: a_ij = q_iᵀ W_att[τ_i, τ_j] k_j / √d, a `softmax` over the agents j that the mask
+    shows, o_i = Out_{τ_i} Σ_j a_ij (v_j W_msg[τ_i, τ_j]); for each head.
     """
 
     def __init__(self, channels: int, heads: int, dropout: float) -> None:
@@ -133,47 +143,54 @@ class AgentAttention(nn.Module):
         self.heads = heads
         size = channels // heads
         self.query, self.key, self.value, self.out = (LinearByKind(channels) for _ in range(4))
-        self.relation_att = nn.Parameter(torch.empty(_KINDS * _KINDS, heads, size, size))
-        self.relation_msg = nn.Parameter(torch.empty(_KINDS * _KINDS, heads, size, size))
+        self.relation_att = nn.Parameter(torch.empty(_KIND_COUNT * _KIND_COUNT, heads, size, size))
+        self.relation_msg = nn.Parameter(torch.empty(_KIND_COUNT * _KIND_COUNT, heads, size, size))
         for relation in (self.relation_att, self.relation_msg):
             nn.init.uniform_(relation, -((3 / size) ** 0.5), (3 / size) ** 0.5)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor) -> Tensor:
-        """Maps (B, A, H, W, C), mask (B, A, H, W) and kinds (B, A) → the same shape as the maps."""
+        """Attend in maps (B, A, H, W, C); return the same shape.
+
+        The mask has shape (B, A, H, W), the kinds (B, A).
+        """
         kind = agent_is_infra.long()
         cells = x.flatten(2, 3)
         query, key, value = (
             self._by_head(layer(cells, kind)) for layer in (self.query, self.key, self.value)
         )
         scale = query.shape[-1] ** -0.5
-        by_kind = [
+        scores_by_kind = [
             self._related(query, self.relation_att, kind, other) * scale @ key.transpose(-1, -2)
-            for other in range(_KINDS)
+            for other in range(_KIND_COUNT)
         ]
-        infra = agent_is_infra[:, None, None, None, :]
-        shown = mask.flatten(2).transpose(1, 2)[:, None, :, None, :]
-        score = torch.where(infra, by_kind[1], by_kind[0]).masked_fill(~shown, -torch.inf)
+        is_infra = agent_is_infra[:, None, None, None, :]
+        is_visible = mask.flatten(2).transpose(1, 2)[:, None, :, None, :]
+        score = torch.where(is_infra, scores_by_kind[1], scores_by_kind[0])
+        score = score.masked_fill(~is_visible, -torch.inf)
         weight = score.softmax(-1).to(value.dtype)
-        messages = [
-            self._related(weight * (infra == bool(other)) @ value, self.relation_msg, kind, other)
-            for other in range(_KINDS)
-        ]
+        messages = []
+        for other in range(_KIND_COUNT):
+            values_of_kind = weight * (is_infra == bool(other)) @ value
+            messages.append(self._related(values_of_kind, self.relation_msg, kind, other))
         merged = (messages[0] + messages[1]).permute(0, 3, 2, 1, 4).flatten(3)
         return self.dropout(self.out(merged, kind)).view_as(x)
 
     def _by_head(self, x: Tensor) -> Tensor:
-        """(B, A, M, C) → (B, heads, M, A, C / heads)."""
+        """Return (B, A, M, C) as (B, heads, M, A, C / heads)."""
         return x.unflatten(-1, (self.heads, -1)).permute(0, 3, 2, 1, 4)
 
     @staticmethod
     def _related(x: Tensor, relation: Tensor, kind: Tensor, other: int) -> Tensor:
-        """(B, heads, M, A, d), each agent's through the matrix of its kind and another kind."""
-        return torch.einsum("bhmip,bihpq->bhmiq", x, relation[_KINDS * kind + other])
+        """Return (B, heads, M, A, d), each agent times the matrix of its kind and another kind."""
+        return torch.einsum("bhmip,bihpq->bhmiq", x, relation[_KIND_COUNT * kind + other])
 
 
 class WindowAttention(nn.Module):
-    """Attention among the cells of a window of one agent's map; the relative bias is the same for all heads."""
+    """Attention among the cells of a window of one agent's map.
+
+    The relative bias is the same for all heads.
+    """
 
     positions: Tensor
 
@@ -184,13 +201,16 @@ class WindowAttention(nn.Module):
         self.to_out = nn.Sequential(nn.Linear(channels, channels), nn.Dropout(dropout))
         span = 2 * windows.size - 1
         self.pos_embedding = nn.Parameter(torch.randn(span, span))
-        # the original's bias goes by key − query
+        # The original's bias is indexed by key − query.
         self.register_buffer(
             "positions", relative_positions(windows.size).T.contiguous(), persistent=False
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (M, 1, H, W, C) → the same shape; cells added to fill the windows are not attended to."""
+        """Attend in maps (M, 1, H, W, C); return the same shape.
+
+        Cells that are added to fill the windows are not attended to.
+        """
         keys = None
         if x.shape[2] % self.windows.size or x.shape[3] % self.windows.size:
             keys = self.windows.split_mask(
@@ -202,7 +222,11 @@ class WindowAttention(nn.Module):
 
 
 class SplitAttention(nn.Module):
-    """Σ of branches, each channel with a `softmax` over the branches of weights found in the mean over the map."""
+    """Weighted sum of branches.
+
+    Each channel has a `softmax` over the branches of weights, which follow from the mean over the
+    map.
+    """
 
     def __init__(self, channels: int, branches: int) -> None:
         super().__init__()
@@ -215,14 +239,17 @@ class SplitAttention(nn.Module):
         )
 
     def forward(self, results: list[Tensor]) -> Tensor:
-        """As many maps (M, 1, H, W, C) as branches → one."""
+        """Join maps (M, 1, H, W, C), one for each branch, to one map."""
         stacked = torch.stack(results, -2)
         score = self.weigh(stacked.sum(-2).mean((2, 3), keepdim=True))
         return (stacked * score.unflatten(-1, (self.branches, -1)).softmax(-2)).sum(-2)
 
 
 class MultiWindowAttention(nn.Module):
-    """Window attention with windows of several sizes, joined by split attention; each agent's map for itself."""
+    """Window attention with windows of several sizes, joined by split attention.
+
+    Each agent's map is treated separately.
+    """
 
     def __init__(
         self, channels: int, sizes: Sequence[int], heads: Sequence[int], dropout: float
@@ -235,6 +262,6 @@ class MultiWindowAttention(nn.Module):
         self.split_attention = SplitAttention(channels, len(sizes))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (B, A, H, W, C) → the same shape."""
+        """Attend in maps (B, A, H, W, C); return the same shape."""
         maps = x.flatten(0, 1)[:, None]
         return self.split_attention([branch(maps) for branch in self.branches]).view_as(x)

@@ -1,8 +1,8 @@
-"""What every way of fusion takes and gives, and those without attention: mean, maximum, the released one, DiscoNet.
+"""The interface of all fusions, and mean, maximum, the released fusion and DiscoNet.
 
-DiscoNet is after Li et al., Learning Distilled Collaboration Graph (NeurIPS 2021); the layers' sizes are those of its
-version in CoBEVT's code. The DeepAccident paper names it; the released code has none. There is no distillation from a
-teacher that sees all sensors.
+DiscoNet follows Li et al., Learning Distilled Collaboration Graph (NeurIPS 2021); the sizes of the
+layers are from its version in CoBEVT's code. The DeepAccident paper names it; the released code has
+none. There is no distillation from a teacher that sees all sensors.
 """
 
 from __future__ import annotations
@@ -18,56 +18,64 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.temporal import Bottleneck3d, TemporalBlock
 from deepaccident_devkit.support.text import settle_choices
 
+# Channels that a relative pose takes: a 6-vector, the same in all cells.
+POSE_CHANNELS = 6
+# Of 64, found by eye on one checkpoint of the released code's authors, and without meaning for any
+# other.
+RELEASED_EGO_CHANNELS: Final = (31, 41, 42, 43, 44, 53, 57, 60)
+
 
 class Fusion(nn.Module, ABC):
-    """Several agents' BEV maps in the ego's frame → one map of the ego.
+    """Fusion of several agents' BEV maps in the ego's frame into one map of the ego.
 
-    Every module gives exactly the result of the ego alone where no partner has anything to say, and does not depend on
-    the partners' order, except with options that say so. What the mask hides has no effect, in training neither.
+    In cells without a visible partner every module returns exactly the result of the ego without
+    partners, and does not depend on the partners' order, except with options that document it.
+    Hidden cells have no effect, not even in training.
 
     Attributes:
-        hides_outside: whether masks are to hide the cells outside a partner's own map, beside agents that are missing.
+        hides_outside: Whether masks should also hide the cells outside a partner's own map, in
+            addition to missing agents.
     """
 
     hides_outside: ClassVar[bool] = True
 
     @abstractmethod
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:
-        """Fuse.
+        """Fuse the agents' maps; return the ego's map (B, C, H, W).
 
         Args:
-            x: (B, A, C, H, W) maps, already in the ego's frame (`warps.features_to_ego`); slot 0 is the ego.
-            mask: (B, A, H, W) bool, where an agent has something to say (`warps.agents_mask`); the ego has everywhere.
-            agent_is_infra: (B, A) bool, whether the agent is infrastructure, not a vehicle.
-            delay: (B, A) integer steps by which an agent's map is older than the ego's; not negative.
-
-        Returns:
-            (B, C, H, W).
+            x: Maps in the ego's frame (`warps.features_to_ego`), shape (B, A, C, H, W); slot 0 is
+                the ego.
+            mask: Cells that each agent covers (`warps.agents_mask`), (B, A, H, W) bool; the ego
+                covers all cells.
+            agent_is_infra: Whether each agent is infrastructure instead of a vehicle, (B, A) bool.
+            delay: Steps by which each agent's map is older than the ego's, (B, A) int; not
+                negative.
         """
 
 
 def visible(x: Tensor, mask: Tensor) -> Tensor:
-    """Maps (B, A, C, H, W) with 0 where the mask (B, A, H, W) hides an agent."""
+    """Return maps (B, A, C, H, W) with 0 in cells that the mask (B, A, H, W) hides."""
     return x.masked_fill(~mask[:, :, None], 0)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Mean (B, C, H, W) of the agents that a mask (B, A, H, W) does not hide, of maps (B, A, C, H, W)."""
-    return visible(x, mask).sum(1) / mask.sum(1)[:, None].to(x.dtype)
+    """Return the mean (B, C, H, W) of maps (B, A, C, H, W) over the agents that the mask shows.
 
-
-# Channels that a relative pose takes: a 6-vector, the same in all cells.
-POSE = 6
+    The mask has shape (B, A, H, W).
+    """
+    agent_counts = mask.sum(1)[:, None]
+    return visible(x, mask).sum(1) / agent_counts.to(x.dtype)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agent3DConfig:
-    """The unreached layers.
+    """The unused layers of the released code.
 
     Attributes:
-        channels: C.
-        agents: A, the ego and its partners.
-        bottlenecks: after each block.
+        channels: Number C of channels.
+        agents: Number A of agents, the ego and its partners.
+        bottlenecks: Number of bottlenecks after each block.
     """
 
     channels: int
@@ -85,8 +93,8 @@ class Agent3DConfig:
 class Agent3D(nn.Module):
     """A − 1 blocks over the sequence of agents, then one 3×3 convolution over all their channels.
 
-    State-dict keys are the released ones (`v2x_fusion.` and these). The order of the partners matters, and nothing was
-    published that was trained through these layers.
+    State-dict keys are the released ones (`v2x_fusion.` and these). The order of the partners
+    matters, and nothing that was trained through these layers was published.
     """
 
     def __init__(self, config: Agent3DConfig) -> None:
@@ -94,7 +102,7 @@ class Agent3D(nn.Module):
         width = config.channels
         layers: list[nn.Module] = []
         for block in range(config.agents - 1):
-            layers.append(TemporalBlock(width + POSE if block == 0 else width, width))
+            layers.append(TemporalBlock(width + POSE_CHANNELS if block == 0 else width, width))
             layers.extend(Bottleneck3d(width) for _ in range(config.bottlenecks))
         self.model = nn.Sequential(*layers)
         self.compression = nn.Sequential(
@@ -104,36 +112,29 @@ class Agent3D(nn.Module):
         )
 
     def forward(self, x: Tensor, relative_pose: Tensor) -> Tensor:
-        """Fuse maps that are already in the ego's frame.
+        """Fuse maps that are already in the ego's frame; return one map (B, C, H, W).
 
         Args:
-            x: (B, A, C, H, W); slot 0 is the ego.
-            relative_pose: (B, A, 6) 6-vectors `ego_from_agent`; slot 0 is not used.
-
-        Returns:
-            (B, C, H, W).
+            x: Maps, shape (B, A, C, H, W); slot 0 is the ego.
+            relative_pose: 6-vectors `ego_from_agent`, shape (B, A, 6); slot 0 is not used.
         """
         return self.compression(self.over_agents(x, relative_pose).flatten(1, 2))
 
     def over_agents(self, x: Tensor, relative_pose: Tensor) -> Tensor:
-        """(B, A, C, H, W) after the 3D convolutions; arguments as `forward`."""
-        pose = torch.cat([torch.zeros_like(relative_pose[:, :1]), relative_pose[:, 1:]], 1).to(
-            x.dtype
-        )
-        maps = torch.cat([x, pose[..., None, None].expand(-1, -1, -1, *x.shape[-2:])], 2)
+        """Return the maps (B, A, C, H, W) after the 3D convolutions; arguments as in `forward`."""
+        ego_pose = torch.zeros_like(relative_pose[:, :1])
+        poses = torch.cat([ego_pose, relative_pose[:, 1:]], 1).to(x.dtype)
+        pose_maps = poses[..., None, None].expand(-1, -1, -1, *x.shape[-2:])
+        maps = torch.cat([x, pose_maps], 2)
         return self.model(maps.transpose(1, 2)).transpose(1, 2)
-
-
-# Of 64, found by eye on one checkpoint of the released code's authors, and without meaning for any other.
-RELEASED_EGO_CHANNELS: Final = (31, 41, 42, 43, 44, 53, 57, 60)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoolFusionConfig:
-    """The mean, or the maximum (F-Cooper), of the agents that have something to say.
+    """The mean, or the maximum (F-Cooper), over the agents that the mask shows.
 
     Attributes:
-        by: which of the two.
+        by: `mean` or `max`.
     """
 
     by: Literal["mean", "max"] = "mean"
@@ -151,7 +152,7 @@ class PoolFusion(Fusion):
         self.config = config
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
-        """As `Fusion.forward`; kinds of agents and delays do not count."""
+        """Fuse as `Fusion.forward`; kinds of agents and delays have no effect."""
         if self.config.by == "mean":
             return masked_mean(x, mask)
         return x.masked_fill(~mask[:, :, None], -torch.inf).amax(1)
@@ -162,10 +163,13 @@ class ReleasedFusionConfig:
     """The fusion of the released code.
 
     Attributes:
-        channels: C.
-        ego_channels: channels that are the ego's own, not the mean; none gives a plain mean of filled maps.
-        fill_below: a partner's cell whose channels' mean absolute value is smaller is filled with the ego's.
-        agent3d: the released code's unused layers, so that all keys of its checkpoints have a place; None for none.
+        channels: Number C of channels.
+        ego_channels: Channels that are copied from the ego instead of averaged; none gives a plain
+            mean of filled maps.
+        fill_below: A partner's cell with a smaller mean absolute value over its channels is filled
+            with the ego's.
+        agent3d: The released code's unused layers, so that all keys of its checkpoints have a
+            target; None for none.
     """
 
     channels: int
@@ -184,14 +188,15 @@ class ReleasedFusionConfig:
 
 
 class ReleasedFusion(Fusion):
-    """The released V2X_fusion as far as its early return: fill, mean over all slots, then channels of the ego's.
+    """The released V2X_fusion up to its early return: fill, mean over slots, the ego's channels.
 
-    The release knows no masks: it takes cells outside a partner's map for those with almost nothing in them, fills them
-    with the ego's and counts them in the mean. So this module is to be given masks of whole agents
-    (`hides_outside`). Masked cells are filled, too, and count; an agent that is masked everywhere is not there, and not
-    in the mean. The release is right for batches of one sample alone; here each sample of a batch is treated so.
+    The release has no masks: it treats cells outside a partner's map as almost empty cells, fills
+    them with the ego's and counts them in the mean. So this module needs masks of complete agents
+    (`hides_outside`). Masked cells are filled, too, and count; an agent that is masked everywhere
+    is missing, and not in the mean. The release is only correct for batches of one sample; here
+    each sample of a batch is treated as its own batch.
 
-    With `agent3d` there are the released unused layers as well; no gradient is asked of them.
+    With `agent3d` it also has the released unused layers; they need no gradient.
     """
 
     hides_outside = False
@@ -200,30 +205,33 @@ class ReleasedFusion(Fusion):
     def __init__(self, config: ReleasedFusionConfig) -> None:
         super().__init__()
         self.config = config
-        own = torch.zeros(config.channels, dtype=torch.bool)
-        own[list(config.ego_channels)] = True
-        self.register_buffer("from_ego", own, persistent=False)
+        is_ego_channel = torch.zeros(config.channels, dtype=torch.bool)
+        is_ego_channel[list(config.ego_channels)] = True
+        self.register_buffer("from_ego", is_ego_channel, persistent=False)
         if config.agent3d is not None:
             unused = Agent3D(config.agent3d).requires_grad_(requires_grad=False)
             self.model, self.compression = unused.model, unused.compression
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
-        """As `Fusion.forward`; kinds of agents and delays do not count."""
-        ego, there = x[:, :1], mask.flatten(2).any(2)[:, :, None, None, None]
-        filled = ~mask[:, :, None] | (x.abs().mean(2, keepdim=True) < self.config.fill_below)
-        mean = torch.where(filled, ego, x).masked_fill(~there, 0).sum(1) / there.sum(1)
+        """Fuse as `Fusion.forward`; kinds of agents and delays have no effect."""
+        ego = x[:, :1]
+        is_present = mask.flatten(2).any(2)[:, :, None, None, None]
+        is_empty = x.abs().mean(2, keepdim=True) < self.config.fill_below
+        is_filled = ~mask[:, :, None] | is_empty
+        filled = torch.where(is_filled, ego, x)
+        mean = filled.masked_fill(~is_present, 0).sum(1) / is_present.sum(1)
         return torch.where(self.from_ego[:, None, None], ego[:, 0], mean)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoNetConfig:
-    """Weights of agents.
+    """Sizes of DiscoNet's weighting of agents.
 
     Attributes:
-        channels: C.
-        hidden: channels of the layers that find a weight.
-        last_relu: the original's ReLU on the weights before the `softmax`. Off: it takes the gradient away from all
-            negative ones, and makes them equal.
+        channels: Number C of channels.
+        hidden: Channels of the layers that compute a weight.
+        last_relu: Whether the weights have the original's ReLU before the `softmax`. It removes the
+            gradient from all negative weights, and makes them equal.
     """
 
     channels: int
@@ -232,9 +240,10 @@ class DiscoNetConfig:
 
 
 class DiscoNetFusion(Fusion):
-    """Linear(Σ w_k x_k); w is a `softmax` over agents of what a small network finds in an agent's cell and the ego's.
+    """Linear(Σ w_k x_k), with a `softmax` w over the agents' scores.
 
-    The network sees only cells that the mask shows, so the batch statistics depend on no others.
+    A small network computes a score from an agent's cell and the ego's. It only sees cells that the
+    mask shows, so the batch statistics depend on no others.
     """
 
     def __init__(self, config: DiscoNetConfig) -> None:
@@ -251,14 +260,17 @@ class DiscoNetFusion(Fusion):
         self.out = nn.Linear(config.channels, config.channels)
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
-        """As `Fusion.forward`; kinds of agents and delays do not count."""
+        """Fuse as `Fusion.forward`; kinds of agents and delays have no effect."""
         weighted = (self.weights(x, mask)[:, :, None] * visible(x, mask)).sum(1)
         return self.out(weighted.movedim(1, -1)).movedim(-1, 1)
 
     def weights(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, A, H, W) weights of the agents, in sum 1 and 0 where masked; arguments as `forward`."""
+        """Return the weights of the agents, (B, A, H, W); arguments as in `forward`.
+
+        Their sum is 1, and masked weights are 0.
+        """
         cells = x.movedim(2, -1)
         pairs = torch.cat([cells, cells[:, :1].expand_as(cells)], -1)[mask]
         score = self.score(pairs)[:, 0]
-        hidden = torch.full(mask.shape, -torch.inf, dtype=score.dtype, device=score.device)
-        return hidden.masked_scatter(mask, score).softmax(1)
+        masked_scores = torch.full(mask.shape, -torch.inf, dtype=score.dtype, device=score.device)
+        return masked_scores.masked_scatter(mask, score).softmax(1)

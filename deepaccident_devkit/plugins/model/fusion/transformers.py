@@ -1,8 +1,9 @@
-"""Fusion by attention over all agents' cells: CoBEVT's, and V2X-ViT's with agents of two kinds.
+"""Fusion by attention over all agents' cells: CoBEVT, and V2X-ViT with agents of two kinds.
 
-After Xu et al., CoBEVT: Cooperative Bird's Eye View Semantic Segmentation with Sparse Transformers (CoRL 2022), fused
-axial attention, and V2X-ViT: Vehicle-to-Everything Cooperative Perception with Vision Transformer (ECCV 2022). The
-DeepAccident paper names them; the released code has neither. Warping and masks are done outside.
+After Xu et al., CoBEVT: Cooperative Bird's Eye View Semantic Segmentation with Sparse Transformers
+(CoRL 2022), fused axial attention, and V2X-ViT: Vehicle-to-Everything Cooperative Perception with
+Vision Transformer (ECCV 2022). The DeepAccident paper names them; the released code has neither.
+Maps are warped and masked by the caller.
 """
 
 from __future__ import annotations
@@ -27,26 +28,28 @@ from deepaccident_devkit.plugins.model.fusion.simple import Fusion, masked_mean,
 from deepaccident_devkit.plugins.model.images.swin import relative_positions
 from deepaccident_devkit.support.text import settle_choices
 
-# An agent and itself, the ego and a partner, two partners.
-_RELATIONS = 3
+# Relations of two agents: an agent and itself, the ego and a partner, two partners.
+_RELATION_COUNT = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CobevtConfig:
-    """Fused axial attention.
+    """Sizes and rules of fused axial attention.
 
     Attributes:
-        channels: C.
-        depth: how many layers of window attention and grid attention.
-        window: rows and columns of a window.
-        heads: of each attention; C / 32 in the original.
-        expansion: hidden channels of the feed-forward layers, in C.
-        dropout: after attention and in the feed-forward layers.
-        agents: the most slots, for `agent_relation="slots"` alone.
-        agent_relation: by what pairs of agents the learned bias differs. `classes`: itself, the ego and a partner, two
-            partners. `slots`: the difference of their slots, as in the original, so that the partners' order matters.
-        masked_cells: `hidden`: what the mask hides counts nowhere. `averaged`: it is attended to by nobody, but is in
-            the final mean over the agents, as in the original.
+        channels: Number C of channels.
+        depth: Number of layers of window attention and grid attention.
+        window: Rows and columns of a window.
+        heads: Heads of each attention; C / 32 in the original.
+        expansion: Hidden channels of the feed-forward layers, in C.
+        dropout: Dropout after attention and in the feed-forward layers.
+        agents: Maximum number of slots, only for `agent_relation="slots"`.
+        agent_relation: The relation of two agents that the learned bias depends on. `classes`:
+            itself, the ego and a partner, two partners. `slots`: the difference of their slots, as
+            in the original, so that the partners' order matters.
+        masked_cells: Treatment of cells that the mask hides. `hidden`: they have no effect.
+            `averaged`: nobody attends to them, but they are in the final mean over the agents, as
+            in the original.
     """
 
     channels: int
@@ -77,7 +80,7 @@ class AgentWindowAttention(nn.Module):
     def __init__(self, config: CobevtConfig, windows: Windows) -> None:
         super().__init__()
         self.config, self.windows = config, windows
-        relations = _RELATIONS if config.agent_relation == "classes" else 2 * config.agents - 1
+        relations = _RELATION_COUNT if config.agent_relation == "classes" else 2 * config.agents - 1
         self.to_qkv = nn.Linear(config.channels, 3 * config.channels, bias=False)
         self.to_out = nn.Sequential(
             nn.Linear(config.channels, config.channels, bias=False), nn.Dropout(config.dropout)
@@ -89,30 +92,34 @@ class AgentWindowAttention(nn.Module):
         self.register_buffer("positions", relative_positions(windows.size), persistent=False)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Maps (B, A, H, W, C) → the same shape; only cells of the mask (B, A, H, W) are attended to."""
+        """Attend in maps (B, A, H, W, C); return the same shape.
+
+        Only cells of the mask (B, A, H, W) are attended to.
+        """
         qkv = self.windows.split(self.to_qkv(x))
-        attended = attention(
-            qkv, self.config.heads, self.bias(x.shape[1]), self.windows.split_mask(mask)
-        )
+        bias = self.bias(x.shape[1])
+        attended = attention(qkv, self.config.heads, bias, self.windows.split_mask(mask))
         return self.windows.join(self.to_out(attended), x.shape[:4])
 
     def bias(self, agents: int) -> Tensor:
-        """(heads, A · size², A · size²) by agent and cell of query and key. Raises ConfigError: too many agents."""
-        relation = self._relations(agents)
-        index = (
-            relation[:, None, :, None] * (2 * self.windows.size - 1) ** 2
-            + self.positions[None, :, None, :]
-        )
+        """Return the bias by agent and cell of query and key, (heads, A · size², A · size²).
+
+        Raises ConfigError if there are too many agents.
+        """
+        relation = self._relations(agents)[:, None, :, None]
+        positions_per_relation = (2 * self.windows.size - 1) ** 2
+        index = relation * positions_per_relation + self.positions[None, :, None, :]
         return self.bias_table[index.flatten(2, 3).flatten(0, 1)].permute(2, 0, 1)
 
     def _relations(self, agents: int) -> Tensor:
-        """(A, A) the number of the relation of a query's agent and a key's."""
+        """Return the number of the relation of a query's agent and a key's agent, (A, A)."""
         slots = torch.arange(agents, device=self.positions.device)
         difference = slots[:, None] - slots[None, :]
         if self.config.agent_relation == "slots":
             if agents > self.config.agents:
                 raise ConfigError(
-                    f"agents: the bias is for {self.config.agents} slots, found {agents}; raise CobevtConfig.agents"
+                    f"agents: the bias is for {self.config.agents} slots, found {agents}; raise "
+                    "CobevtConfig.agents"
                 )
             return difference + self.config.agents - 1
         with_ego = (slots[:, None] == 0) | (slots[None, :] == 0)
@@ -120,7 +127,7 @@ class AgentWindowAttention(nn.Module):
 
 
 class AxialLayer(nn.Module):
-    """Attention in windows and over the whole map, each followed by a feed-forward layer."""
+    """Attention in windows and over the complete map, each followed by a feed-forward layer."""
 
     def __init__(self, config: CobevtConfig) -> None:
         super().__init__()
@@ -135,7 +142,7 @@ class AxialLayer(nn.Module):
         self.grid_feed_forward = PreNorm(width, FeedForward(width, hidden, config.dropout))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Maps (B, A, H, W, C) and mask (B, A, H, W) → the same shape."""
+        """Attend in maps (B, A, H, W, C) with mask (B, A, H, W); return the same shape."""
         x = self.window_feed_forward(self.window_attention(x, mask))
         return self.grid_feed_forward(self.grid_attention(x, mask))
 
@@ -152,30 +159,34 @@ class CobevtFusion(Fusion):
         )
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
-        """As `Fusion.forward`; kinds of agents and delays do not count. Raises ConfigError: more agents than slots."""
-        hidden = self.config.masked_cells == "hidden"
-        tokens = (visible(x, mask) if hidden else x).movedim(2, -1)
+        """Fuse as `Fusion.forward`; kinds of agents and delays have no effect.
+
+        Raises ConfigError if there are more agents than slots.
+        """
+        hides_masked = self.config.masked_cells == "hidden"
+        tokens = (visible(x, mask) if hides_masked else x).movedim(2, -1)
         for layer in self.layers:
             tokens = layer(tokens, mask)
         maps = tokens.movedim(-1, 2)
-        pooled = masked_mean(maps, mask) if hidden else maps.mean(1)
+        pooled = masked_mean(maps, mask) if hides_masked else maps.mean(1)
         return self.head(pooled.movedim(1, -1)).movedim(-1, 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class V2XViTConfig:
-    """Blocks of agent attention, window attention and a feed-forward layer.
+    """Sizes and rules of blocks of agent attention, window attention and a feed-forward layer.
 
     Attributes:
-        channels: C.
-        depth: how many blocks.
-        heads: of the attention over agents.
-        windows: rows and columns of the windows of each branch.
-        window_heads: heads of each branch.
-        dropout: in all three parts of a block.
-        delay_rate: places of the sinusoid a step of delay; 2 in the original.
-        masked_cells: `hidden`: what the mask hides counts nowhere. `windowed`: no other agent attends to it, but it
-            reaches its neighbours through the windows, as in the original.
+        channels: Number C of channels.
+        depth: Number of blocks.
+        heads: Heads of the attention over agents.
+        windows: Rows and columns of the windows of each branch.
+        window_heads: Heads of each branch.
+        dropout: Dropout in all three parts of a block.
+        delay_rate: Positions of the sinusoid per step of delay; 2 in the original.
+        masked_cells: Treatment of cells that the mask hides. `hidden`: they have no effect.
+            `windowed`: no other agent attends to them, but they reach their neighbours through the
+            windows, as in the original.
     """
 
     channels: int
@@ -192,12 +203,12 @@ class V2XViTConfig:
         settle_choices(self, {"masked_cells": ("hidden", "windowed")}, error=ConfigError)
         if len(self.windows) != len(self.window_heads):
             raise ConfigError(
-                f"window_heads: expected one number for each of {len(self.windows)} windows, found {self.window_heads}"
+                f"window_heads: expected one number for each of {len(self.windows)} windows, found "
+                f"{self.window_heads}"
             )
-        for name, heads in (
-            ("heads", self.heads),
-            *(("window_heads", count) for count in self.window_heads),
-        ):
+        numbers_of_heads = [("heads", self.heads)]
+        numbers_of_heads += [("window_heads", count) for count in self.window_heads]
+        for name, heads in numbers_of_heads:
             if self.channels % heads:
                 raise ConfigError(
                     f"{name}: {heads} do not divide {self.channels} channels; choose a divisor"
@@ -213,19 +224,21 @@ class DelayEncoding(nn.Module):
         self.linear = nn.Linear(channels, channels)
 
     def forward(self, delay: Tensor) -> Tensor:
-        """(B, A) steps → (B, A, C)."""
+        """Return the encoding (B, A, C) of delays (B, A) in steps."""
         return self.linear(
             sinusoid(self.delay_rate * delay, self.channels).to(self.linear.weight.dtype)
         )
 
 
-def sinusoid(place: Tensor, channels: int) -> Tensor:
-    """(…,) → (…, C) float32: sines and cosines by turns, of wavelengths from 2π to 10000 · 2π places, over √C."""
-    rate = torch.arange(0, channels, 2, device=place.device) * (-math.log(10000) / channels)
-    angle = place[..., None] * rate.exp()
-    return torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)[..., :channels] / math.sqrt(
-        channels
-    )
+def sinusoid(position: Tensor, channels: int) -> Tensor:
+    """Return sines and cosines of positions (…,), alternating and divided by √C, (…, C) float32.
+
+    Wavelengths are from 2π to 10000 · 2π positions.
+    """
+    exponents = torch.arange(0, channels, 2, device=position.device) * (-math.log(10000) / channels)
+    angle = position[..., None] * exponents.exp()
+    waves = torch.stack([angle.sin(), angle.cos()], -1).flatten(-2)
+    return waves[..., :channels] / math.sqrt(channels)
 
 
 class _TransformerBlock(nn.Module):
@@ -241,12 +254,15 @@ class _TransformerBlock(nn.Module):
         self.feed_forward = PreNorm(width, FeedForward(width, width, config.dropout))
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor) -> Tensor:
-        """Maps (B, A, H, W, C), mask (B, A, H, W) and kinds (B, A) → the same shape as the maps."""
+        """Attend in maps (B, A, H, W, C); return the same shape.
+
+        The mask has shape (B, A, H, W), the kinds (B, A).
+        """
         return self.feed_forward(self.windows(self.agents(x, mask, agent_is_infra)))
 
 
 class V2XViTFusion(Fusion):
-    """The delay's encoding, blocks, and of their result the ego's map."""
+    """The delay's encoding and blocks; the result is the ego's map."""
 
     def __init__(self, config: V2XViTConfig) -> None:
         super().__init__()
@@ -255,8 +271,9 @@ class V2XViTFusion(Fusion):
         self.blocks = nn.ModuleList(_TransformerBlock(config) for _ in range(config.depth))
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:
-        """As `Fusion.forward`."""
-        tokens = (visible(x, mask) if self.config.masked_cells == "hidden" else x).movedim(2, -1)
+        """Fuse as `Fusion.forward`."""
+        hides_masked = self.config.masked_cells == "hidden"
+        tokens = (visible(x, mask) if hides_masked else x).movedim(2, -1)
         tokens = tokens + self.delay_encoding(delay)[:, :, None, None]
         for block in self.blocks:
             tokens = block(tokens, mask, agent_is_infra)

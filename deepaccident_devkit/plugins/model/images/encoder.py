@@ -1,4 +1,4 @@
-"""The image encoder that a configuration describes, its neck, and a backbone small enough to be trained on a CPU."""
+"""The image encoder that a configuration describes, its neck, and a small backbone for CPUs."""
 
 from __future__ import annotations
 
@@ -12,21 +12,28 @@ from torch.nn import functional
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.images.swin import Swin, SwinConfig
 
+# ImageNet's statistics of R, G, B in [0, 1]; the published weights of Swin expect them.
+_IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
+_IMAGENET_STD: Final = (0.229, 0.224, 0.225)
+
 
 class FpnNeck(nn.Module):
-    """The coarse map is enlarged, set beside the fine one, and both go through two convolutions (released FPN_LSS).
+    """Joins a fine and a coarse map (the released FPN_LSS).
+
+    The coarse map is enlarged and concatenated with the fine one, and both go through two
+    convolutions.
 
     Attributes:
-        out_channels: of the result.
+        out_channels: Channels of the result.
     """
 
     def __init__(self, in_channels: int, out_channels: int, *, first_kernel: int = 3) -> None:
-        """Make the layers.
+        """Build the layers.
 
         Args:
-            in_channels: of both maps together.
-            out_channels: of the result.
-            first_kernel: size of the first convolution's kernel, 3 in the release; an odd number.
+            in_channels: Channels of both maps together.
+            out_channels: Channels of the result.
+            first_kernel: Size of the first convolution's kernel, 3 in the release; an odd number.
         """
         super().__init__()
         self.out_channels = out_channels
@@ -43,7 +50,10 @@ class FpnNeck(nn.Module):
         self.up = nn.ModuleDict({"conv": layers})
 
     def forward(self, maps: tuple[Tensor, Tensor]) -> Tensor:
-        """The maps (N, C, h', w') and (N, C', h'', w''), the fine one first, as one map (N, `out_channels`, h', w')."""
+        """Join the maps (N, C, h', w') and (N, C', h'', w''), the fine one first.
+
+        Return one map (N, `out_channels`, h', w').
+        """
         fine, coarse = maps
         enlarged = functional.interpolate(
             coarse, size=fine.shape[-2:], mode="bilinear", align_corners=True
@@ -56,10 +66,10 @@ class SmallConvConfig:
     """Sizes of the small encoder.
 
     Attributes:
-        widths: channels at 1/2, 1/4 and 1/8 of the image's resolution.
-        branch: channels at 1/16.
-        neck_channels: of the features.
-        stride: pixels of the image a step of the features.
+        widths: Channels at 1/2, 1/4 and 1/8 of the image's resolution.
+        branch: Channels at 1/16.
+        neck_channels: Channels of the features.
+        stride: Pixels of the image per cell of the features.
     """
 
     widths: tuple[int, int, int] = (16, 24, 32)
@@ -77,7 +87,7 @@ class SmallConv(nn.Module):
     """Convolutions with stride 2, and a residual block at each of the last two resolutions; ours.
 
     Attributes:
-        out_channels: of the two maps.
+        out_channels: Channels of the two maps.
     """
 
     def __init__(self, config: SmallConvConfig) -> None:
@@ -90,7 +100,7 @@ class SmallConv(nn.Module):
         self.coarse = nn.Sequential(_halved(third, config.branch), _Residual(config.branch))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Images (N, 3, h, w) → maps at 1/8 and 1/16 of their resolution, sizes rounded up."""
+        """Encode images (N, 3, h, w) as maps at 1/8 and 1/16 of their resolution, rounded up."""
         fine = self.fine(images)
         return fine, self.coarse(fine)
 
@@ -115,47 +125,45 @@ def _halved(in_channels: int, out_channels: int) -> nn.Sequential:
 def _convolution(
     in_channels: int, out_channels: int, *, stride: int = 1
 ) -> tuple[nn.Conv2d, nn.BatchNorm2d]:
-    return nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False), nn.BatchNorm2d(
-        out_channels
-    )
+    convolution = nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False)
+    return convolution, nn.BatchNorm2d(out_channels)
 
 
 EncoderConfig = SwinConfig | SmallConvConfig
-_MEAN: Final = (0.485, 0.456, 0.406)
-# Of ImageNet's R, G, B in [0, 1]; the published weights of Swin expect them.
-_STD: Final = (0.229, 0.224, 0.225)
 
 
 def image_encoder(config: EncoderConfig) -> tuple[Swin | SmallConv, FpnNeck]:
-    """A backbone and its neck; `neck(backbone(images))` are the features.
+    """Return a backbone and its neck; `neck(backbone(images))` are the features.
 
-    They map (N, 3, h, w) to (N, `config.neck_channels`, h', w'), with h' and w' the rounded up h / `config.stride` and
-    w / `config.stride`. They come apart because the release keeps them under the names `img_backbone` and `img_neck`.
+    They map (N, 3, h, w) to (N, `config.neck_channels`, h', w'), with h' and w' the rounded up h /
+    `config.stride` and w / `config.stride`. They are separate because the release stores them under
+    the names `img_backbone` and `img_neck`.
 
     Raises:
-        ConfigError: the configuration is of neither encoder.
+        ConfigError: The configuration belongs to neither encoder.
     """
     if not isinstance(config, EncoderConfig):
         raise ConfigError(f"expected a SwinConfig or a SmallConvConfig, found {config!r}")
     backbone = Swin(config) if isinstance(config, SwinConfig) else SmallConv(config)
-    # the small encoder saves time where most of its neck's work would be
+    # Most of the small neck's work would be in the first convolution, so its kernel is smaller.
     first_kernel = 1 if isinstance(config, SmallConvConfig) else 3
-    return backbone, FpnNeck(
-        sum(backbone.out_channels), config.neck_channels, first_kernel=first_kernel
-    )
+    in_channels = sum(backbone.out_channels)
+    return backbone, FpnNeck(in_channels, config.neck_channels, first_kernel=first_kernel)
 
 
 def normalised(images: Tensor) -> Tensor:
-    """RGB images (…, 3, h, w) uint8 as floats: divided by 255, less ImageNet's mean, divided by its deviation.
+    """Return RGB images (…, 3, h, w) uint8 as normalised floats.
+
+    They are divided by 255, reduced by ImageNet's mean and divided by its standard deviation.
 
     Raises:
-        ConfigError: the images are not uint8, so that it is not known what was done to them.
+        ConfigError: The images are not uint8, so it is unknown how they were processed.
     """
     if images.dtype != torch.uint8:
         raise ConfigError(
-            f"images: expected uint8, found {images.dtype}; load them with ImageConfig(dtype='uint8')"
+            f"images: expected uint8, found {images.dtype}; load them with "
+            "ImageConfig(dtype='uint8')"
         )
-    mean, std = (
-        torch.tensor(three, device=images.device)[:, None, None] for three in (_MEAN, _STD)
-    )
+    mean = torch.tensor(_IMAGENET_MEAN, device=images.device)[:, None, None]
+    std = torch.tensor(_IMAGENET_STD, device=images.device)[:, None, None]
     return (images / 255 - mean) / std

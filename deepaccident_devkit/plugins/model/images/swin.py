@@ -1,4 +1,7 @@
-"""`Swin`: the image backbone of the release, a Swin Transformer (Liu et al., ICCV 2021), and its official weights."""
+"""`Swin`: the image backbone of the release, a Swin Transformer, and its official weights.
+
+Liu et al., ICCV 2021.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,28 @@ from torch.utils.checkpoint import checkpoint
 
 from deepaccident_devkit.errors import ConfigError, shortened
 
+# Pixels along the side of a patch.
+_PATCH_PIXELS = 4
+_MLP_RATIO = 4
+_RENAMING_RULES: Final = (
+    (r"patch_embed\.proj\.(.+)", r"patch_embed.projection.\1"),
+    (r"(patch_embed\.norm\..+)", r"\1"),
+    (r"layers\.(\d+\.blocks\.\d+\.norm[12]\..+)", r"stages.\1"),
+    (r"layers\.(\d+\.blocks\.\d+\.attn)\.(.+)", r"stages.\1.w_msa.\2"),
+    (r"layers\.(\d+\.blocks\.\d+)\.mlp\.fc1\.(.+)", r"stages.\1.ffn.layers.0.0.\2"),
+    (r"layers\.(\d+\.blocks\.\d+)\.mlp\.fc2\.(.+)", r"stages.\1.ffn.layers.1.\2"),
+    (r"layers\.(\d+\.downsample\..+)", r"stages.\1"),
+    (r"(norm\..+)", r"\1"),
+)
+# The classifier, and masks that only depend on the size of the image.
+_DROPPED_NAMES: Final = re.compile(r"head\..+|layers\.\d+\.blocks\.\d+\.attn_mask")
+_MERGING_NAMES: Final = re.compile(
+    r"layers\.\d+\.downsample\.(norm\.weight|norm\.bias|reduction\.weight)"
+)
+
 
 class _SwinAttention(nn.Module):
-    """Multi-head self-attention of the tokens of one window, with a learned bias for each relative position."""
+    """Multi-head self-attention in one window, with a learned bias for each relative position."""
 
     relative_position_index: Tensor
 
@@ -29,26 +51,28 @@ class _SwinAttention(nn.Module):
         self.qkv = nn.Linear(channels, 3 * channels)
         self.proj = nn.Linear(channels, channels)
 
-    def forward(self, tokens: Tensor, together: Tensor | None = None) -> Tensor:
-        """Attend in K windows of L tokens, (N, K, L, C); `together` (K, L, L) bool tells which may see each other."""
+    def forward(self, tokens: Tensor, is_visible: Tensor | None = None) -> Tensor:
+        """Attend in K windows of L tokens, shape (N, K, L, C).
+
+        `is_visible` (K, L, L) bool is whether a token may attend to another one.
+        """
         channels = tokens.shape[-1]
         # (N, K, L, 3C) → query, key and value, each (N, K, heads, L, C / heads)
         parts = self.qkv(tokens).unflatten(-1, (3, self.heads, channels // self.heads))
         query, key, value = parts.permute(3, 0, 1, 4, 2, 5).unbind(0)
         scores = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
-        scores = scores + self.relative_position_bias_table[self.relative_position_index].permute(
-            2, 0, 1
-        )
-        if together is not None:
-            scores = scores.masked_fill(~together[:, None], -torch.inf)
+        bias = self.relative_position_bias_table[self.relative_position_index]
+        scores = scores + bias.permute(2, 0, 1)
+        if is_visible is not None:
+            scores = scores.masked_fill(~is_visible[:, None], -torch.inf)
         return self.proj((scores.softmax(-1) @ value).transpose(2, 3).flatten(3))
 
 
 class ShiftedWindowAttention(nn.Module):
-    """A map cut into windows of which each attends to itself; `shift` moves the windows, and the map is a torus.
+    """Self-attention in the windows of a map; `shift` moves the windows over the map as a torus.
 
-    A map that is not a whole number of windows is filled with zeros on the right and at the bottom. As in the release,
-    tokens see the filling as they see others.
+    A map that is not an integer number of windows is padded with zeros on the right and at the
+    bottom. As in the release, tokens also attend to the padding.
     """
 
     def __init__(self, channels: int, heads: int, window: int, shift: int) -> None:
@@ -57,15 +81,15 @@ class ShiftedWindowAttention(nn.Module):
         self.w_msa = _SwinAttention(channels, heads, window)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features (N, h, w, C) → the same shape."""
+        """Attend in features (N, h, w, C); return the same shape."""
         height, width = features.shape[1:3]
         padded = functional.pad(features, (0, 0, 0, -width % self.window, 0, -height % self.window))
         rows, columns = padded.shape[1:3]
-        together = None
+        is_visible = None
         if self.shift:
             padded = padded.roll((-self.shift, -self.shift), (1, 2))
-            together = neighbours(rows, columns, self.window, self.shift, padded.device)
-        attended = self.w_msa(windows_of(padded, self.window), together)
+            is_visible = neighbours(rows, columns, self.window, self.shift, padded.device)
+        attended = self.w_msa(windows_of(padded, self.window), is_visible)
         result = map_of(attended, rows, columns)
         if self.shift:
             result = result.roll((self.shift, self.shift), (1, 2))
@@ -73,21 +97,27 @@ class ShiftedWindowAttention(nn.Module):
 
 
 def relative_positions(window: int) -> Tensor:
-    """(L, L) int64 for L = window² tokens: the row of the bias table for a query (first axis) and a key."""
+    """Return the row of the bias table for each query (first axis) and key, (L, L) int64.
+
+    L = window² is the number of tokens.
+    """
     cells = torch.cartesian_prod(torch.arange(window), torch.arange(window))
-    down, along = (cells[:, None] - cells + window - 1).unbind(-1)
-    return down * (2 * window - 1) + along
+    row_offsets, column_offsets = (cells[:, None] - cells + window - 1).unbind(-1)
+    return row_offsets * (2 * window - 1) + column_offsets
 
 
 def windows_of(features: Tensor, window: int) -> Tensor:
-    """A map (N, h, w, C) of whole windows as (N, K, L, C): K windows in reading order of L = window² tokens."""
+    """Return the windows of a map (N, h, w, C), in reading order, shape (N, K, L, C).
+
+    The map consists of K complete windows of L = window² tokens.
+    """
     count, rows, columns, channels = features.shape
     cut = features.view(count, rows // window, window, columns // window, window, channels)
     return cut.transpose(2, 3).reshape(count, -1, window * window, channels)
 
 
 def map_of(windows: Tensor, rows: int, columns: int) -> Tensor:
-    """The map (N, rows, columns, C) that `windows_of` cut."""
+    """Return the map (N, rows, columns, C) that `windows_of` cut."""
     count, _, tokens, channels = windows.shape
     window = round(tokens**0.5)
     cut = windows.view(count, rows // window, columns // window, window, window, channels)
@@ -97,21 +127,16 @@ def map_of(windows: Tensor, rows: int, columns: int) -> Tensor:
 def neighbours(
     rows: int, columns: int, window: int, shift: int, device: torch.device | str | None = None
 ) -> Tensor:
-    """Which tokens of the windows of a shifted map may see each other, (K, L, L) bool.
+    """Return which tokens of the windows of a shifted map may attend to each other, (K, L, L) bool.
 
-    Those that lay beside each other before the shift: not the two sides of the map that it brought together.
+    These are tokens on the same side of the map: not the two sides that the shift brought together.
     """
-    # in the last row and column of windows the last `shift` steps come from the other side
-    down, along = (
+    # In the last row and column of windows the last `shift` steps come from the other side.
+    is_low, is_right = (
         (torch.arange(size, device=device) >= size - shift).long() for size in (rows, columns)
     )
-    sides = windows_of((2 * down[:, None] + along)[None, :, :, None], window)[0, :, :, 0]
+    sides = windows_of((2 * is_low[:, None] + is_right)[None, :, :, None], window)[0, :, :, 0]
     return sides[:, :, None] == sides[:, None, :]
-
-
-# Pixels along the side of a patch.
-_PATCH = 4
-_MLP_RATIO = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,14 +144,15 @@ class SwinConfig:
     """Sizes of the Swin Transformer; the defaults are Swin-T's, as in the release.
 
     Attributes:
-        embed_dims: channels of the first stage; each further stage has twice as many.
-        depths: blocks of each stage.
-        num_heads: of each stage.
-        window_size: tokens along the side of a window.
-        out_stages: the two stages whose maps are the result, the second after the first; stage i is at 1 / 2^(i + 2)
-            of the image's resolution.
-        checkpointing: whether training computes blocks again for the gradient, which saves memory and costs time.
-        neck_channels: of the features.
+        embed_dims: Channels of the first stage; each further stage has twice as many.
+        depths: Number of blocks of each stage.
+        num_heads: Number of attention heads of each stage.
+        window_size: Tokens along the side of a window.
+        out_stages: The two successive stages that give the resulting maps; stage i is at 1 / 2^(i +
+            2) of the image's resolution.
+        checkpointing: Whether training recomputes blocks for the gradient, which saves memory and
+            costs time.
+        neck_channels: Channels of the features.
     """
 
     embed_dims: int = 96
@@ -147,12 +173,12 @@ class SwinConfig:
         for width, heads in zip(self.widths, self.num_heads, strict=True):
             if width % heads:
                 raise ConfigError(
-                    f"num_heads: {width} channels cannot be shared by {heads} heads; choose a divisor"
+                    f"num_heads: {width} channels cannot be shared by {heads} heads; choose a "
+                    "divisor"
                 )
-        if self.out_stages not in pairwise(range(stages)):
-            raise ConfigError(
-                f"out_stages: expected one of {[*pairwise(range(stages))]}, found {self.out_stages!r}"
-            )
+        pairs = [*pairwise(range(stages))]
+        if self.out_stages not in pairs:
+            raise ConfigError(f"out_stages: expected one of {pairs}, found {self.out_stages!r}")
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -161,17 +187,18 @@ class SwinConfig:
 
     @property
     def stride(self) -> int:
-        """Pixels of the image a step of the features."""
-        return _PATCH << self.out_stages[0]
+        """Pixels of the image per cell of the features."""
+        return _PATCH_PIXELS << self.out_stages[0]
 
 
 class Swin(nn.Module):
-    """Swin Transformer with a LayerNorm for each map of its result, without stochastic depth, as in the release.
+    """Swin Transformer with a LayerNorm for each map of its result.
 
-    Parameters have the released names; `from_official` converts those of the official weights.
+    As in the release it has no stochastic depth. Parameters have the released names;
+    `from_official` converts the names of the official weights.
 
     Attributes:
-        out_channels: of the two maps.
+        out_channels: Channels of the two maps.
     """
 
     def __init__(self, config: SwinConfig) -> None:
@@ -189,32 +216,39 @@ class Swin(nn.Module):
         self.apply(_initialise)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Images (N, 3, h, w) → the maps of `out_stages`, (N, C, h', w'), sizes rounded up."""
+        """Encode images (N, 3, h, w); return the maps of `out_stages`, (N, C, h', w').
+
+        Sizes are rounded up.
+        """
         features, maps = self.patch_embed(images), []
         for i, stage in enumerate(self.stages):
-            features, larger = stage(features)
+            features, stage_features = stage(features)
             if i in self.config.out_stages:
-                maps.append(self.get_submodule(f"norm{i}")(larger).permute(0, 3, 1, 2).contiguous())
+                norm = self.get_submodule(f"norm{i}")
+                maps.append(norm(stage_features).permute(0, 3, 1, 2).contiguous())
         return maps[0], maps[1]
 
 
 class PatchEmbedding(nn.Module):
-    """Patches of 4×4 pixels → tokens."""
+    """Encoder of patches of 4×4 pixels as tokens."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.projection = nn.Conv2d(3, channels, _PATCH, _PATCH)
+        self.projection = nn.Conv2d(3, channels, _PATCH_PIXELS, _PATCH_PIXELS)
         self.norm = nn.LayerNorm(channels)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (N, 3, h, w) → (N, h / 4, w / 4, C); black fills what lacks of the last patches."""
+        """Encode images (N, 3, h, w) as tokens (N, h / 4, w / 4, C).
+
+        Incomplete patches are filled with black.
+        """
         height, width = images.shape[-2:]
-        padded = nn.functional.pad(images, (0, -width % _PATCH, 0, -height % _PATCH))
+        padded = nn.functional.pad(images, (0, -width % _PATCH_PIXELS, 0, -height % _PATCH_PIXELS))
         return self.norm(self.projection(padded).permute(0, 2, 3, 1))
 
 
 class _SwinStage(nn.Module):
-    """Blocks of one resolution, and what halves it for the next stage."""
+    """Blocks of one resolution, and the layer that halves it for the next stage."""
 
     def __init__(self, config: SwinConfig, index: int, *, downsample: bool) -> None:
         super().__init__()
@@ -227,7 +261,10 @@ class _SwinStage(nn.Module):
         self.downsample = PatchMerging(channels) if downsample else None
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (N, h, w, C) → those for the next stage, (N, h / 2, w / 2, 2C), and this stage's, (N, h, w, C)."""
+        """Return the features for the next stage, (N, h / 2, w / 2, 2C), and this stage's.
+
+        The input and this stage's features have shape (N, h, w, C).
+        """
         for block in self.blocks:
             if self.checkpointing and self.training:
                 features = checkpoint(block, features, use_reentrant=False)
@@ -237,7 +274,7 @@ class _SwinStage(nn.Module):
 
 
 class _SwinBlock(nn.Module):
-    """Window attention and a perceptron of each token, each after a LayerNorm and beside a shortcut."""
+    """Window attention and a perceptron of each token, each with a LayerNorm and a shortcut."""
 
     def __init__(self, channels: int, heads: int, window: int, *, shift: int) -> None:
         super().__init__()
@@ -251,15 +288,16 @@ class _SwinBlock(nn.Module):
         self.ffn = nn.ModuleDict({"layers": layers})
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features (N, h, w, C) → the same shape."""
+        """Transform features (N, h, w, C); return the same shape."""
         features = features + self.attn(self.norm1(features))
         return features + self.ffn["layers"](self.norm2(features))
 
 
 class PatchMerging(nn.Module):
-    """Four neighbouring tokens → one with twice the channels; a channel's four values stand together, row by row.
+    """Merging of four neighbouring tokens into one with twice the channels.
 
-    (The official order is by token, and down before along: `from_official`.)
+    A channel's four values are adjacent, row by row. (The official order is by token, column by
+    column: `from_official`.)
     """
 
     def __init__(self, channels: int) -> None:
@@ -268,7 +306,7 @@ class PatchMerging(nn.Module):
         self.reduction = nn.Linear(4 * channels, 2 * channels, bias=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Features (N, h, w, C) → (N, h / 2, w / 2, 2C); zeros fill what lacks to even sizes."""
+        """Merge features (N, h, w, C) to (N, h / 2, w / 2, 2C); odd sizes are padded with zeros."""
         padded = nn.functional.pad(
             features, (0, 0, 0, features.shape[2] % 2, 0, features.shape[1] % 2)
         )
@@ -286,58 +324,45 @@ def _initialise(module: nn.Module) -> None:
         nn.init.trunc_normal_(module.relative_position_bias_table, std=0.02)
 
 
-_RENAMED: Final = (
-    (r"patch_embed\.proj\.(.+)", r"patch_embed.projection.\1"),
-    (r"(patch_embed\.norm\..+)", r"\1"),
-    (r"layers\.(\d+\.blocks\.\d+\.norm[12]\..+)", r"stages.\1"),
-    (r"layers\.(\d+\.blocks\.\d+\.attn)\.(.+)", r"stages.\1.w_msa.\2"),
-    (r"layers\.(\d+\.blocks\.\d+)\.mlp\.fc1\.(.+)", r"stages.\1.ffn.layers.0.0.\2"),
-    (r"layers\.(\d+\.blocks\.\d+)\.mlp\.fc2\.(.+)", r"stages.\1.ffn.layers.1.\2"),
-    (r"layers\.(\d+\.downsample\..+)", r"stages.\1"),
-    (r"(norm\..+)", r"\1"),
-)
-# The classifier, and masks that depend on the size of the image alone.
-_DROPPED: Final = re.compile(r"head\..+|layers\.\d+\.blocks\.\d+\.attn_mask")
-_MERGING: Final = re.compile(
-    r"layers\.\d+\.downsample\.(norm\.weight|norm\.bias|reduction\.weight)"
-)
-
-
 def from_official(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A state dict with the names and the layout of `Swin`, without the classifier.
+    """Return a state dict with the names and the layout of `Swin`, without the classifier.
 
     Args:
-        weights: with the names of microsoft/Swin-Transformer (in its files they are under `model`).
+        weights: State dict with the names of microsoft/Swin-Transformer (its files have it under
+            `model`).
 
     Returns:
-        `norm.*`, the classifier's norm, is among them, and is not used by `Swin`; `norm2.*` and `norm3.*` are not, and
-        are to be learned. So `load_state_dict` needs `strict=False`.
+        The state dict. It has `norm.*`, the classifier's norm, which `Swin` does not use; it lacks
+        `norm2.*` and `norm3.*`, which must be learned. So `load_state_dict` needs `strict=False`.
 
     Raises:
-        ConfigError: a name is not one of Swin's.
+        ConfigError: A name is not one of Swin's.
     """
-    return {
-        _renamed(name): _channel_major(tensor) if _MERGING.fullmatch(name) else tensor
-        for name, tensor in weights.items()
-        if not _DROPPED.fullmatch(name)
-    }
+    state = {}
+    for name, tensor in weights.items():
+        if not _DROPPED_NAMES.fullmatch(name):
+            is_merging = _MERGING_NAMES.fullmatch(name)
+            state[_renamed(name)] = _channel_major(tensor) if is_merging else tensor
+    return state
 
 
 def _renamed(name: str) -> str:
-    for pattern, template in _RENAMED:
+    """Return the name in `Swin` of an official weight; raises ConfigError."""
+    for pattern, template in _RENAMING_RULES:
         match = re.fullmatch(pattern, name)
         if match:
             return match.expand(template)
     raise ConfigError(
-        "expected names of Swin's official weights, such as 'layers.0.blocks.0.norm1.weight', found "
-        f"{shortened(name)!r}; if it is a file's content, give its entry 'model'"
+        "expected names of Swin's official weights, such as 'layers.0.blocks.0.norm1.weight', "
+        f"found {shortened(name)!r}; if it is a file's content, give its entry 'model'"
     )
 
 
 def _channel_major(tensor: Tensor) -> Tensor:
-    """Values (…, 4C) of the four tokens that are merged, from token-major to channel-major.
+    """Return values (…, 4C) of four merged tokens in channel-major instead of token-major order.
 
-    Official tokens come down, then along: (0, 0), (1, 0), (0, 1), (1, 1). Ours come in reading order.
+    Official tokens are ordered column by column: (0, 0), (1, 0), (0, 1), (1, 1). Ours are in
+    reading order.
     """
     by_token = tensor.unflatten(-1, (4, -1))[..., [0, 2, 1, 3], :]
     return by_token.transpose(-1, -2).flatten(-2)

@@ -1,4 +1,7 @@
-"""The motion head: distributions of the latent, future states by flow and GRU, decoders, labels and losses."""
+"""The motion head: distributions of the latent, future states, decoders, labels and losses.
+
+Future states are predicted by flow and GRU.
+"""
 
 from deepaccident_devkit.plugins.model.motion.decoders import (
     LatentDistribution,

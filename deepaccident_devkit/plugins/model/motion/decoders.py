@@ -1,9 +1,8 @@
-"""The motion head's parts: distributions of the latent, future states by flow and GRU, and decoders to maps.
+"""The motion head's parts: distributions of the latent, future states, and decoders to maps.
 
-As in FIERY and BEVerse (the released `SpatialDistributionModule`): a diagonal normal distribution at each cell of a map
-a quarter as fine as the features.
-
-BEVerse's iterative flow (the released `ResFuturePrediction`).
+As in FIERY and BEVerse (the released `SpatialDistributionModule`), the latent has a diagonal normal
+distribution at each cell of a map with a quarter of the features' resolution. Future states follow
+from BEVerse's iterative flow and a GRU (the released `ResFuturePrediction`).
 """
 
 from __future__ import annotations
@@ -17,20 +16,35 @@ from torch.nn import functional
 
 from deepaccident_devkit.errors import GeometryError
 
+# Standard deviation of the flow layer's first weights, so that training starts close to no motion.
+_FLOW_DEVIATION: Final = 0.02
+_CHANNELS: Final = {
+    "segmentation": 2,
+    "instance_center": 1,
+    "instance_offset": 2,
+    "instance_flow": 2,
+}
+# First bias of the centres' logits: one cell in ten, so that empty cells do not dominate the first
+# steps (CenterNet, arXiv:1904.07850).
+_CENTER_BIAS: Final = -2.19
+
 
 class LatentDistribution(NamedTuple):
     """A diagonal normal distribution.
 
     Attributes:
-        mu: (N, L, h, w) means.
-        log_sigma: (N, L, h, w) logarithms of the standard deviations.
+        mu: Means, shape (N, L, h, w).
+        log_sigma: Logarithms of the standard deviations, shape (N, L, h, w).
     """
 
     mu: Tensor
     log_sigma: Tensor
 
     def sample(self, noise: Tensor) -> Tensor:
-        """The latent (N, L, h, w) that belongs to standard normal noise of that shape; raises GeometryError."""
+        """Return the latent (N, L, h, w) of standard normal noise with that shape.
+
+        Raises GeometryError for another shape.
+        """
         if noise.shape != self.mu.shape:
             raise GeometryError(
                 f"noise: expected shape {tuple(self.mu.shape)}, found {tuple(noise.shape)}"
@@ -38,39 +52,52 @@ class LatentDistribution(NamedTuple):
         return self.mu + noise.to(self.mu) * self.log_sigma.exp()
 
     def noise(self, generator: torch.Generator | None = None) -> Tensor:
-        """Standard normal noise of this shape, from a generator on the same device or from torch's own."""
+        """Draw standard normal noise of this shape.
+
+        The generator is on the same device; None stands for torch's own.
+        """
         return torch.randn(
             self.mu.shape, generator=generator, device=self.mu.device, dtype=self.mu.dtype
         )
 
 
 class SpatialDistribution(nn.Module):
-    """Features → `LatentDistribution`: two bottlenecks of stride 2, and a 1 × 1 convolution."""
+    """Encoder of features as a `LatentDistribution`.
+
+    It has two bottlenecks of stride 2 and a 1 × 1 convolution.
+    """
 
     def __init__(
         self, inputs: int, hidden: int, latent: int, log_sigma: tuple[float, float]
     ) -> None:
-        """Make the layers, with `hidden` channels between them, and the range of `LatentDistribution.log_sigma`."""
+        """Build the layers, with `hidden` channels between them.
+
+        `log_sigma` is the range of `LatentDistribution.log_sigma`.
+        """
         super().__init__()
         self._log_sigma = log_sigma
-        self.encoder = nn.Sequential(
-            OrderedDict(
-                model=nn.Sequential(_Bottleneck(inputs, hidden), _Bottleneck(hidden, hidden))
-            )
-        )
-        last = nn.Conv2d(hidden, 2 * latent, 1)
-        # two distributions that begin far apart have a divergence of thousands, beside which nothing else is learned
-        nn.init.normal_(last.weight, std=0.01)
-        self.last_conv = nn.Sequential(last)
+        bottlenecks = nn.Sequential(_Bottleneck(inputs, hidden), _Bottleneck(hidden, hidden))
+        self.encoder = nn.Sequential(OrderedDict(model=bottlenecks))
+        final_conv = nn.Conv2d(hidden, 2 * latent, 1)
+        # Two distributions that begin far apart have a divergence of thousands, and then nothing
+        # else is learned.
+        nn.init.normal_(final_conv.weight, std=0.01)
+        self.last_conv = nn.Sequential(final_conv)
 
     def forward(self, features: Tensor) -> LatentDistribution:
-        """Features (N, inputs, H, W) → means and log deviations, each (N, latent, H / 4, W / 4), rounded up."""
+        """Encode features (N, inputs, H, W) as means and log deviations.
+
+        Each has shape (N, latent, H / 4, W / 4), rounded up.
+        """
         mu, log_sigma = self.last_conv(self.encoder(features)).chunk(2, dim=1)
         return LatentDistribution(mu, log_sigma.clamp(*self._log_sigma))
 
 
 class _Bottleneck(nn.Module):
-    """Half the channels, a 3 × 3 convolution of stride 2, the wanted channels; plus a pooled and projected skip."""
+    """Half the channels, a 3 × 3 convolution of stride 2, then the output channels.
+
+    A pooled and projected skip is added.
+    """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -94,7 +121,7 @@ class _Bottleneck(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         rows, columns = features.shape[-2:]
-        # zeros count at a padded edge, as released
+        # As released, the padding's zeros count at an edge.
         padded = functional.pad(features, (0, columns % 2, 0, rows % 2))
         return self.layers(features) + self.projection(functional.max_pool2d(padded, 2))
 
@@ -105,36 +132,39 @@ def _norm(channels: int) -> nn.Sequential:
 
 HiddenWarp = Literal["none", "warped"]
 HIDDEN_WARPS: Final[tuple[HiddenWarp, ...]] = ("none", "warped")
-# Standard deviation of the flow layer's first weights, so that training starts close to no motion.
-_FLOW_DEVIATION: Final = 0.02
 
 
 def warp_with_flow(features: Tensor, flow: Tensor) -> Tensor:
-    """Features (N, C, H, W) at each cell plus its flow, by bilinear sampling; zero outside (the released function).
+    """Return features (N, C, H, W) sampled at each cell plus its flow (the released function).
 
-    The flow is (N, 2, H, W), cells: along the columns (channel 0) and down the rows (channel 1) to the source.
+    Sampling is bilinear; features are zero outside the map. The flow leads to the source, in cells,
+    along the columns (channel 0) and down the rows (channel 1), shape (N, 2, H, W).
     """
     rows, columns = features.shape[-2:]
-    # half precision cannot tell neighbouring cells of a large grid apart
+    # Half precision cannot distinguish neighbouring cells of a large grid.
     dtype = torch.promote_types(features.dtype, torch.float32)
-    along = torch.arange(columns, device=flow.device, dtype=dtype) + flow[:, 0].to(dtype)
-    down = torch.arange(rows, device=flow.device, dtype=dtype)[:, None] + flow[:, 1].to(dtype)
-    points = torch.stack(
-        [2 * along / max(columns - 1, 1) - 1, 2 * down / max(rows - 1, 1) - 1], dim=-1
-    )
+    x = torch.arange(columns, device=flow.device, dtype=dtype) + flow[:, 0].to(dtype)
+    y = torch.arange(rows, device=flow.device, dtype=dtype)[:, None] + flow[:, 1].to(dtype)
+    scaled_x = 2 * x / max(columns - 1, 1) - 1
+    scaled_y = 2 * y / max(rows - 1, 1) - 1
+    points = torch.stack([scaled_x, scaled_y], dim=-1)
     return functional.grid_sample(features.to(dtype), points, align_corners=True).to(features.dtype)
 
 
 class FlowGru(nn.Module):
-    """Latent and present state → the states of the future frames (the released `ResFuturePrediction`)."""
+    """Prediction of future states from a latent and the present state.
+
+    It is the released `ResFuturePrediction`.
+    """
 
     def __init__(
         self, channels: int, latent: int, frames: int, *, hidden_warp: HiddenWarp, detach: bool
     ) -> None:
-        """Make the layers for so many future frames.
+        """Build the layers for a number of future frames.
 
-        The GRU updates the last state in its old place (`none`, as released), or moved along the flow as its input is
-        (`warped`). With `detach`, gradients stop between a frame and the next, as released.
+        The GRU updates the previous state in its old place (`none`, as released), or warped with
+        the flow like its input (`warped`). With `detach`, gradients stop between a frame and the
+        next, as released.
         """
         super().__init__()
         self._frames, self._hidden_warp, self._detach = frames, hidden_warp, detach
@@ -147,13 +177,17 @@ class FlowGru(nn.Module):
         self.spatial_conv = _ConvNorm(channels, channels)
 
     def forward(self, latent: Tensor, state: Tensor) -> Tensor:
-        """A latent (N, L, H, W) and the present (N, C, H, W) → the future states (N, frames, C, H, W)."""
+        """Return future states (N, frames, C, H, W) of a latent (N, L, H, W) and the present state.
+
+        The present state has shape (N, C, H, W).
+        """
         states = []
         for _ in range(self._frames):
             flow = self.offset_pred(self.offset_conv(torch.cat([latent, state], dim=1)))
-            moved = warp_with_flow(state, flow)
-            hidden = state if self._hidden_warp == "none" else moved
-            state = self.spatial_conv(self.gru_cells[0](torch.cat([moved, latent], dim=1), hidden))
+            warped = warp_with_flow(state, flow)
+            hidden = state if self._hidden_warp == "none" else warped
+            inputs = torch.cat([warped, latent], dim=1)
+            state = self.spatial_conv(self.gru_cells[0](inputs, hidden))
             states.append(state)
             if self._detach:
                 state = state.detach()
@@ -161,7 +195,7 @@ class FlowGru(nn.Module):
 
 
 class _GruCell(nn.Module):
-    """A GRU of convolutions whose reset gate is the share that is *forgotten*, as in FIERY."""
+    """A GRU of convolutions with a reset gate that is the *forgotten* share, as in FIERY."""
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
@@ -170,8 +204,9 @@ class _GruCell(nn.Module):
         self.conv_state_tilde = _ConvNorm(inputs + channels, channels)
 
     def forward(self, inputs: Tensor, state: Tensor) -> Tensor:
-        both = torch.cat([inputs, state], dim=1)
-        update, reset = self.conv_update(both).sigmoid(), self.conv_reset(both).sigmoid()
+        joint = torch.cat([inputs, state], dim=1)
+        update = self.conv_update(joint).sigmoid()
+        reset = self.conv_reset(joint).sigmoid()
         proposed = self.conv_state_tilde(torch.cat([inputs, (1 - reset) * state], dim=1))
         return (1 - update) * state + update * proposed
 
@@ -188,25 +223,18 @@ class _ConvNorm(nn.Module):
         return functional.relu(self.norm(self.conv(features)), inplace=True)
 
 
-_CHANNELS: Final = {
-    "segmentation": 2,
-    "instance_center": 1,
-    "instance_offset": 2,
-    "instance_flow": 2,
-}
-# First bias of the centres' logits: one cell in ten, so that empty cells do not dominate the first steps (CenterNet,
-# arXiv:1904.07850).
-_RARE: Final = -2.19
-
-
 class PredictedMotionMaps(NamedTuple):
-    """The maps of a motion prediction, in the orientation of the features; vectors in cells of these maps.
+    """The maps of a motion prediction, in the orientation of the features.
+
+    Vectors are in cells of these maps.
 
     Attributes:
-        segmentation: (…, T, 2, H, W) logits of background and foreground.
-        instance_center: (…, T, 1, H, W) logits of a centre.
-        instance_offset: (…, T, 2, H, W) to the centre, down the rows and along the columns.
-        instance_flow: (…, T, 2, H, W) to the centre in the next frame, down the rows and along the columns.
+        segmentation: Logits of background and foreground, shape (…, T, 2, H, W).
+        instance_center: Logits of a centre, shape (…, T, 1, H, W).
+        instance_offset: Offset to the centre, down the rows and along the columns, shape (…, T, 2,
+            H, W).
+        instance_flow: Offset to the centre in the next frame, down the rows and along the columns,
+            shape (…, T, 2, H, W).
     """
 
     segmentation: Tensor
@@ -216,21 +244,18 @@ class PredictedMotionMaps(NamedTuple):
 
 
 class SeparateDecoders(nn.ModuleDict):
-    """The released task heads: for each map a 3 × 3 and a 1 × 1 convolution, at the states' resolution."""
+    """The released task heads: a 3 × 3 and a 1 × 1 convolution for each map.
+
+    Maps have the resolution of the states.
+    """
 
     def __init__(self, channels: int) -> None:
-        """Make the layers for states of so many channels."""
-        super().__init__(
-            {
-                name: _decoder(
-                    channels,
-                    channels,
-                    count,
-                    rare=slice(0, 1) if name == "instance_center" else None,
-                )
-                for name, count in _CHANNELS.items()
-            }
-        )
+        """Build the layers for states with a number of channels."""
+        decoders = {}
+        for name, count in _CHANNELS.items():
+            centers = slice(0, 1) if name == "instance_center" else None
+            decoders[name] = _decoder(channels, channels, count, centers=centers)
+        super().__init__(decoders)
 
     def forward(self, states: Tensor) -> PredictedMotionMaps:
         """Decode states (M, C, H, W) to maps (M, …, H, W)."""
@@ -238,16 +263,19 @@ class SeparateDecoders(nn.ModuleDict):
 
 
 class ShuffledDecoder(nn.Module):
-    """Our small decoder: all maps from the same few channels; each finer cell has channels of its own."""
+    """Our small decoder: all maps from a few channels; each finer cell has its own channels."""
 
     def __init__(self, channels: int, hidden: int, upsample: int) -> None:
-        """Make the layers: `hidden` channels after the 3 × 3 convolution, `upsample` cells of maps to one of states."""
+        """Build the layers.
+
+        `hidden` is the number of channels after the 3 × 3 convolution, and `upsample` the number of
+        the maps' cells along a cell of the states.
+        """
         super().__init__()
         self._upsample, cells = upsample, upsample**2
-        first = cells * _CHANNELS["segmentation"]
-        self.layers = _decoder(
-            channels, hidden, cells * sum(_CHANNELS.values()), rare=slice(first, first + cells)
-        )
+        start = cells * _CHANNELS["segmentation"]
+        outputs = cells * sum(_CHANNELS.values())
+        self.layers = _decoder(channels, hidden, outputs, centers=slice(start, start + cells))
 
     def forward(self, states: Tensor) -> PredictedMotionMaps:
         """Decode states (M, C, H, W) to maps (M, …, H', W') on the finer grid."""
@@ -255,15 +283,15 @@ class ShuffledDecoder(nn.Module):
         return PredictedMotionMaps(*maps.split(list(_CHANNELS.values()), dim=1))
 
 
-def _decoder(channels: int, hidden: int, outputs: int, *, rare: slice | None) -> nn.Sequential:
-    """Two convolutions; `rare` says which outputs are centres' logits, if there are any."""
-    last = nn.Conv2d(hidden, outputs, 1)
-    if rare is not None:
+def _decoder(channels: int, hidden: int, outputs: int, *, centers: slice | None) -> nn.Sequential:
+    """Return two convolutions; `centers` are the outputs with centres' logits, None without any."""
+    output_conv = nn.Conv2d(hidden, outputs, 1)
+    if centers is not None:
         with torch.no_grad():
-            last.get_parameter("bias")[rare] = _RARE
+            output_conv.get_parameter("bias")[centers] = _CENTER_BIAS
     return nn.Sequential(
         nn.Conv2d(channels, hidden, 3, padding=1, bias=False),
         nn.BatchNorm2d(hidden),
         nn.ReLU(inplace=True),
-        last,
+        output_conv,
     )

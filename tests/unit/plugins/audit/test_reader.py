@@ -342,7 +342,7 @@ def test_rows_in_place_of_columns() -> None:
 
 
 def test_what_has_no_end_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deepaccident_devkit.plugins.audit.reader.MOST_VALUES", 5000)
+    monkeypatch.setattr("deepaccident_devkit.plugins.audit.reader.MAX_VALUES", 5000)
     report = audit_reader(lambda root: cycle([{"ttc": float(row[11])} for row in rows(root)]))
     assert (list(misread(report)), report.cannot_say) == (
         ["*/ttc"],

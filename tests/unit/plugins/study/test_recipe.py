@@ -9,7 +9,7 @@ from refusals import assert_refused
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.study import read_recipe
-from deepaccident_devkit.plugins.study.recipe import MOST_ROWS, SHIPPED_RECIPES, StudyRow
+from deepaccident_devkit.plugins.study.recipe import MAX_ROWS, SHIPPED_RECIPES, StudyRow
 
 PLAIN: dict[str, Any] = {
     "title": "A study",
@@ -211,7 +211,7 @@ def test_lists_in_many_keys_are_counted_before_they_are_multiplied_out(tmp_path:
         {"name": f"{{agents}} {each}", "trivial": "nothing", "agents": ["all", "single"]}
         for each in range(500)
     ]
-    assert len(read_recipe(written(tmp_path, {**PLAIN, "rows": many})).rows) == MOST_ROWS
+    assert len(read_recipe(written(tmp_path, {**PLAIN, "rows": many})).rows) == MAX_ROWS
     with pytest.raises(ConfigError, match="found 1,001"):
         read_recipe(
             written(tmp_path, {**PLAIN, "rows": [*many, {"name": "one", "trivial": "nothing"}]})
