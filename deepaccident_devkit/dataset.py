@@ -377,7 +377,7 @@ class Dataset(OpenTables):
         _, name = self._sensor(sample_data, channel)
         if name not in CAMERAS:
             raise ChoiceError(f"{name} holds no images; the cameras are {', '.join(CAMERAS)}")
-        return read_image(self.sensor_path(sample_data, channel), least=min_size, size=size)
+        return read_image(self.sensor_path(sample_data, channel), min_size=min_size, size=size)
 
     def load_point_cloud(self, sample: RowArgument, frame: Frame = "world") -> LidarPointCloud:
         """Return a sample's LiDAR points in `world`, `ego` or `lidar`.

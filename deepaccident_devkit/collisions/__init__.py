@@ -1,4 +1,4 @@
-"""Recorded collisions: the pair, contact and impact, what braking would have changed, and twins without one."""
+"""Recorded collisions: pair, contact, impact, effect of braking, and twins without a collision."""
 
 from deepaccident_devkit.collisions.outcomes import (
     BRAKINGS,

@@ -1,8 +1,8 @@
-"""When replays of a pair first touch: no contact is missed, however short.
+"""When replays of a pair first touch; no contact is missed, however short.
 
-A time interval is proven free of contact by the gaps at its ends and by how far the two can come within it
-(`_contact_possible`). What is not proven is halved. So the steps are long where the two are far apart and short where
-they nearly touch.
+A time interval is proven free of contact by the gaps at its ends and by how far the two actors can
+approach within it (`_contact_possible`). An interval that is not proven is halved. Intervals are
+therefore long where the actors are far apart, and short where they nearly touch.
 """
 
 from __future__ import annotations
@@ -32,12 +32,11 @@ from deepaccident_devkit.support.arrays import (
     checked,
 )
 
-# Seconds of the longest intervals.
-_COARSE: Final = 0.32
-# How often an interval is halved at most: down to 0.3 µs, in which a car moves by less than 0.01 mm.
-_HALVINGS: Final = 20
+_LONGEST_INTERVAL_S: Final = 0.32
+# Halvings of an interval at most: down to 0.3 µs, in which a car moves by less than 0.01 mm.
+_MAX_HALVINGS: Final = 20
 TOUCHING: Final = 1e-9
-"""Metres of a gap that still counts as contact."""
+"""Largest gap that still counts as contact, metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,10 +44,11 @@ class Pair(FrozenArrays):
     """The motions of two actors, and the gap between their outlines that counts as contact.
 
     Attributes:
-        motions: of the two; the same number of frames.
-        sizes: (2, 2) lengths and widths, metres. Read-only.
-        margin: metres. The simulator's contact need not be an overlap of the boxes at the last frame, so that the gap
-            there counts as contact: otherwise such accidents would be avoided by doing nothing.
+        motions: Motions of the two actors, with the same number of frames.
+        sizes: Lengths and widths, shape (2, 2), metres. Read-only.
+        margin: Gap that counts as contact, metres. The simulator's contact need not be an overlap
+            of the boxes at the last frame, so the gap at that frame counts as contact; otherwise
+            doing nothing would avoid such accidents.
     """
 
     motions: tuple[Motion, Motion]
@@ -57,17 +57,17 @@ class Pair(FrozenArrays):
 
     @property
     def duration(self) -> float:
-        """Seconds of the recording."""
+        """Duration of the recording, seconds."""
         return self.motions[0].duration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Impacts(FrozenArrays):
-    """How N replays of a pair first touch; NaN where they do not. Arrays are read-only.
+    """Speeds at the first contact of N replays of a pair, NaN without contact; read-only arrays.
 
     Attributes:
-        speeds: (N, 2) of the two, m/s.
-        relative_speeds: (N,) m/s.
+        speeds: Speeds of the two actors, shape (N, 2), m/s.
+        relative_speeds: Relative speeds, shape (N,), m/s.
     """
 
     speeds: FloatArray
@@ -75,21 +75,27 @@ class Impacts(FrozenArrays):
 
 
 def pair_of(paths: ArrayLike, sizes: ArrayLike, *, margin: float | None = None) -> Pair:
-    """The motions of two on paths (2, F, 3) of x, y, yaw at 10 Hz up to the impact, and the margin of their contact.
+    """Return the motions of two actors and the margin of their contact.
 
-    Any right-handed frame, metres, radians; `sizes` (2, 2 or more) begin with length and width. A `margin` of None
-    is the gap at the last frame. Raises GeometryError.
+    Args:
+        paths: Positions and yaws (x, y, yaw) at 10 Hz up to the impact, shape (2, F, 3), in any
+            right-handed frame, metres and radians.
+        sizes: Sizes that begin with length and width, shape (2, 2 or more), metres.
+        margin: Gap that counts as contact, metres; None for the gap at the last frame.
+
+    Raises:
+        GeometryError: An array has another shape, or fewer than two frames, or a NaN.
     """
-    both = checked("paths", paths, (2, None, 3))
-    flat = checked("sizes", np.asarray(sizes)[:, :2], (2, 2))
-    first, second = (motion_of(path) for path in both)
+    actor_paths = checked("paths", paths, (2, None, 3))
+    flat_sizes = checked("sizes", np.asarray(sizes)[:, :2], (2, 2))
+    first_motion, second_motion = (motion_of(path) for path in actor_paths)
     if margin is None:
-        last = [
+        last_boxes = [
             np.concatenate([path[-1, :2], size, path[-1, 2:]])
-            for path, size in zip(both, flat, strict=True)
+            for path, size in zip(actor_paths, flat_sizes, strict=True)
         ]
-        margin = float(gaps_of_pairs(last[0], last[1])) + TOUCHING
-    return Pair(motions=(first, second), sizes=flat, margin=margin)
+        margin = float(gaps_of_pairs(last_boxes[0], last_boxes[1])) + TOUCHING
+    return Pair(motions=(first_motion, second_motion), sizes=flat_sizes, margin=margin)
 
 
 def contact_times(
@@ -99,13 +105,21 @@ def contact_times(
     *,
     window: tuple[float, float] | None = None,
 ) -> FloatArray:
-    """(N,) seconds at which replays of a pair first touch; inf for those that never do.
+    """Return the times at which replays of a pair first touch, shape (N,), seconds; inf for never.
 
-    `starts` (N, 2) are the seconds at which each of the two begins to brake, inf or NaN if it does not;
-    `decelerations` (N,) are m/s² of both. Contact counts within the `window`, None for all to the end of the
-    continuation. Raises GeometryError.
+    Args:
+        pair: Motions and sizes of the two actors.
+        starts: Times at which each actor begins to brake, shape (N, 2), seconds; inf or NaN if it
+            does not brake.
+        decelerations: Decelerations of both actors, shape (N,), m/s².
+        window: Times within which contact counts, seconds; None for all to the end of the
+            continuation.
+
+    Raises:
+        GeometryError: An array has another shape.
     """
-    return _search(pair, _plans(pair, starts, decelerations), window or _whole(pair), earliest=True)
+    plans = _plans(pair, starts, decelerations)
+    return _search(pair, plans, window or _full_window(pair), earliest=True)
 
 
 def contact_made(
@@ -115,90 +129,109 @@ def contact_made(
     *,
     window: tuple[float, float] | None = None,
 ) -> BoolArray:
-    """(N,) whether replays of a pair touch at all: faster than `contact_times`, whose arguments and errors it has."""
-    found = _search(
-        pair, _plans(pair, starts, decelerations), window or _whole(pair), earliest=False
-    )
-    return np.isfinite(found)
+    """Return whether replays of a pair touch at all, shape (N,).
+
+    This is faster than `contact_times`, and has the same arguments and errors.
+    """
+    plans = _plans(pair, starts, decelerations)
+    times = _search(pair, plans, window or _full_window(pair), earliest=False)
+    return np.isfinite(times)
 
 
 def impacts(pair: Pair, starts: ArrayLike, decelerations: ArrayLike, times: FloatArray) -> Impacts:
-    """How fast the two are where replays first touch: at `times` (N,), inf for none; else as `contact_times`."""
-    hit = np.flatnonzero(np.isfinite(times))
-    speeds, velocities = np.full((len(times), 2), np.nan), np.full((2, len(times), 2), np.nan)
+    """Return how fast the two actors are where replays first touch.
+
+    Args:
+        pair: Motions and sizes of the two actors.
+        starts: Times at which each actor begins to brake, as `contact_times` expects them.
+        decelerations: Decelerations, as `contact_times` expects them.
+        times: Times of the first contact, shape (N,), seconds; inf without contact.
+    """
+    hit_rows = np.flatnonzero(np.isfinite(times))
+    speeds = np.full((len(times), 2), np.nan)
+    velocities = np.full((2, len(times), 2), np.nan)
     plans = _plans(pair, starts, decelerations)
-    for which, (motion, plan) in enumerate(zip(pair.motions, plans, strict=True)):
-        states = replay(motion, plan, hit, times[hit])
-        speeds[hit, which] = states.speeds
-        velocities[which, hit] = states.velocities(motion)
-    return Impacts(speeds=speeds, relative_speeds=np.hypot(*(velocities[0] - velocities[1]).T))
+    for actor, (motion, plan) in enumerate(zip(pair.motions, plans, strict=True)):
+        states = replay(motion, plan, hit_rows, times[hit_rows])
+        speeds[hit_rows, actor] = states.speeds
+        velocities[actor, hit_rows] = states.velocities(motion)
+    velocity_changes = velocities[0] - velocities[1]
+    return Impacts(speeds=speeds, relative_speeds=np.hypot(*velocity_changes.T))
 
 
-def _whole(pair: Pair) -> tuple[float, float]:
+def _full_window(pair: Pair) -> tuple[float, float]:
+    """Return the first and last time of a pair's motions, with the continuation."""
     return 0.0, float(pair.motions[0].times[-1])
 
 
 def _plans(
     pair: Pair, starts: ArrayLike, decelerations: ArrayLike
 ) -> tuple[BrakingPlans, BrakingPlans]:
-    begun = checked("starts", starts, (None, 2))
-    first, second = (
-        braking_plans(motion, begun[:, each], decelerations)
-        for each, motion in enumerate(pair.motions)
+    """Return the braking plans of both actors, as `contact_times` describes the arguments."""
+    actor_starts = checked("starts", starts, (None, 2))
+    first_plans, second_plans = (
+        braking_plans(motion, actor_starts[:, actor], decelerations)
+        for actor, motion in enumerate(pair.motions)
     )
-    return first, second
+    return first_plans, second_plans
 
 
 class _Mark(IntEnum):
-    """Rows of what is known of a replay at a time."""
+    """Rows of the array that holds what is known of a replay at a time."""
 
     TIME = 0
-    """Seconds."""
+    """Time, seconds."""
     GAP = 1
-    """Metres, less the margin; or a lower bound."""
+    """Gap less the margin, metres; or a lower bound of it."""
     WAY = 2
-    """Metres that the two have travelled, and their corners turned."""
+    """Distance that the two actors have travelled and their corners have turned, metres."""
     TURN = 3
-    """Metres that their corners have turned."""
+    """Distance that their corners have turned, metres."""
     X = 4
     Y = 5
-    """Metres from the second centre to the first."""
+    """Offset from the second centre to the first, metres."""
     SPEED = 6
-    """m/s of both together."""
+    """Sum of both speeds, m/s."""
     STRETCH = 7
-    """A number for the two stretches of their paths."""
+    """Number of the pair of stretches of their paths."""
 
 
 class _Gaps:
-    """Gaps of replays of a pair at times, and how far the two have moved until then."""
+    """Gaps of replays of a pair at times, and how far the two actors have moved until then."""
 
     def __init__(self, pair: Pair, plans: tuple[BrakingPlans, BrakingPlans]) -> None:
         self._pair = pair
         self._plans = plans
-        self._reaches = np.hypot(*pair.sizes.T) / 2
-        self._fastest = sum(float(motion.speeds.max()) for motion in pair.motions)
+        self._half_diagonals = np.hypot(*pair.sizes.T) / 2
+        self._max_closing_speed = sum(float(motion.speeds.max()) for motion in pair.motions)
 
     def at(self, rows: IntArray, times: FloatArray, step: float) -> FloatArray:
-        """(8, N) marks; the gap is a lower bound where the two are farther apart than they drive in a step."""
-        one, two = (
+        """Return the marks of replays at times, shape (8, N).
+
+        The gap is a lower bound where the two actors are farther apart than they drive in a step of
+        `step` seconds.
+        """
+        first, second = (
             replay(motion, plan, rows, times)
             for motion, plan in zip(self._pair.motions, self._plans, strict=True)
         )
-        turn = self._reaches[0] * one.turned + self._reaches[1] * two.turned
-        x, y = (one.poses - two.poses)[:, :2].T
-        gap = np.hypot(x, y) - self._reaches.sum()
-        near = np.flatnonzero(gap <= self._pair.margin + self._fastest * step)
-        outlines = (self._outlines(states, which, near) for which, states in enumerate((one, two)))
-        gap[near] = gaps_of_pairs(*outlines)
-        stretch = one.stretches * len(self._pair.motions[1].times) + two.stretches
-        way = one.arcs + two.arcs + turn
-        return np.stack(
-            [times, gap - self._pair.margin, way, turn, x, y, one.speeds + two.speeds, stretch]
-        )
+        turn = self._half_diagonals[0] * first.turned + self._half_diagonals[1] * second.turned
+        x, y = (first.poses - second.poses)[:, :2].T
+        gap = np.hypot(x, y) - self._half_diagonals.sum()
+        max_approach = self._max_closing_speed * step
+        close_rows = np.flatnonzero(gap <= self._pair.margin + max_approach)
+        first_outlines = self._outlines(first, 0, close_rows)
+        second_outlines = self._outlines(second, 1, close_rows)
+        gap[close_rows] = gaps_of_pairs(first_outlines, second_outlines)
+        stretch = first.stretches * len(self._pair.motions[1].times) + second.stretches
+        way = first.arcs + second.arcs + turn
+        speed = first.speeds + second.speeds
+        return np.stack([times, gap - self._pair.margin, way, turn, x, y, speed, stretch])
 
-    def _outlines(self, states: ReplayStates, which: int, rows: IntArray) -> FloatArray:
+    def _outlines(self, states: ReplayStates, actor: int, rows: IntArray) -> FloatArray:
+        """Return the flat boxes (x, y, length, width, yaw) of an actor's states at rows."""
         poses = states.poses[rows]
-        sizes = np.broadcast_to(self._pair.sizes[which], (len(rows), 2))
+        sizes = np.broadcast_to(self._pair.sizes[actor], (len(rows), 2))
         return np.concatenate([poses[:, :2], sizes, poses[:, 2:]], axis=1)
 
 
@@ -209,81 +242,105 @@ def _search(
     *,
     earliest: bool,
 ) -> FloatArray:
-    """(N,) times of contact, inf for none: the first ones, or any (`earliest` false).
+    """Return times of contact, shape (N,), inf for none: the first ones, or any if not `earliest`.
 
-    Until the first of the two brakes, a replay is the recording, which is searched once.
+    Until the first of the two actors brakes, a replay equals the recording, which is searched once.
     """
     nodes = _nodes(pair, window)
-    begun = np.minimum(plans[0].starts, plans[1].starts)
-    never = _plans(pair, np.full((1, 2), np.inf), np.ones(1))
-    recorded = _refined(_Gaps(pair, never), nodes, np.array([window[0]]), earliest=True)[0]
-    found = np.where(begun >= recorded, recorded, np.inf)
-    rows = np.flatnonzero(begun < recorded)
+    braking_begins = np.minimum(plans[0].starts, plans[1].starts)
+    unbraked_plans = _plans(pair, np.full((1, 2), np.inf), np.ones(1))
+    unbraked_gaps = _Gaps(pair, unbraked_plans)
+    recorded_time = _refined(unbraked_gaps, nodes, np.array([window[0]]), earliest=True)[0]
+    times = np.where(braking_begins >= recorded_time, recorded_time, np.inf)
+    rows = np.flatnonzero(braking_begins < recorded_time)
     gaps = _Gaps(pair, (plans[0].take(rows), plans[1].take(rows)))
-    found[rows] = _refined(gaps, nodes, begun[rows], earliest=earliest)
-    return found
+    times[rows] = _refined(gaps, nodes, braking_begins[rows], earliest=earliest)
+    return times
 
 
-def _refined(gaps: _Gaps, nodes: FloatArray, begun: FloatArray, *, earliest: bool) -> FloatArray:
-    """(N,) times of contact after `begun` (N,), inf for none; intervals between nodes are halved as long as needed."""
-    found = np.full(len(begun), np.inf)
-    rows, ends = _first_intervals(gaps, nodes, begun)
+def _refined(
+    gaps: _Gaps, nodes: FloatArray, braking_begins: FloatArray, *, earliest: bool
+) -> FloatArray:
+    """Return times of contact after `braking_begins` (N,), shape (N,), inf for none.
+
+    Intervals between nodes are halved as long as needed.
+    """
+    times = np.full(len(braking_begins), np.inf)
+    rows, ends = _first_intervals(gaps, nodes, braking_begins)
     for marks in ends:
-        _note(found, rows, marks)
-    for halving in range(1, _HALVINGS + 1):
-        limit = found if earliest else np.where(np.isfinite(found), -np.inf, np.inf)
-        kept = np.flatnonzero(_contact_possible(ends) & (ends[0, _Mark.TIME] < limit[rows]))
-        if not len(kept):
+        _note_contacts(times, rows, marks)
+    for halving in range(1, _MAX_HALVINGS + 1):
+        limit = times if earliest else np.where(np.isfinite(times), -np.inf, np.inf)
+        undecided = _contact_possible(ends) & (ends[0, _Mark.TIME] < limit[rows])
+        intervals = np.flatnonzero(undecided)
+        if not len(intervals):
             break
-        rows, ends = rows[kept], ends[..., kept]
-        middle = gaps.at(rows, ends[:, _Mark.TIME].mean(axis=0), _COARSE / 2**halving)
-        _note(found, rows, middle)
+        rows = rows[intervals]
+        ends = ends[..., intervals]
+        middle_times = ends[:, _Mark.TIME].mean(axis=0)
+        middle = gaps.at(rows, middle_times, _LONGEST_INTERVAL_S / 2**halving)
+        _note_contacts(times, rows, middle)
         rows = np.concatenate([rows, rows])
         ends = np.concatenate([[ends[0], middle], [middle, ends[1]]], axis=2)
-    return found
+    return times
 
 
 def _contact_possible(ends: FloatArray) -> BoolArray:
-    """(M,) whether the two can touch within intervals whose marks at both ends are (2, 8, M).
+    """Return whether actors can touch within intervals, shape (M,).
 
-    At any moment in between, the gap is at least the mean of those at the ends less half of what it can change. That
-    is no more than the ways. Where each of the two stays on one stretch, which is straight and on which it does not
-    speed up, it is no more than the change of their distance either, and what they leave the straight line of constant
-    speeds by: a quarter of the loss of speed, times the time.
+    The marks at both ends of the intervals have the shape (2, 8, M).
+
+    At any moment in between, the gap is at least the mean of the gaps at both ends less half of
+    what it can change. The change is no more than the distance travelled. If each of the two actors
+    stays on one stretch, which is straight and on which it does not speed up, the change is also no
+    more than the change of their distance plus their deviation from the straight line of constant
+    speeds: a quarter of the loss of speed, times the time.
     """
     begin, end = ends
     change = np.abs(end - begin)
-    apart = np.hypot(change[_Mark.X], change[_Mark.Y])
-    relative = apart + change[_Mark.TURN] + change[_Mark.SPEED] * change[_Mark.TIME] / 2
-    most = np.where(
-        change[_Mark.STRETCH] == 0, np.minimum(relative, change[_Mark.WAY]), change[_Mark.WAY]
-    )
-    return np.asarray(begin[_Mark.GAP] + end[_Mark.GAP] <= most)
+    distance = np.hypot(change[_Mark.X], change[_Mark.Y])
+    straight_change = distance + change[_Mark.TURN] + change[_Mark.SPEED] * change[_Mark.TIME] / 2
+    same_stretches = change[_Mark.STRETCH] == 0
+    travelled = change[_Mark.WAY]
+    max_change = np.where(same_stretches, np.minimum(straight_change, travelled), travelled)
+    return np.asarray(begin[_Mark.GAP] + end[_Mark.GAP] <= max_change)
 
 
 def _nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:
-    """Times from the first to the last of a window, at most `_COARSE` apart; the end of the recording is one."""
-    since, until = window
-    bounds = [since, *([pair.duration] if since < pair.duration < until else []), until]
-    parts = [
-        np.linspace(start, end, max(1, int(np.ceil((end - start) / _COARSE))) + 1)
-        for start, end in pairwise(bounds)
-    ]
+    """Return times from the begin to the end of a window, at most `_LONGEST_INTERVAL_S` apart.
+
+    The end of the recording is a node if the window holds it.
+    """
+    begin, end = window
+    bounds = [begin, end]
+    if begin < pair.duration < end:
+        bounds.insert(1, pair.duration)
+    parts = []
+    for part_begin, part_end in pairwise(bounds):
+        num_intervals = max(1, int(np.ceil((part_end - part_begin) / _LONGEST_INTERVAL_S)))
+        parts.append(np.linspace(part_begin, part_end, num_intervals + 1))
     return np.unique(np.concatenate(parts))
 
 
 def _first_intervals(
-    gaps: _Gaps, nodes: FloatArray, begun: FloatArray
+    gaps: _Gaps, nodes: FloatArray, braking_begins: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """The intervals between nodes that end after `begun`: replays (M,), and marks (2, 8, M) at both ends."""
-    marks = np.full((len(_Mark), len(begun), len(nodes)), np.nan)
-    rows, numbers = np.nonzero(np.append(nodes[1:], np.inf) > begun[:, None])
-    marks[:, rows, numbers] = gaps.at(rows, nodes[numbers], _COARSE)
-    rows, numbers = np.nonzero(nodes[1:] > begun[:, None])
-    return rows, np.stack([marks[:, rows, numbers], marks[:, rows, numbers + 1]])
+    """Return the intervals between nodes that end after `braking_begins` (N,).
+
+    Returns:
+        Rows of replays, shape (M,), and the marks at both ends of their intervals, shape (2, 8, M).
+    """
+    marks = np.full((len(_Mark), len(braking_begins), len(nodes)), np.nan)
+    next_nodes = np.append(nodes[1:], np.inf)
+    rows, numbers = np.nonzero(next_nodes > braking_begins[:, None])
+    marks[:, rows, numbers] = gaps.at(rows, nodes[numbers], _LONGEST_INTERVAL_S)
+    rows, numbers = np.nonzero(nodes[1:] > braking_begins[:, None])
+    begins = marks[:, rows, numbers]
+    ends = marks[:, rows, numbers + 1]
+    return rows, np.stack([begins, ends])
 
 
-def _note(found: FloatArray, rows: IntArray, marks: FloatArray) -> None:
-    """Note the times at which replays are in contact, if they are earlier than those noted before."""
-    hit = marks[_Mark.GAP] <= 0
-    np.minimum.at(found, rows[hit], marks[_Mark.TIME, hit])
+def _note_contacts(times: FloatArray, rows: IntArray, marks: FloatArray) -> None:
+    """Note the times at which replays are in contact, if they are earlier than the noted ones."""
+    in_contact = marks[_Mark.GAP] <= 0
+    np.minimum.at(times, rows[in_contact], marks[_Mark.TIME, in_contact])

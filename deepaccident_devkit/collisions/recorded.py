@@ -1,4 +1,4 @@
-"""`Accident`: the recorded motion of two that collide; masses; `each_scenario`: one computation on many scenarios."""
+"""Recorded motions of colliding pairs, assumed masses, and computations on many scenarios."""
 
 from __future__ import annotations
 
@@ -45,9 +45,15 @@ CLASS_MASSES: Final[Mapping[str, float]] = MappingProxyType(
         "pedestrian": 75.0,
     }
 )
-"""Kilograms of a road user of its class's median size, with load or rider: an assumption of this devkit."""
+"""Mass of a road user of its class's median size, with load or rider, kilograms.
+
+The masses are an assumption of this devkit.
+"""
 MASS_UNCERTAINTY: Final = 0.3
-"""Share by which these masses may be wrong; figures that depend on them are also given for that much more and less."""
+"""Share by which these masses may be wrong.
+
+Figures that depend on them are also stated for masses that are heavier and lighter by this share.
+"""
 # Length, width, height in metres: medians of 250,378 real boxes (docs/format.md).
 _MEDIAN_SIZES: Final[Mapping[str, tuple[float, float, float]]] = {
     "car": (4.60, 1.93, 1.52),
@@ -57,62 +63,73 @@ _MEDIAN_SIZES: Final[Mapping[str, tuple[float, float, float]]] = {
     "motorcycle": (2.21, 0.86, 1.53),
     "pedestrian": (0.38, 0.38, 1.86),
 }
-# Frames that show both of a pair, with which there is a motion.
-_FEWEST: Final = 2
-# How much lighter or heavier than its class a road user can be by its size.
-_LEAST, _MOST = 0.5, 2.0
+# A motion needs this number of frames that show both actors of a pair.
+_MIN_COMMON_FRAMES: Final = 2
+# Factors by which a road user's size can make it lighter or heavier than its class.
+_MIN_MASS_FACTOR: Final = 0.5
+_MAX_MASS_FACTOR: Final = 2.0
+# Scenarios of one piece of work: a few tenths of a second.
+_SCENARIOS_PER_RUN: Final = 64
+
+_Result = TypeVar("_Result")
 
 
 def masses_of(
     categories: ArrayLike, sizes: ArrayLike, class_masses: Mapping[str, float] = CLASS_MASSES
 ) -> FloatArray:
-    """The assumed masses (N,) of road users in kilograms: their class's, times their volume over the class's median.
+    """Return the assumed masses of road users, shape (N,), kilograms.
 
-    The factor is kept between 0.5 and 2.
+    A mass is that of its class, times the ratio of the volume to the class's median volume. The
+    ratio is limited to the range from 0.5 to 2.
 
     Args:
-        categories: (N,) positions in `taxonomy.CATEGORIES`.
-        sizes: (N, 3) length, width, height, metres.
-        class_masses: class → kilograms at its median size.
+        categories: Positions in `taxonomy.CATEGORIES`, shape (N,).
+        sizes: Lengths, widths, heights, shape (N, 3), metres.
+        class_masses: Class → mass at its median size, kilograms.
 
     Raises:
-        GeometryError: the sizes have another shape.
-        ConfigError: a class has no mass, or none above 0.
+        GeometryError: The sizes have another shape.
+        ConfigError: A class has no mass, or none above 0.
     """
     codes = np.asarray(categories, dtype=np.int64)
     volumes = checked("sizes", sizes, (len(codes), 3)).prod(axis=1)
     masses = np.array(_masses_in_order(class_masses))
-    medians = np.array([np.prod(_MEDIAN_SIZES[name]) for name in CATEGORIES])
-    return np.asarray(masses[codes] * np.clip(volumes / medians[codes], _LEAST, _MOST))
+    median_volumes = np.array([np.prod(_MEDIAN_SIZES[name]) for name in CATEGORIES])
+    factors = np.clip(volumes / median_volumes[codes], _MIN_MASS_FACTOR, _MAX_MASS_FACTOR)
+    return np.asarray(masses[codes] * factors)
 
 
 def _masses_in_order(class_masses: Mapping[str, float]) -> Sequence[float]:
+    """Return the mass of each class in the order of `CATEGORIES`, or raise ConfigError."""
     missing = [name for name in CATEGORIES if not class_masses.get(name, 0) > 0]
     if missing:
         raise ConfigError(
-            f"class_masses: expected kilograms above 0 for each class; {', '.join(missing)} has none"
+            "class_masses: expected kilograms above 0 for each class; "
+            f"{', '.join(missing)} has none"
         )
     return [float(class_masses[name]) for name in CATEGORIES]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Accident(FrozenArrays):
-    """Two actors up to the moment at which they collide; world, right-handed, metres, seconds, radians.
+    """Two actors up to the moment at which they collide.
 
-    The pair is in the meta file's order. Time 0 is `first_frame`, the first that shows both; the impact counts as at
-    the last frame that does, though the outlines may touch before (`touching`). Arrays are read-only.
+    World frame, right-handed; metres, seconds, radians. The pair is in the meta file's order.
+    Time 0 is `first_frame`, the first that shows both actors. The impact counts as at the last
+    frame that shows both, though the outlines may touch before (`touching`). Arrays are read-only.
 
     Attributes:
-        scenario: token.
-        actor_ids: their CARLA ids.
-        categories: their classes.
-        agents: the agents that they are; None for one that records nothing.
-        first_frame: number of the first frame.
-        num_frames: of the whole recording.
-        paths: (2, F, 3) x, y, yaw at each frame.
-        sizes: (2, 3) length, width, height: medians over the frames.
-        masses: (2,) kilograms, assumed (`interactions.masses_of`).
-        interpolated: frames within which a label of one of the two is missing; straight lines fill them.
+        scenario: Token.
+        actor_ids: CARLA ids of the two actors.
+        categories: Classes of the two actors.
+        agents: Names of the actors as agents; None for one that records nothing.
+        first_frame: Number of the first frame.
+        num_frames: Number of frames of the full recording.
+        paths: Positions and yaws (x, y, yaw) at each frame, shape (2, F, 3).
+        sizes: Lengths, widths, heights, shape (2, 3): medians over the frames.
+        masses: Assumed masses, shape (2,), kilograms (`interactions.masses_of`).
+        interpolated: Number of frames in which a label of one of the two is missing; straight lines
+            fill them.
     """
 
     scenario: str
@@ -128,7 +145,7 @@ class Accident(FrozenArrays):
 
     @property
     def duration(self) -> float:
-        """Seconds from the first frame to the impact."""
+        """Time from the first frame to the impact, seconds."""
         return float((self.paths.shape[1] - 1) * FRAME_PERIOD)
 
     @property
@@ -138,30 +155,40 @@ class Accident(FrozenArrays):
 
     @property
     def touching(self) -> float | None:
-        """Seconds from the frame at which the outlines begin to touch (as `Contact.contact_frame`) to the last one."""
-        flat = np.broadcast_to(self.sizes[:, None, :2], (*self.paths.shape[:2], 2))
-        begin = contact_begin(
-            signed_gaps(*np.concatenate([self.paths[..., :2], flat, self.paths[..., 2:]], axis=2))
-        )
-        return None if begin is None else round((self.paths.shape[1] - 1 - begin) * FRAME_PERIOD, 1)
+        """Time from the frame at which the outlines begin to touch to the last frame, seconds.
+
+        The first of these frames is found as for `Contact.contact_frame`.
+        """
+        num_frames: int = self.paths.shape[1]
+        flat_sizes = np.broadcast_to(self.sizes[:, None, :2], (2, num_frames, 2))
+        boxes = np.concatenate([self.paths[..., :2], flat_sizes, self.paths[..., 2:]], axis=2)
+        begin = contact_begin(signed_gaps(*boxes))
+        if begin is None:
+            return None
+        return round((num_frames - 1 - begin) * FRAME_PERIOD, 1)
 
 
 def counted_text(touching: Sequence[float | None]) -> str:
-    """What seconds before impacts are counted to; `touching` is each accident's (`Accident.touching`)."""
+    """Return what the seconds before impacts are counted to, in words.
+
+    Args:
+        touching: `Accident.touching` of each accident.
+    """
     early = [seconds for seconds in touching if seconds]
     text = "seconds count to the last frame; the impact is at most 0.1 s after it"
     if early:
-        text += f", or before it where outlines touch: {len(early)} of {len(touching)} accidents, up to {max(early):.1f} s"
+        num_early = f"{len(early)} of {len(touching)} accidents"
+        text += f", or before it where outlines touch: {num_early}, up to {max(early):.1f} s"
     return text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Skipped(ShortRepr):
-    """A scenario without what a computation needs.
+    """A scenario that lacks what a computation needs.
 
     Attributes:
-        scenario: token.
-        reason: in words.
+        scenario: Token.
+        reason: Reason in words.
     """
 
     scenario: str
@@ -171,101 +198,109 @@ class Skipped(ShortRepr):
 def accident_of(
     dataset: Dataset, scenario: RowArgument, class_masses: Mapping[str, float] = CLASS_MASSES
 ) -> Accident | None:
-    """The motion of the pair that the meta file names; None if it names no collision.
+    """Return the motion of the pair that the meta file names; None if it names no collision.
 
     Args:
-        dataset: the release.
-        scenario: token or record.
-        class_masses: class → kilograms at its median size.
+        dataset: The release.
+        scenario: Token or record.
+        class_masses: Class → mass at its median size, kilograms.
 
     Raises:
-        TokenError: no such scenario.
-        NotAvailableError: the scenario has no meta file or no labels, the file names one actor twice, or the labels
-            show the two together at fewer than two frames.
+        TokenError: No such scenario.
+        NotAvailableError: The scenario has no meta file or no labels, the file names one actor
+            twice, or the labels show the two actors together in fewer than two frames.
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     token = record["token"]
-    named = colliding_pair(record)
-    if named is None:
+    actor_ids = colliding_pair(record)
+    if actor_ids is None:
         return None
-    first, second = named
+    first_id, second_id = actor_ids
     tracks = scenario_tracks(dataset, token)
     if not len(tracks.index):
         raise NotAvailableError(
             f"{token} has no labels (the test split ships without), which say where actors are"
         )
-    rows = [np.flatnonzero(tracks.actor_id == actor) for actor in (first, second)]
-    common, _ = labelled_together(tracks, token, named)
-    if len(common) < _FEWEST:
+    actor_rows = [np.flatnonzero(tracks.actor_id == actor_id) for actor_id in actor_ids]
+    common_frames, _ = labelled_together(tracks, token, actor_ids)
+    if len(common_frames) < _MIN_COMMON_FRAMES:
         raise NotAvailableError(
-            f"{token}: its labels show the colliding pair {first} and {second} together at {len(common)} frames; a "
-            f"motion needs {_FEWEST}"
+            f"{token}: its labels show the colliding pair {first_id} and {second_id} together at "
+            f"{len(common_frames)} frames; a motion needs {_MIN_COMMON_FRAMES}"
         )
-    frames = np.arange(common[0], common[-1] + 1)
-    sizes = np.array([np.median(tracks.boxes.size[each], axis=0) for each in rows])
+    frames = np.arange(common_frames[0], common_frames[-1] + 1)
+    sizes = np.array([np.median(tracks.boxes.size[rows], axis=0) for rows in actor_rows])
     agents = agents_by_actor(dataset, token)
-    codes = [int(tracks.boxes.category[each[-1]]) for each in rows]
+    codes = [int(tracks.boxes.category[rows[-1]]) for rows in actor_rows]
     return Accident(
         scenario=token,
-        actor_ids=(first, second),
+        actor_ids=(first_id, second_id),
         categories=(CATEGORIES[codes[0]], CATEGORIES[codes[1]]),
-        agents=(agents.get(first), agents.get(second)),
-        first_frame=int(common[0]),
+        agents=(agents.get(first_id), agents.get(second_id)),
+        first_frame=int(common_frames[0]),
         num_frames=record["num_frames"],
-        paths=np.stack([recorded_path(tracks, each, frames) for each in rows]),
+        paths=np.stack([recorded_path(tracks, rows, frames) for rows in actor_rows]),
         sizes=sizes,
         masses=masses_of(codes, sizes, class_masses),
-        interpolated=len(frames) - len(common),
+        interpolated=len(frames) - len(common_frames),
     )
 
 
 def accidents_of(
     dataset: Dataset, scenarios: Iterable[RowArgument] | None = None
 ) -> tuple[list[Accident], list[Skipped]]:
-    """The accidents of scenarios, all by default, and the scenarios of which it cannot be said or which lack labels.
+    """Return the accidents of scenarios, and the scenarios that lack what an accident needs.
 
-    Scenarios whose meta file names no collision are in neither.
+    Scenarios with a meta file that names no collision are in neither list. By default all scenarios
+    are read.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: No such scenario.
     """
-    found = [
-        tried(accident_of, dataset, dataset.scenario[row])
-        for row in rows_of_scenarios(dataset, scenarios)
-    ]
-    return [*those_of(Accident, found)], [*those_of(Skipped, found)]
+    results = []
+    for row in rows_of_scenarios(dataset, scenarios):
+        results.append(tried(accident_of, dataset, dataset.scenario[row]))
+    return [*those_of(Accident, results)], [*those_of(Skipped, results)]
 
 
 def recorded_path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> FloatArray:
-    """(F, 3) x, y, yaw of an actor's rows at frames; yaw turns the shorter way.
+    """Return x, y, yaw of an actor's rows at frames, shape (F, 3); yaw turns the shorter way.
 
-    Straight lines fill gaps; before the first row and after the last one the actor stands there.
+    Straight lines fill gaps. Before the first row and after the last one the actor stands still.
     """
-    index, boxes = tracks.index[rows], tracks.boxes.select(rows)
-    values = [*boxes.center[:, :2].T, np.unwrap(boxes.yaw)]
-    return np.column_stack([np.interp(frames, index, each) for each in values])
+    row_frames = tracks.index[rows]
+    boxes = tracks.boxes.select(rows)
+    columns = [*boxes.center[:, :2].T, np.unwrap(boxes.yaw)]
+    return np.column_stack([np.interp(frames, row_frames, column) for column in columns])
 
 
 def agents_by_actor(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
-    """The vehicles that recorded a scenario in this release, by their CARLA ids; those that meta does not say lack."""
-    names = agents_of(dataset, scenario)
-    ids = (dataset.agent.get(f"{scenario}/{name}")["actor_id"] for name in names)
-    return {actor: name for actor, name in zip(ids, names, strict=True) if actor is not None}
+    """Return CARLA id → agent, for the vehicles that recorded a scenario in this release.
 
-
-_Result = TypeVar("_Result")
-# Scenarios that are looked at together: some tenths of a second.
-_RUN_LENGTH: Final = 64
+    Vehicles without an id in the meta file are missing.
+    """
+    agents: dict[int, AgentName] = {}
+    for name in agents_of(dataset, scenario):
+        actor_id = dataset.agent.get(f"{scenario}/{name}")["actor_id"]
+        if actor_id is not None:
+            agents[actor_id] = name
+    return agents
 
 
 def skipped_rows(skipped: Iterable[Skipped]) -> list[Row]:
-    """The table of what is left out."""
-    return [("scenario", "reason"), *((each.scenario, each.reason) for each in skipped)]
+    """Return the table of the scenarios that are left out, with a header."""
+    rows: list[Row] = [("scenario", "reason")]
+    for skip in skipped:
+        rows.append((skip.scenario, skip.reason))
+    return rows
 
 
 def reasons_text(title: str, skipped: Iterable[Skipped]) -> str:
-    """A line a reason under a title."""
-    return "\n".join([f"{title}:", *(f"  {each.reason}" for each in skipped)])
+    """Return a title, and a line for each reason."""
+    lines = [f"{title}:"]
+    for skip in skipped:
+        lines.append(f"  {skip.reason}")
+    return "\n".join(lines)
 
 
 def each_scenario(
@@ -274,46 +309,50 @@ def each_scenario(
     scenarios: Iterable[RowArgument] | None = None,
     *,
     label: str,
-    at_once: int = _RUN_LENGTH,
-    **how: Unpack[Engine],
+    at_once: int = _SCENARIOS_PER_RUN,
+    **engine: Unpack[Engine],
 ) -> list[_Result | Skipped | None]:
-    """Apply a computation to scenarios, each once, in the order of the release.
+    """Apply a computation to scenarios, once to each, in the order of the release.
 
     Args:
-        work: an importable function of the devkit (or a `functools.partial` of one) of a release and a scenario's
-            record. It returns None for a scenario that it does not concern, and raises NotAvailableError for one that
-            lacks what it needs: then there is a Skipped.
-        dataset: the release.
-        scenarios: tokens or records; None for all. Raises TokenError.
-        label: text of the progress bar.
-        at_once: scenarios of a piece of work; 1 where one takes tenths of a second.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        work: An importable function of the devkit (or a `functools.partial` of one) of a release
+            and a scenario's record. It returns None for a scenario that it does not concern, and
+            raises NotAvailableError for one that lacks what it needs: the result is then a Skipped.
+        dataset: The release.
+        scenarios: Tokens or records; None for all. Raises TokenError.
+        label: Text of the progress bar.
+        at_once: Scenarios of a piece of work; 1 where one scenario takes tenths of a second.
+        **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
     """
     rows = sorted(set(rows_of_scenarios(dataset, scenarios)))
-    runs = [rows[first : first + at_once] for first in range(0, len(rows), at_once)]
-    sizes, places = [len(run) for run in runs], Places(reads=dataset.places)
-    parts = run_unordered(
-        partial(_run, work, dataset), runs, sizes=sizes, places=places, label=label, **how
-    )
-    return [each for part in in_order(parts) for each in part]
+    runs = [rows[start : start + at_once] for start in range(0, len(rows), at_once)]
+    sizes = [len(run) for run in runs]
+    places = Places(reads=dataset.places)
+    run_work = partial(_run, work, dataset)
+    parts = run_unordered(run_work, runs, sizes=sizes, places=places, label=label, **engine)
+    return [result for part in in_order(parts) for result in part]
 
 
 def _run(
     work: Callable[[Dataset, Any], _Result | None], dataset: Dataset, rows: Sequence[int]
 ) -> list[_Result | Skipped | None]:
+    """Return the result of a computation for each row of the scenario table."""
     return [tried(work, dataset, dataset.scenario[row]) for row in rows]
 
 
 def tried(
     work: Callable[[Dataset, Any], _Result | None], dataset: Dataset, scenario: ScenarioRecord
 ) -> _Result | Skipped | None:
-    """What a computation, as `each_scenario` takes it, finds in one scenario, or why it finds nothing."""
+    """Return the result of a computation for one scenario, or why it has none.
+
+    `each_scenario` describes the computation.
+    """
     try:
         return work(dataset, scenario)
     except NotAvailableError as error:
         return Skipped(scenario=scenario["token"], reason=str(error))
 
 
-def those_of(kind: type[_Result], found: Iterable[object]) -> tuple[_Result, ...]:
-    """Of what `each_scenario` found, what is of a kind: results, or Skipped."""
-    return tuple(each for each in found if isinstance(each, kind))
+def those_of(kind: type[_Result], results: Iterable[object]) -> tuple[_Result, ...]:
+    """Return the results of `each_scenario` that are of a kind: a result class, or Skipped."""
+    return tuple(result for result in results if isinstance(result, kind))

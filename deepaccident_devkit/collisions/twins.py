@@ -1,4 +1,4 @@
-"""Twins: an accident scenario and the normal one of the same name and subtype, and those that a split tears apart."""
+"""Twins: an accident scenario and the normal one of its name and subtype; splits that part them."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class TornTwins:
     """Two scenarios of one name and subtype that belong to different splits.
 
     Attributes:
-        scenarios: their tokens.
-        splits: the split of each.
+        scenarios: Tokens of the two scenarios.
+        splits: Splits of the two scenarios.
     """
 
     scenarios: tuple[str, str]
@@ -31,14 +31,14 @@ class TornTwins:
 
 
 def twin_of(dataset: Dataset, scenario: RowArgument) -> ScenarioRecord | None:
-    """The scenario of the same name and subtype with the other ending; None if this release has none.
+    """Return the scenario of the same name and subtype with the other ending, or None.
 
     Args:
-        dataset: the release.
-        scenario: token or record.
+        dataset: The release.
+        scenario: Token or record.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: No such scenario.
     """
     record = dataset.get("scenario", scenario)
     family, _, ending = record["scenario_type"].rpartition("_")
@@ -51,19 +51,22 @@ def twin_of(dataset: Dataset, scenario: RowArgument) -> ScenarioRecord | None:
 
 
 def torn_twins(split_of: Mapping[str, str | None]) -> tuple[TornTwins, ...]:
-    """The twins of which each is in another split; what is learnt from one is then known of the other.
+    """Return the twins with their two scenarios in different splits.
+
+    A model that learns from one of the two scenarios has then learnt about the other.
 
     Args:
-        split_of: scenario token → its split; scenarios without one do not count.
+        split_of: Scenario token → its split; scenarios without a split do not count.
     """
     twins: dict[tuple[str, str], list[str]] = defaultdict(list)
     for token, split in split_of.items():
         scenario_type, _, name = token.partition("/")
         if split is not None:
             twins[scenario_type.rpartition("_")[0], name].append(token)
-    return tuple(
-        TornTwins(scenarios=pair, splits=(str(split_of[pair[0]]), str(split_of[pair[1]])))
-        for tokens in twins.values()
-        for pair in combinations(tokens, 2)
-        if split_of[pair[0]] != split_of[pair[1]]
-    )
+    torn = []
+    for tokens in twins.values():
+        for pair in combinations(tokens, 2):
+            splits = (split_of[pair[0]], split_of[pair[1]])
+            if splits[0] != splits[1]:
+                torn.append(TornTwins(scenarios=pair, splits=(str(splits[0]), str(splits[1]))))
+    return tuple(torn)

@@ -1,4 +1,4 @@
-"""Pairs of road users: how near they come to each other, how fast, and how soon they would touch."""
+"""Pairs of road users: how near and how fast they come, and how soon they would touch."""
 
 from deepaccident_devkit.collisions.recorded import CLASS_MASSES, masses_of
 from deepaccident_devkit.geometry import time_to_collision

@@ -1,4 +1,4 @@
-"""The columns of a scenario's interactions, from the motion of all actors at all frames in dense arrays."""
+"""Columns of a scenario's interactions, from dense arrays of the motion of all actors."""
 
 from __future__ import annotations
 
@@ -34,19 +34,26 @@ from deepaccident_devkit.tables import displacement_velocities
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks
 
+# Pairs times frames that are computed together.
+_PAIR_FRAMES_AT_ONCE = 1 << 17
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ActorMotion(FrozenArrays):
-    """A actors at F frames, seen from above; world, right-handed, SI units. NaN where nobody annotated an actor.
+    """Motion of A actors at F frames, seen from above; world, right-handed, SI units.
+
+    NaN where an actor is not annotated.
 
     Attributes:
-        ids: (A,) CARLA ids, ascending.
-        masses: (A,) kilograms, assumed.
-        boxes: (A, F, 5) x, y, length, width, yaw.
-        velocity: (A, F, 2) over the ground; NaN where neither a label nor a displacement says it.
-        speed: (A, F) along the heading.
-        acceleration: (A, F) along the heading: by the speeds one frame before and after; 0 without such.
-        moves: (A, F) whether an actor is there and faster than `standing_speed`.
+        ids: CARLA ids, shape (A,), ascending.
+        masses: Assumed masses, shape (A,), kilograms.
+        boxes: x, y, length, width, yaw, shape (A, F, 5).
+        velocity: Velocities over the ground, shape (A, F, 2); NaN where neither a label nor a
+            displacement gives one.
+        speed: Speeds along the heading, shape (A, F).
+        acceleration: Accelerations along the heading, shape (A, F), from the speeds one frame
+            before and after; 0 without such speeds.
+        moves: Whether an actor is annotated and faster than `standing_speed`, shape (A, F).
     """
 
     ids: IntArray
@@ -59,30 +66,30 @@ class ActorMotion(FrozenArrays):
 
     @property
     def present(self) -> BoolArray:
-        """(A, F) whether somebody annotated the actor."""
+        """Whether each actor is annotated, shape (A, F)."""
         return np.asarray(~np.isnan(self.boxes[..., 0]))
 
 
 def actor_motion(tracks: ScenarioTracks, num_frames: int, config: InteractionConfig) -> ActorMotion:
-    """The actors of a scenario at its frames 1 to `num_frames`."""
+    """Return the motion of the actors of a scenario at its frames 1 to `num_frames`."""
     boxes = tracks.boxes
-    ids, last = np.unique(tracks.actor_id[::-1], return_index=True)
-    actor = np.searchsorted(ids, tracks.actor_id)
-    place = (actor, tracks.index - 1)
-    dense = np.full((len(ids), num_frames, 5), np.nan)
-    dense[place] = np.column_stack([boxes.center[:, :2], boxes.size[:, :2], boxes.yaw])
+    ids, last_positions = np.unique(tracks.actor_id[::-1], return_index=True)
+    last_rows = len(boxes) - 1 - last_positions
+    actors = np.searchsorted(ids, tracks.actor_id)
+    cells = (actors, tracks.index - 1)
+    dense_boxes = np.full((len(ids), num_frames, 5), np.nan)
+    dense_boxes[cells] = np.column_stack([boxes.center[:, :2], boxes.size[:, :2], boxes.yaw])
     velocity = np.full((len(ids), num_frames, 2), np.nan)
-    velocity[place] = _velocities(tracks)
-    speed = (velocity * normals(dense[..., 4])).sum(axis=-1)
-    rows = len(boxes) - 1 - last
+    velocity[cells] = _velocities(tracks)
+    speed = (velocity * normals(dense_boxes[..., 4])).sum(axis=-1)
     with np.errstate(invalid="ignore"):
-        moves: BoolArray = np.hypot(velocity[..., 0], velocity[..., 1]) > config.standing_speed
+        ground_speed = np.hypot(velocity[..., 0], velocity[..., 1])
+        moves: BoolArray = ground_speed > config.standing_speed
+    sizes = _median_sizes(boxes.size, actors, len(ids))
     return ActorMotion(
         ids=ids,
-        masses=masses_of(
-            boxes.category[rows], _median_sizes(boxes.size, actor, len(ids)), config.class_masses
-        ),
-        boxes=dense,
+        masses=masses_of(boxes.category[last_rows], sizes, config.class_masses),
+        boxes=dense_boxes,
         velocity=velocity,
         speed=speed,
         acceleration=_accelerations(speed),
@@ -91,45 +98,51 @@ def actor_motion(tracks: ScenarioTracks, num_frames: int, config: InteractionCon
 
 
 def _velocities(tracks: ScenarioTracks) -> FloatArray:
-    """(M, 2) the tracks' velocities, displacements where these are unknown."""
+    """Return the tracks' velocities, shape (M, 2), from displacements where they are unknown."""
     velocity = tracks.boxes.velocity[:, :2]
     unknown: BoolArray = np.isnan(velocity.sum(axis=1))
     if not unknown.any():
         return velocity
-    together = np.zeros(len(velocity), dtype=np.int64)
-    moved = displacement_velocities(tracks.boxes.center, together, tracks.actor_id, tracks.index)
-    return np.where(unknown[:, None], moved[:, :2], velocity)
-
-
-def _median_sizes(sizes: FloatArray, actor: IntArray, count: int) -> FloatArray:
-    """(A, 3) medians: a pedestrian's box changes its size with the steps."""
-    return np.array([np.median(sizes[actor == each], axis=0) for each in range(count)]).reshape(
-        -1, 3
+    one_scenario = np.zeros(len(velocity), dtype=np.int64)
+    displacements = displacement_velocities(
+        tracks.boxes.center, one_scenario, tracks.actor_id, tracks.index
     )
+    return np.where(unknown[:, None], displacements[:, :2], velocity)
+
+
+def _median_sizes(sizes: FloatArray, actors: IntArray, count: int) -> FloatArray:
+    """Return the median size of each actor, shape (A, 3).
+
+    The box of a pedestrian changes its size with the steps.
+    """
+    medians = [np.median(sizes[actors == actor], axis=0) for actor in range(count)]
+    return np.array(medians).reshape(-1, 3)
 
 
 def _accelerations(speed: FloatArray) -> FloatArray:
-    """(A, F) mean change of the speed to and from each frame, of what is known of both; 0 where nothing is."""
+    """Return the mean change of the speed to and from each frame, shape (A, F).
+
+    The mean is over the known changes, and 0 without one.
+    """
     edge = np.full((len(speed), 1), np.nan)
     change = np.concatenate([edge, np.diff(speed, axis=1) / FRAME_PERIOD, edge], axis=1)
-    around = np.stack([change[:, :-1], change[:, 1:]])
-    known = ~np.isnan(around)
-    return np.asarray(np.where(known, around, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1))
-
-
-# Pairs times frames that are looked at together.
-_AT_ONCE = 1 << 17
+    neighbours = np.stack([change[:, :-1], change[:, 1:]])
+    known = ~np.isnan(neighbours)
+    sums = np.where(known, neighbours, 0.0).sum(axis=0)
+    return np.asarray(sums / np.maximum(known.sum(axis=0), 1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Measured(FrozenArrays):
-    """L pairs that come under a threshold, at all their F frames; NaN where one is not there or both stand.
+    """L pairs that come under a threshold, at all their F frames.
+
+    NaN where an actor is not annotated, or both stand.
 
     Attributes:
-        pairs: (L, 2) positions of the actors, ascending.
-        counts: (L, F) where both are annotated and at least one moves.
-        rows: (L, F) where they are under a threshold.
-        values: name → (L, F) or (L, F, 2), as in `InteractionRecord`.
+        pairs: Positions of the actors, shape (L, 2), ascending.
+        counts: Whether both actors are annotated and at least one moves, shape (L, F).
+        rows: Whether the pair is under a threshold, shape (L, F).
+        values: Measure → its values, shape (L, F) or (L, F, 2), as in `InteractionRecord`.
     """
 
     pairs: IntArray
@@ -139,164 +152,213 @@ class Measured(FrozenArrays):
 
 
 def measured_pairs(motion: ActorMotion, config: InteractionConfig) -> Measured:
-    """The pairs that come under a threshold, with their measures at all frames.
+    """Return the pairs that come under a threshold, with their measures at all frames.
 
-    Pairs that lie in each other at all frames and move together, such as a rider and what is ridden, are one thing.
+    Pairs that lie in each other at all frames and move together, such as a rider and a bicycle, are
+    one object and are left out.
     """
-    pairs = _listed(motion, config)
+    pairs = _pairs_under_threshold(motion, config)
     first, second = pairs.T
     counts = _counts(motion, pairs)
-    place = np.nonzero(counts)
-    sides = [(actors[place[0]], place[1]) for actors in (first, second)]
-    columns, rows = _values(motion, sides, config)
+    pair_rows, frames = np.nonzero(counts)
+    sides = [(actors[pair_rows], frames) for actors in (first, second)]
+    columns, under = _values(motion, sides, config)
     shape = counts.shape
     values = {}
     for name, column in columns.items():
-        values[name] = np.full((*shape, *column.shape[1:]), np.nan)
-        values[name][place] = column
-    under = np.zeros(shape, dtype=bool)
-    under[place] = rows
-    kept = ~_moves_as_one(motion, pairs, values["gap"], config)
+        dense = np.full((*shape, *column.shape[1:]), np.nan)
+        dense[pair_rows, frames] = column
+        values[name] = dense
+    rows = np.zeros(shape, dtype=bool)
+    rows[pair_rows, frames] = under
+    separate = ~_moves_as_one(motion, pairs, values["gap"], config)
     return Measured(
-        pairs=pairs[kept],
-        counts=counts[kept],
-        rows=under[kept],
-        values={name: each[kept] for name, each in values.items()},
+        pairs=pairs[separate],
+        counts=counts[separate],
+        rows=rows[separate],
+        values={name: dense[separate] for name, dense in values.items()},
     )
 
 
 def pair_summaries(
     motion: ActorMotion, measured: Measured, config: InteractionConfig
 ) -> dict[str, AnyArray]:
-    """The columns of `InteractionPairRecord` by name: least and most over frames; frames as positions, −1 for none."""
+    """Return the columns of `InteractionPairRecord` by name: minima and maxima over frames.
+
+    Frames are positions from 0, or −1 for none.
+    """
     values = measured.values
-    ttc, gap = _filled(values["ttc"], np.inf), _filled(values["gap"], np.inf)
-    least_ttc = _least(ttc)
-    pieces = {actor: pieces_of(motion.boxes[actor]) for actor in np.unique(measured.pairs).tolist()}
-    pet = [recorded_pet(pieces[first], pieces[second]) for first, second in measured.pairs.tolist()]
+    ttc = _filled(values["ttc"], np.inf)
+    gap = _filled(values["gap"], np.inf)
+    min_ttc = _minima(ttc)
+    min_ttc_frame = np.where(np.isfinite(min_ttc), _first_minima(ttc), -1)
+    tet = [time_exposed(ttc, tau, FRAME_PERIOD) for tau in config.taus]
+    tit = [time_integrated(ttc, tau, FRAME_PERIOD) for tau in config.taus]
     moves: BoolArray = motion.moves.sum(axis=1) > 0
     return {
         "num_frames": measured.counts.sum(axis=1),
         "moving": moves[measured.pairs].all(axis=1),
-        "min_ttc": least_ttc,
-        "min_ttc_frame": np.where(np.isfinite(least_ttc), _first_least(ttc), -1),
-        "min_gap": _least(gap),
-        "min_gap_frame": _first_least(gap),
-        "max_drac": -_least(-_filled(values["drac"], 0.0)),
-        "min_mttc": _least(_filled(values["mttc"], np.inf)),
-        "pet": np.array(pet, dtype=np.float64),
-        **{
-            name: np.stack([measure(ttc, tau, FRAME_PERIOD) for tau in config.taus], axis=-1)
-            for name, measure in (("tet", time_exposed), ("tit", time_integrated))
-        },
+        "min_ttc": min_ttc,
+        "min_ttc_frame": min_ttc_frame,
+        "min_gap": _minima(gap),
+        "min_gap_frame": _first_minima(gap),
+        "max_drac": -_minima(-_filled(values["drac"], 0.0)),
+        "min_mttc": _minima(_filled(values["mttc"], np.inf)),
+        "pet": _encroachment_times(motion, measured.pairs),
+        "tet": np.stack(tet, axis=-1),
+        "tit": np.stack(tit, axis=-1),
     }
 
 
-def _listed(motion: ActorMotion, config: InteractionConfig) -> IntArray:
-    """(L, 2) the pairs that are under a threshold at some frame; circles around the boxes leave most others out."""
-    actors, frames = motion.moves.shape
-    candidates = np.column_stack(np.triu_indices(actors, 1))
-    kept = [np.zeros((0, 2), dtype=np.int64)]
-    for start in range(0, len(candidates), max(1, _AT_ONCE // max(1, frames))):
-        pairs = candidates[start : start + max(1, _AT_ONCE // max(1, frames))]
-        pair, frame = np.nonzero(_may_be_under(motion, pairs, config))
-        sides = [(pairs[pair, side], frame) for side in (0, 1)]
-        kept.append(pairs[np.unique(pair[_under(motion, sides, config)])])
-    return np.concatenate(kept)
+def _encroachment_times(motion: ActorMotion, pairs: IntArray) -> FloatArray:
+    """Return the post-encroachment time of each pair over the recording, shape (L,), seconds."""
+    pieces = {}
+    for actor in np.unique(pairs).tolist():
+        pieces[actor] = pieces_of(motion.boxes[actor])
+    times = [recorded_pet(pieces[first], pieces[second]) for first, second in pairs.tolist()]
+    return np.array(times, dtype=np.float64)
+
+
+def _pairs_under_threshold(motion: ActorMotion, config: InteractionConfig) -> IntArray:
+    """Return the pairs that are under a threshold at some frame, shape (L, 2).
+
+    Circles around the boxes exclude most of the other pairs.
+    """
+    num_actors, num_frames = motion.moves.shape
+    candidates = np.column_stack(np.triu_indices(num_actors, 1))
+    parts = [np.zeros((0, 2), dtype=np.int64)]
+    pairs_at_once = max(1, _PAIR_FRAMES_AT_ONCE // max(1, num_frames))
+    for start in range(0, len(candidates), pairs_at_once):
+        pairs = candidates[start : start + pairs_at_once]
+        pair_rows, frames = np.nonzero(_may_be_under(motion, pairs, config))
+        sides = [(pairs[pair_rows, side], frames) for side in (0, 1)]
+        under = _under(motion, sides, config)
+        parts.append(pairs[np.unique(pair_rows[under])])
+    return np.concatenate(parts)
 
 
 def _counts(motion: ActorMotion, pairs: IntArray) -> BoolArray:
-    """(P, F) where both of each pair are there and at least one moves."""
+    """Return where both actors of each pair are annotated and at least one moves, shape (P, F)."""
     first, second = pairs.T
-    present, moves = motion.present, motion.moves
-    return np.asarray(present[first] & present[second] & (moves[first] | moves[second]))
+    both_present = motion.present[first] & motion.present[second]
+    return np.asarray(both_present & (motion.moves[first] | motion.moves[second]))
 
 
 def _may_be_under(motion: ActorMotion, pairs: IntArray, config: InteractionConfig) -> BoolArray:
-    """(P, F) where circles around the boxes are within the radius, and meet soon enough or are near enough."""
+    """Return where pairs may be under a threshold by circles around their boxes, shape (P, F).
+
+    The circles must be within the radius, and meet soon enough or have a gap that is small enough.
+    """
     first, second = pairs.T
     counts = _counts(motion, pairs)
-    apart = motion.boxes[second, :, :2] - motion.boxes[first, :, :2]
-    speed = motion.velocity[second] - motion.velocity[first]
+    offset = motion.boxes[second, :, :2] - motion.boxes[first, :, :2]
+    velocity = motion.velocity[second] - motion.velocity[first]
     radius = np.hypot(motion.boxes[..., 2], motion.boxes[..., 3]) / 2
-    reach = radius[first] + radius[second]
+    sum_of_radii = radius[first] + radius[second]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        distance = np.hypot(apart[..., 0], apart[..., 1])
-        when = np.clip(-(apart * speed).sum(axis=-1) / (speed**2).sum(axis=-1), 0, config.max_ttc)
-        nearest = apart + np.nan_to_num(when)[..., None] * np.nan_to_num(speed)
-        soon = np.hypot(nearest[..., 0], nearest[..., 1]) <= reach
-        near: BoolArray = soon | (distance - reach <= config.max_gap)
-        return counts & (distance <= config.radius) & near
+        distance = np.hypot(offset[..., 0], offset[..., 1])
+        time = -(offset * velocity).sum(axis=-1) / (velocity**2).sum(axis=-1)
+        time = np.clip(time, 0, config.max_ttc)
+        nearest = offset + np.nan_to_num(time)[..., None] * np.nan_to_num(velocity)
+        meets = np.hypot(nearest[..., 0], nearest[..., 1]) <= sum_of_radii
+        under: BoolArray = meets | (distance - sum_of_radii <= config.max_gap)
+        return counts & (distance <= config.radius) & under
+
+
+def _of_sides(array: FloatArray, sides: list[tuple[IntArray, IntArray]]) -> list[FloatArray]:
+    """Return the entries of a dense array at the (actors, frames) of each side of pairs."""
+    return [array[side] for side in sides]
 
 
 def _under(
     motion: ActorMotion, sides: list[tuple[IntArray, IntArray]], config: InteractionConfig
 ) -> BoolArray:
-    """Whether pairs, given by (actors, frames) of each side, are under a threshold."""
-    boxes, velocity = ([array[side] for side in sides] for array in (motion.boxes, motion.velocity))
-    return _within(boxes, gaps_of_pairs(*boxes), time_to_collision(*boxes, *velocity), config)
+    """Return whether pairs are under a threshold.
+
+    Args:
+        motion: Motion of all actors.
+        sides: Actors and frames of the first and of the second actor of each pair.
+        config: Thresholds.
+    """
+    boxes = _of_sides(motion.boxes, sides)
+    velocity = _of_sides(motion.velocity, sides)
+    gap = gaps_of_pairs(*boxes)
+    ttc = time_to_collision(*boxes, *velocity)
+    return _within_thresholds(boxes, gap, ttc, config)
 
 
-def _within(
+def _within_thresholds(
     boxes: list[FloatArray], gap: FloatArray, ttc: FloatArray, config: InteractionConfig
 ) -> BoolArray:
-    apart = boxes[1][:, :2] - boxes[0][:, :2]
-    within: BoolArray = np.hypot(apart[:, 0], apart[:, 1]) <= config.radius
-    return within & ((ttc <= config.max_ttc) | (gap <= config.max_gap))
+    """Return whether pairs with known gaps and times to collision are under a threshold."""
+    offset = boxes[1][:, :2] - boxes[0][:, :2]
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    within_radius: BoolArray = distance <= config.radius
+    return within_radius & ((ttc <= config.max_ttc) | (gap <= config.max_gap))
 
 
 def _values(
     motion: ActorMotion, sides: list[tuple[IntArray, IntArray]], config: InteractionConfig
 ) -> tuple[dict[str, FloatArray], BoolArray]:
-    """The measures of pairs at frames, given by (actors, frames) of each side; and which are under a threshold."""
-    boxes, velocity = ([array[side] for side in sides] for array in (motion.boxes, motion.velocity))
-    speed, acceleration = (
-        [array[side] for side in sides] for array in (motion.speed, motion.acceleration)
-    )
+    """Return the measures of pairs at frames, and whether they are under a threshold.
+
+    Args:
+        motion: Motion of all actors.
+        sides: Actors and frames of the first and of the second actor of each pair.
+        config: Thresholds and assumptions.
+    """
+    boxes = _of_sides(motion.boxes, sides)
+    velocity = _of_sides(motion.velocity, sides)
+    speed = _of_sides(motion.speed, sides)
+    acceleration = _of_sides(motion.acceleration, sides)
+    masses = [motion.masses[actors] for actors, _ in sides]
     gap = gaps_of_pairs(*boxes)
-    ttc = _until(time_to_collision(*boxes, *velocity), config)
-    one_way = [
-        time_to_collision_1d(*boxes, *velocity),
-        time_to_collision_1d(*boxes[::-1], *velocity[::-1]),
-    ]
+    ttc = _before_horizon(time_to_collision(*boxes, *velocity), config)
+    first_ttc_1d = time_to_collision_1d(*boxes, *velocity)
+    second_ttc_1d = time_to_collision_1d(*boxes[::-1], *velocity[::-1])
     values = {
         "gap": gap,
         "closing_speed": closing_speed_of_boxes(*boxes, *velocity),
         "ttc": ttc,
-        "ttc_1d": _until(np.minimum(*one_way), config),
+        "ttc_1d": _before_horizon(np.minimum(first_ttc_1d, second_ttc_1d), config),
         "drac": drac_of(ttc, relative_speed(*velocity)),
-        "mttc": _until(modified_ttc(*boxes, *speed, *acceleration), config),
-        "delta_v": delta_v(*velocity, *(motion.masses[actors] for actors, _ in sides)),
+        "mttc": _before_horizon(modified_ttc(*boxes, *speed, *acceleration), config),
+        "delta_v": delta_v(*velocity, *masses),
         "impact_angle": impact_heading(*boxes),
     }
-    return values, _within(boxes, gap, ttc, config)
+    return values, _within_thresholds(boxes, gap, ttc, config)
 
 
-def _until(times: FloatArray, config: InteractionConfig) -> FloatArray:
+def _before_horizon(times: FloatArray, config: InteractionConfig) -> FloatArray:
+    """Return times to collision, infinite after the horizon."""
     return np.where(times > config.horizon, np.inf, times)
 
 
 def _moves_as_one(
     motion: ActorMotion, pairs: IntArray, gap: FloatArray, config: InteractionConfig
 ) -> BoolArray:
-    """(L,) whether two touch at all frames that count, and are never faster relative to each other than who stands."""
+    """Return whether two actors touch at all frames that count, and move together, shape (L,).
+
+    They move together if their relative speed never exceeds the speed up to which an actor stands.
+    """
     speed = relative_speed(motion.velocity[pairs[:, 0]], motion.velocity[pairs[:, 1]])
     with np.errstate(invalid="ignore"):
-        alone = (gap > 0) | ((speed > config.standing_speed) & ~np.isnan(gap))
-    return np.asarray(alone.sum(axis=1) == 0)
+        separate = (gap > 0) | ((speed > config.standing_speed) & ~np.isnan(gap))
+    return np.asarray(separate.sum(axis=1) == 0)
 
 
 def _filled(values: FloatArray, filler: float) -> FloatArray:
+    """Return values with a filler instead of NaN."""
     return np.where(np.isnan(values), filler, values)
 
 
-def _least(values: FloatArray) -> FloatArray:
-    """(L,) least of (L, F), infinite if there is none."""
+def _minima(values: FloatArray) -> FloatArray:
+    """Return the minimum of each row of (L, F), shape (L,), infinite for empty rows."""
     return np.asarray(values.min(axis=1, initial=np.inf))
 
 
-def _first_least(values: FloatArray) -> IntArray:
-    """(L,) positions of the first least of (L, F)."""
-    return (
-        np.asarray(values.argmin(axis=1)) if values.size else np.zeros(len(values), dtype=np.int64)
-    )
+def _first_minima(values: FloatArray) -> IntArray:
+    """Return the position of the first minimum of each row of (L, F), shape (L,)."""
+    if not values.size:
+        return np.zeros(len(values), dtype=np.int64)
+    return np.asarray(values.argmin(axis=1))

@@ -1,8 +1,9 @@
-"""Post-encroachment time: how long after one road user the other comes to where it was.
+"""Post-encroachment time: the time after which one road user reaches an area that another has left.
 
-All is exact for steady motions. What two boxes occupy at the times t of the first and t + d of the second is convex in
-(t, d): strips |g + a·t + b·d| ≤ r, one for each direction of a side, one for each one's window. Eliminating t leaves
-the range of delays d at which they would touch.
+All results are exact for steady motions. The area that two boxes occupy at time t of the first and
+t + d of the second is convex in (t, d): strips |g + a·t + b·d| ≤ r, one for each direction of a
+side and one for each box's window. Eliminating t leaves the range of delays d at which the boxes
+would touch.
 """
 
 from __future__ import annotations
@@ -21,10 +22,15 @@ from deepaccident_devkit.geometry.box_arrays import (
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# Below this two strips do not cross.
-_PARALLEL = 1e-12
-# Metres by which two boxes may be apart where they touch by calculation.
-_TOUCHING = 1e-9
+# Slopes below this are zero: two such strips do not cross.
+_ZERO_SLOPE = 1e-12
+# Two boxes that touch by calculation may be apart by this distance.
+_CONTACT_TOLERANCE_M = 1e-9
+# An actor that moves less than this between all frames of a stretch stands in it, so that it is one
+# piece.
+_STANDING_STEP_M = 1e-3
+# Pairs of pieces that are compared between two checks for pairs that can have a smaller delay.
+_PIECE_PAIRS_AT_ONCE = 1 << 12
 
 
 def post_encroachment_time(
@@ -34,22 +40,26 @@ def post_encroachment_time(
     second_velocity: FloatArray,
     window: float = 10.0,
 ) -> FloatArray:
-    """Least delay with which one of a pair comes to where the other is at another time, both keeping their velocities.
+    """Return the smallest delay after which one box of a pair reaches the area of the other.
+
+    Both boxes keep their velocities.
 
     Args:
-        first: (…, 5) boxes at the window's begin.
-        second: (…, 5) the same.
-        first_velocity: (…, 2) metres a second.
-        second_velocity: (…, 2) metres a second.
-        window: seconds; what is beyond does not count.
+        first: First boxes at the begin of the window, shape (…, 5).
+        second: Second boxes at the begin of the window, shape (…, 5).
+        first_velocity: Velocities of the first boxes, shape (…, 2), m/s.
+        second_velocity: Velocities of the second boxes, shape (…, 2), m/s.
+        window: Time that counts, seconds.
 
     Returns:
-        (…,) seconds: positive if the first was there first, negative if the second was, 0 if they touch, infinite if
-        their ways do not meet within the window; NaN where a velocity is.
+        Delays, shape (…,), seconds: positive if the first box was in the area first, negative if
+        the second was, 0 if they touch, infinite if their paths do not meet within the window; NaN
+        where a velocity is NaN.
     """
-    span = np.broadcast_to([0.0, window], (*np.broadcast_shapes(first.shape, second.shape)[:-1], 2))
-    least, most = delays(first, second, first_velocity, second_velocity, (span, span))
-    times = signed_least(least, most)
+    leading_shape = np.broadcast_shapes(first.shape, second.shape)[:-1]
+    span = np.broadcast_to([0.0, window], (*leading_shape, 2))
+    shortest, longest = delays(first, second, first_velocity, second_velocity, (span, span))
+    times = signed_least(shortest, longest)
     unknown = np.isnan(first_velocity).any(axis=-1) | np.isnan(second_velocity).any(axis=-1)
     return np.where(unknown, np.nan, times)
 
@@ -61,28 +71,39 @@ def delays(
     second_velocity: FloatArray,
     spans: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
-    """The least and most delays (…), seconds, at which two steadily moving boxes touch; ±infinite for none.
+    """Return the smallest and the largest delay at which two steadily moving boxes touch.
 
-    A delay is the second's time less the first's; boxes (…, 5) are at time 0, and `spans` the begins and ends (…,
-    2) of the times that count.
+    A delay is the second's time less the first's.
+
+    Args:
+        first: First boxes at time 0, shape (…, 5).
+        second: Second boxes at time 0, shape (…, 5).
+        first_velocity: Velocities of the first boxes, shape (…, 2), m/s.
+        second_velocity: Velocities of the second boxes, shape (…, 2), m/s.
+        spans: Begin and end of the times that count for each of the two, shape (…, 2), seconds.
+
+    Returns:
+        Smallest and largest delays, each of shape (…), seconds; infinite and −infinite if the boxes
+        never touch.
     """
     normal, gap, reach = side_gaps(first, second)
-    first_way, second_way = along(normal, first_velocity), along(normal, second_velocity)
+    first_speed = along(normal, first_velocity)
+    second_speed = along(normal, second_velocity)
     middles = [span.mean(axis=-1)[..., None] for span in spans]
     halves = [np.diff(span, axis=-1) / 2 for span in spans]
-    one = np.ones_like(middles[0])
-    return _range_of(
+    ones = np.ones_like(middles[0])
+    return _delay_range(
         np.concatenate([gap, -middles[0], -middles[1]], axis=-1),
-        np.concatenate([second_way - first_way, one, one], axis=-1),
-        np.concatenate([second_way, np.zeros_like(one), one], axis=-1),
+        np.concatenate([second_speed - first_speed, ones, ones], axis=-1),
+        np.concatenate([second_speed, np.zeros_like(ones), ones], axis=-1),
         np.concatenate([reach, *halves], axis=-1),
     )
 
 
-def signed_least(least: FloatArray, most: FloatArray) -> FloatArray:
-    """The delay that is nearest to 0 of ranges of delays; infinite where a range is empty."""
-    nearest = np.where(least > 0, least, np.where(most < 0, most, 0.0))
-    return np.where(least <= most, nearest, np.inf)
+def signed_least(shortest: FloatArray, longest: FloatArray) -> FloatArray:
+    """Return the delay nearest to 0 in ranges of delays; infinite where a range is empty."""
+    nearest = np.where(shortest > 0, shortest, np.where(longest < 0, longest, 0.0))
+    return np.where(shortest <= longest, nearest, np.inf)
 
 
 def conflict_area_pet(
@@ -92,123 +113,156 @@ def conflict_area_pet(
     second_velocity: FloatArray,
     window: float = 10.0,
 ) -> FloatArray:
-    """The time between one's leaving the area that both pass over and the other's entering it.
+    """Return the time from one box's exit to the other's entry into the area that both cross.
 
-    Negative where both are in it together, whether they touch or not: `post_encroachment_time` says more.
+    It is negative where both are in the area together, whether they touch or not;
+    `post_encroachment_time` is more precise.
 
     Args:
-        first: (…, 5) boxes at the window's begin.
-        second: (…, 5) the same.
-        first_velocity: (…, 2) metres a second.
-        second_velocity: (…, 2) metres a second.
-        window: seconds; who enters before it or leaves after it counts as doing so at its begin or end.
+        first: First boxes at the begin of the window, shape (…, 5).
+        second: Second boxes at the begin of the window, shape (…, 5).
+        first_velocity: Velocities of the first boxes, shape (…, 2), m/s.
+        second_velocity: Velocities of the second boxes, shape (…, 2), m/s.
+        window: Time that counts, seconds; an entry before it or an exit after it counts as at its
+            begin or end.
 
     Returns:
-        (…,) seconds; NaN where there is no such area, or a velocity is NaN.
+        Times, shape (…,), seconds; NaN where there is no such area, or a velocity is NaN.
     """
-    boxes, velocities = (first, second), (first_velocity, second_velocity)
-    origin = first[..., :2]  # far from the world's, no digits are lost
-    sides = [_swept_sides(box, velocity) for box, velocity in zip(boxes, velocities, strict=True)]
-    strips = [
-        _swept(box, velocity, normal, origin, window)
-        for box, velocity, normal in zip(boxes, velocities, sides, strict=True)
-    ]
-    normal = np.concatenate(sides, axis=-2)
-    middle, half = (np.concatenate([strip[part] for strip in strips], axis=-1) for part in (0, 1))
-    least, most = _extents(normal, middle, half)
-    times = [
-        _times_inside(box, velocity, (normal, least, most), origin, window)
-        for box, velocity in zip(boxes, velocities, strict=True)
-    ]
-    between = np.maximum(times[1][0] - times[0][1], times[0][0] - times[1][1])
-    return np.where((least < most).all(axis=-1), between, np.nan)
+    boxes = (first, second)
+    velocities = (first_velocity, second_velocity)
+    origin = first[..., :2]  # far from the world's origin, no digits are lost
+    normals_of_boxes = []
+    middles = []
+    halves = []
+    for box, velocity in zip(boxes, velocities, strict=True):
+        sides = _swept_sides(box, velocity)
+        middle, half = _swept_extent(box, velocity, sides, origin, window)
+        normals_of_boxes.append(sides)
+        middles.append(middle)
+        halves.append(half)
+    normal = np.concatenate(normals_of_boxes, axis=-2)
+    middle = np.concatenate(middles, axis=-1)
+    half = np.concatenate(halves, axis=-1)
+    lower, upper = _area_extents(normal, middle, half)
+    area = (normal, lower, upper)
+    first_entry, first_exit = _area_times(first, first_velocity, area, origin, window)
+    second_entry, second_exit = _area_times(second, second_velocity, area, origin, window)
+    between = np.maximum(second_entry - first_exit, first_entry - second_exit)
+    return np.where((lower < upper).all(axis=-1), between, np.nan)
 
 
 def _swept_sides(box: FloatArray, velocity: FloatArray) -> FloatArray:
-    """(…, 3, 2) normals of the sides of what a box passes over: its own two, and that of its way."""
+    """Return the normals of the sides of the area that a box sweeps, shape (…, 3, 2).
+
+    Two are the box's own, and one is that of its path.
+    """
     yaw = box[..., 4]
-    still = (velocity == 0).all(axis=-1)
-    way = np.where(still, yaw, np.arctan2(velocity[..., 1], velocity[..., 0]) + np.pi / 2)
-    return normals(np.concatenate([side_yaws(box), way[..., None]], axis=-1))
+    standing = (velocity == 0).all(axis=-1)
+    path_direction = np.arctan2(velocity[..., 1], velocity[..., 0])
+    path_normal = np.where(standing, yaw, path_direction + np.pi / 2)
+    return normals(np.concatenate([side_yaws(box), path_normal[..., None]], axis=-1))
 
 
-def _swept(
+def _swept_extent(
     box: FloatArray, velocity: FloatArray, normal: FloatArray, origin: FloatArray, window: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Middle and half (…, N) of the extent, along directions, of what a box passes over."""
-    begin, way = along(normal, box[..., :2] - origin), along(normal, velocity) * window
-    return begin + way / 2, np.abs(way) / 2 + half_extents(box, normal)
+    """Return the extent of the area that a box sweeps, along directions.
+
+    Returns:
+        Middles and half widths of the extents, each of shape (…, N).
+    """
+    start = along(normal, box[..., :2] - origin)
+    distance = along(normal, velocity) * window
+    return start + distance / 2, np.abs(distance) / 2 + half_extents(box, normal)
 
 
-def _extents(
+def _area_extents(
     normal: FloatArray, middle: FloatArray, half: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The area within N strips (…, N): its least and most (…, N) along the normal (…, N, 2) of each."""
-    across = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
-    along_each, across_each = (
-        np.einsum("...nk,...mk->...mn", normal, other) for other in (normal, across)
-    )
-    return _range_of(-middle[..., None, :], across_each, along_each, half[..., None, :])
+    """Return the extent of the area within N strips along the normal of each strip.
+
+    Args:
+        normal: Normals of the strips, shape (…, N, 2).
+        middle: Middles of the strips along their normals, shape (…, N).
+        half: Half widths of the strips, shape (…, N).
+
+    Returns:
+        Lower and upper ends, each of shape (…, N).
+    """
+    tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+    along_normals = np.einsum("...nk,...mk->...mn", normal, normal)
+    along_tangents = np.einsum("...nk,...mk->...mn", normal, tangent)
+    return _delay_range(-middle[..., None, :], along_tangents, along_normals, half[..., None, :])
 
 
-def _times_inside(
+def _area_times(
     box: FloatArray,
     velocity: FloatArray,
     area: tuple[FloatArray, FloatArray, FloatArray],
     origin: FloatArray,
     window: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """When a moving box first and last touches an area, given by directions and its least and most along them."""
-    normal, least, most = area
-    start, speed, half = (
-        along(normal, box[..., :2] - origin),
-        along(normal, velocity),
-        half_extents(box, normal),
-    )
+    """Return when a moving box first and last touches an area, each of shape (…,), seconds.
+
+    Args:
+        box: Boxes at the begin of the window, shape (…, 5).
+        velocity: Velocities, shape (…, 2), m/s.
+        area: Normals of the area's sides, and its lower and upper ends along them.
+        origin: Origin of the area's coordinates, shape (…, 2).
+        window: Time that counts, seconds.
+    """
+    normal, lower, upper = area
+    start = along(normal, box[..., :2] - origin)
+    speed = along(normal, velocity)
+    half = half_extents(box, normal)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        ends = np.stack([(least - half - start) / speed, (most + half - start) / speed])
-    still = np.abs(speed) < _PARALLEL
-    begin = np.where(still, -np.inf, ends.min(axis=0)).max(axis=-1)
-    end = np.where(still, np.inf, ends.max(axis=0)).min(axis=-1)
+        ends = np.stack([(lower - half - start) / speed, (upper + half - start) / speed])
+    standing = np.abs(speed) < _ZERO_SLOPE
+    begin = np.where(standing, -np.inf, ends.min(axis=0)).max(axis=-1)
+    end = np.where(standing, np.inf, ends.max(axis=0)).min(axis=-1)
     return np.clip(begin, 0, window), np.clip(end, 0, window)
 
 
-def _range_of(
+def _delay_range(
     g: FloatArray, a: FloatArray, b: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The least and most d (…) for which some t lies in all N strips |g + a·t + b·d| ≤ r, given by (…, N) each.
+    """Return the smallest and largest d for which some t lies in all strips |g + a·t + b·d| ≤ r.
 
-    Each strip bounds a·t from below and above; each lower bound must be within each upper one.
+    The N strips are rows of (…, N), the results have the shape (…). Each strip bounds a·t from both
+    sides; each lower bound must be within each upper one.
     """
-    flipped = np.where(a < 0, -1.0, 1.0)
-    g, a, b = np.broadcast_arrays(g * flipped, a * flipped, b * flipped)
-    slope = a[..., None, :] * b[..., :, None] - a[..., :, None] * b[..., None, :]
-    bound = a[..., None, :] * (r - g)[..., :, None] + a[..., :, None] * (r + g)[..., None, :]
+    sign = np.where(a < 0, -1.0, 1.0)
+    g, a, b = np.broadcast_arrays(g * sign, a * sign, b * sign)
+    # Each strip along the rows is paired with each strip along the columns.
+    row_a = a[..., :, None]
+    column_a = a[..., None, :]
+    slope = column_a * b[..., :, None] - row_a * b[..., None, :]
+    upper_bound = column_a * (r - g)[..., :, None]
+    lower_bound = row_a * (r + g)[..., None, :]
+    bound = upper_bound + lower_bound
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        at = bound / slope
-    parallel = np.abs(slope) < _PARALLEL
-    most = np.where(~parallel & (slope > 0), at, np.inf).min(axis=(-2, -1))
-    least = np.where(~parallel & (slope < 0), at, -np.inf).max(axis=(-2, -1))
-    empty = (parallel & (bound < -_TOUCHING)).any(axis=(-2, -1)) | ~(least <= most + _TOUCHING)
-    least, most = np.minimum(least, most), np.maximum(least, most)  # a touch, to a rounding
-    return np.where(empty, np.inf, least), np.where(empty, -np.inf, most)
-
-
-# Metres; an actor that moves less between all frames of a stretch stands in it, which is one piece then.
-_STILL = 1e-3
-# Pairs of pieces that are compared before it is looked which can still be nearer.
-_ROUND = 1 << 12
+        delay = bound / slope
+    parallel = np.abs(slope) < _ZERO_SLOPE
+    longest = np.where(~parallel & (slope > 0), delay, np.inf).min(axis=(-2, -1))
+    shortest = np.where(~parallel & (slope < 0), delay, -np.inf).max(axis=(-2, -1))
+    contradictory = (parallel & (bound < -_CONTACT_TOLERANCE_M)).any(axis=(-2, -1))
+    empty = contradictory | ~(shortest <= longest + _CONTACT_TOLERANCE_M)
+    # A touch may end before it begins, by a rounding.
+    shortest, longest = np.minimum(shortest, longest), np.maximum(shortest, longest)
+    return np.where(empty, np.inf, shortest), np.where(empty, -np.inf, longest)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pieces(FrozenArrays):
-    """An actor's way in N straight pieces.
+    """Path of an actor in N straight pieces.
 
     Attributes:
-        boxes: (N, 5) in the middle of each, as they are turned there.
-        velocity: (N, 2) metres a second.
-        spans: (N, 2) begin and end, seconds from the first frame.
-        radius: (N,) metres around the middle within which the box is during the piece.
+        boxes: Boxes in the middle of each piece, with their yaw at that moment, shape (N, 5).
+        velocity: Velocities, shape (N, 2), m/s.
+        spans: Begin and end, shape (N, 2), seconds from the first frame.
+        radius: Radius around the middle within which the box is during the piece, shape (N,),
+            metres.
     """
 
     boxes: FloatArray
@@ -218,9 +272,12 @@ class Pieces(FrozenArrays):
 
 
 def pieces_of(boxes: FloatArray) -> Pieces:
-    """The pieces of a track (F, 5), one row a frame, NaN where it has none; straight over frames that lack it.
+    """Return the pieces of a track, straight over frames without a box.
 
     A track of one frame is one piece without length.
+
+    Args:
+        boxes: Boxes at each frame, shape (F, 5), NaN where the track has none.
     """
     frames = np.flatnonzero(~np.isnan(boxes[:, 0]))
     track = boxes[frames]
@@ -228,79 +285,94 @@ def pieces_of(boxes: FloatArray) -> Pieces:
     if len(frames) == 1:
         begin = end = np.zeros(1, dtype=np.int64)
     else:
-        begin = np.flatnonzero(_parts(track))
+        begin = np.flatnonzero(_piece_begins(track))
         end = np.append(begin[1:], len(frames) - 1)
     spans = np.column_stack([times[begin], times[end]])
-    seconds = np.maximum(spans[:, 1] - spans[:, 0], FRAME_PERIOD)[:, None]
-    way = track[end, :2] - track[begin, :2]
+    duration = np.maximum(spans[:, 1] - spans[:, 0], FRAME_PERIOD)[:, None]
+    offset = track[end, :2] - track[begin, :2]
     turn = np.mod(track[end, 4] - track[begin, 4] + np.pi, 2 * np.pi) - np.pi
-    middle = track[begin] + np.column_stack([way / 2, np.zeros((len(way), 2)), turn / 2])
+    half_step = np.column_stack([offset / 2, np.zeros((len(offset), 2)), turn / 2])
+    middle = track[begin] + half_step
+    diagonal = np.hypot(middle[:, 2], middle[:, 3])
+    distance = np.hypot(offset[:, 0], offset[:, 1])
     return Pieces(
         boxes=middle,
-        velocity=way / seconds,
+        velocity=offset / duration,
         spans=spans,
-        radius=(np.hypot(middle[:, 2], middle[:, 3]) + np.hypot(way[:, 0], way[:, 1])) / 2,
+        radius=(diagonal + distance) / 2,
     )
 
 
 def recorded_pet(first: Pieces, second: Pieces) -> float:
-    """Least delay, as of `post_encroachment_time`, with which one of two recorded actors comes to where the other is.
+    """Return the smallest delay after which one of two recorded actors reaches the other's area.
 
-    Pieces are compared in the order of the least delay that they can have, until no other can have a smaller one.
+    The sign is as in `post_encroachment_time`. Pieces are compared in the order of the smallest
+    delay that they can have, until no other pair can have a smaller one.
     """
-    one, other = np.nonzero(_near(first, second))
-    one, other = _crossing(first, second, one, other)
-    apart = np.maximum(
-        second.spans[other, 0] - first.spans[one, 1], first.spans[one, 0] - second.spans[other, 1]
+    first_rows, second_rows = np.nonzero(_circles_meet(first, second))
+    first_rows, second_rows = _crossing(first, second, first_rows, second_rows)
+    first_spans = first.spans[first_rows]
+    second_spans = second.spans[second_rows]
+    min_delays = np.maximum(
+        second_spans[:, 0] - first_spans[:, 1], first_spans[:, 0] - second_spans[:, 1]
     )
-    order = np.argsort(apart, kind="stable")
+    order = np.argsort(min_delays, kind="stable")
     best = np.inf
-    for start in range(0, len(order), _ROUND):
-        rows = order[start : start + _ROUND]
-        if apart[rows[0]] >= abs(best):
+    for start in range(0, len(order), _PIECE_PAIRS_AT_ONCE):
+        rows = order[start : start + _PIECE_PAIRS_AT_ONCE]
+        if min_delays[rows[0]] >= abs(best):
             break
-        found = _delays(first, second, one[rows], other[rows])
-        least = found[np.abs(found).argmin()]
-        if abs(least) < abs(best):
-            best = float(least)
+        pair_delays = _delays_of_pieces(first, second, first_rows[rows], second_rows[rows])
+        delay = pair_delays[np.abs(pair_delays).argmin()]
+        if abs(delay) < abs(best):
+            best = float(delay)
     return best
 
 
-def _parts(track: FloatArray) -> BoolArray:
-    """(F − 1,) whether a piece begins at each frame but the last: it moves to the next one, or came from the last."""
-    moves = np.abs(np.diff(track, axis=0)).max(axis=1) > _STILL
+def _piece_begins(track: FloatArray) -> BoolArray:
+    """Return whether a piece begins at each frame but the last, shape (F − 1,).
+
+    It does if the actor moves to the next frame, or has moved from the frame before.
+    """
+    moves = np.abs(np.diff(track, axis=0)).max(axis=1) > _STANDING_STEP_M
     return np.asarray(moves | np.append(True, moves[:-1]))
 
 
-def _near(first: Pieces, second: Pieces) -> BoolArray:
-    """(N, M) whether the circles around two pieces meet."""
-    apart = first.boxes[:, None, :2] - second.boxes[None, :, :2]
-    reach = first.radius[:, None] + second.radius
-    return np.asarray((apart**2).sum(axis=-1) <= reach**2)
+def _circles_meet(first: Pieces, second: Pieces) -> BoolArray:
+    """Return whether the circles around two pieces meet, shape (N, M)."""
+    offset = first.boxes[:, None, :2] - second.boxes[None, :, :2]
+    sum_of_radii = first.radius[:, None] + second.radius
+    return np.asarray((offset**2).sum(axis=-1) <= sum_of_radii**2)
 
 
 def _crossing(
-    first: Pieces, second: Pieces, one: IntArray, other: IntArray
+    first: Pieces, second: Pieces, first_rows: IntArray, second_rows: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Those pairs of pieces that no direction of a side parts at all times."""
-    normal, gap, reach = side_gaps(first.boxes[one], second.boxes[other])
-    ways = [
-        np.abs(along(normal, pieces.velocity[rows])) * np.diff(pieces.spans[rows], axis=-1) / 2
-        for pieces, rows in ((first, one), (second, other))
-    ]
-    kept = (np.abs(gap) <= reach + ways[0] + ways[1] + 1e-9).all(axis=-1)
-    return one[kept], other[kept]
+    """Return the rows of the pairs of pieces that no direction of a side parts at all times."""
+    normal, gap, reach = side_gaps(first.boxes[first_rows], second.boxes[second_rows])
+    half_distances = []
+    for pieces, rows in ((first, first_rows), (second, second_rows)):
+        speed = np.abs(along(normal, pieces.velocity[rows]))
+        half_distances.append(speed * np.diff(pieces.spans[rows], axis=-1) / 2)
+    max_gap = reach + half_distances[0] + half_distances[1] + 1e-9
+    crossing = (np.abs(gap) <= max_gap).all(axis=-1)
+    return first_rows[crossing], second_rows[crossing]
 
 
-def _delays(first: Pieces, second: Pieces, one: IntArray, other: IntArray) -> FloatArray:
-    """The least delay of each of some pairs of pieces, signed; infinite where they never touch."""
-    rows, offsets, spans = [], [], []
-    for pieces, chosen in ((first, one), (second, other)):
-        span = pieces.spans[chosen]
+def _delays_of_pieces(
+    first: Pieces, second: Pieces, first_rows: IntArray, second_rows: IntArray
+) -> FloatArray:
+    """Return the delay nearest to 0 of pairs of pieces; infinite where they never touch."""
+    boxes, velocities, middles, spans = [], [], [], []
+    for pieces, rows in ((first, first_rows), (second, second_rows)):
+        span = pieces.spans[rows]
         middle = span.mean(axis=-1)
-        rows.append((pieces.boxes[chosen], pieces.velocity[chosen]))
-        offsets.append(middle)
+        boxes.append(pieces.boxes[rows])
+        velocities.append(pieces.velocity[rows])
+        middles.append(middle)
         spans.append(span - middle[:, None])
-    shift = offsets[1] - offsets[0]
-    least, most = delays(rows[0][0], rows[1][0], rows[0][1], rows[1][1], (spans[0], spans[1]))
-    return signed_least(least + shift, most + shift)
+    shift = middles[1] - middles[0]
+    shortest, longest = delays(
+        boxes[0], boxes[1], velocities[0], velocities[1], (spans[0], spans[1])
+    )
+    return signed_least(shortest + shift, longest + shift)

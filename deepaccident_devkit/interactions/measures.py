@@ -1,8 +1,9 @@
-"""Surrogate measures of pairs at a moment, as functions of arrays: how near, how fast, how soon they would touch.
+"""Surrogate measures of pairs at a moment, as functions of arrays.
 
-A box is a row (x, y, length, width, yaw), a velocity a row (x, y); SI units and radians, in any one right-handed frame
-whose z points up. The leading dimensions are free: pairs, or pairs × frames. Where a velocity is NaN, so is what
-follows from it. The pair is (first, second), and those measures that are not the same for both are the first's.
+A box is a row (x, y, length, width, yaw), a velocity a row (x, y); SI units and radians, in any one
+right-handed frame with z upwards. The leading dimensions are free: pairs, or pairs × frames.
+Results that depend on a velocity are NaN where it is NaN. The pair is (first, second), and measures
+that differ between the two are the first's.
 """
 
 from __future__ import annotations
@@ -20,21 +21,23 @@ from deepaccident_devkit.geometry.box_arrays import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 
-# Metres by which two boxes may be apart where they touch by calculation.
-_TOLERANCE = 1e-9
-# Pairs that are computed together: what they need then fits into the processor's cache.
+# Two boxes that touch by calculation may be apart by this distance.
+_CONTACT_TOLERANCE_M = 1e-9
+# Pairs that are computed together: their arrays then fit into the processor's cache.
 _PAIRS_AT_ONCE = 1 << 9
 
 
 def time_to_collision_1d(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
-    """Seconds until the first's bumper reaches the second, both keeping their velocities, along the first's heading.
+    """Return the time until the first's bumper reaches the second along the first's heading.
 
-    The figure of car-following studies: it knows nothing of crossing paths. See `time_to_collision` for those.
+    Both keep their velocities. This is the measure of car-following studies, which ignores crossing
+    paths; see `time_to_collision` for them.
 
     Returns:
-        (…,) infinite unless the two overlap sideways now and come closer; 0 if they overlap along the heading too.
+        Times, shape (…,), seconds: infinite unless the two overlap sideways now and come closer; 0
+        if they also overlap along the heading.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -46,10 +49,12 @@ def time_to_collision_1d(
 def drac_1d(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
-    """Deceleration rate to avoid a crash, m/s², along the first's heading: c² / 2g; see `time_to_collision_1d`.
+    """Return the deceleration rate to avoid a crash along the first's heading: c² / 2g, m/s².
+
+    See `time_to_collision_1d`.
 
     Returns:
-        (…,) 0 without a conflict, infinite at contact.
+        Rates, shape (…,): 0 without a conflict, infinite at contact.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -61,17 +66,19 @@ def drac_1d(
 def drac(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
-    """Deceleration rate to avoid a crash in the plane, m/s²: the relative speed over twice the time to collision.
+    """Return the deceleration rate to avoid a crash in the plane, m/s².
+
+    This is the relative speed over twice the time to collision.
 
     Returns:
-        (…,) 0 without a conflict, infinite at contact.
+        Rates, shape (…,): 0 without a conflict, infinite at contact.
     """
     times = time_to_collision(first, second, first_velocity, second_velocity)
     return drac_of(times, relative_speed(first_velocity, second_velocity))
 
 
 def drac_of(times: FloatArray, relative_speeds: FloatArray) -> FloatArray:
-    """`drac` by known times to collision (…,) and relative speeds (…,)."""
+    """Return `drac` for known times to collision (…,) and relative speeds (…,)."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         rates = relative_speeds / (2 * times)
     return _known(np.where(times == 0, np.inf, rates), times)
@@ -85,41 +92,48 @@ def modified_ttc_1d(
     first_acceleration: FloatArray,
     second_acceleration: FloatArray,
 ) -> FloatArray:
-    """`time_to_collision_1d` with accelerations (…,) that stay, m/s² along each one's own heading.
+    """Return `time_to_collision_1d` with constant accelerations (…,), m/s² along each heading.
 
-    As the literature has it, also past a standstill: who brakes reverses in the end. `modified_ttc` does not.
+    Like the textbook formula it ignores standstill: a braking actor ends up reversing.
+    `modified_ttc` does not.
 
     Returns:
-        (…,) infinite unless the two overlap sideways now and the gap closes at some time; 0 if it has none.
+        Times, shape (…,), seconds: infinite unless the two overlap sideways now and the gap closes
+        at some time; 0 without a gap.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
     heading = normals(first[..., 4])
-    accelerations = [
-        acceleration[..., None] * normals(boxes[..., 4])
-        for boxes, acceleration in ((first, first_acceleration), (second, second_acceleration))
-    ]
-    ahead = np.sign(_dot(second[..., :2] - first[..., :2], heading))
-    gaining = ahead * _dot(accelerations[0] - accelerations[1], heading)
-    times = np.where(gap <= 0, 0.0, least_root(gaining / 2, closing, -gap))
-    return _known(np.where(beside, np.inf, times), closing + gaining)
+    first_change = first_acceleration[..., None] * heading
+    second_change = second_acceleration[..., None] * normals(second[..., 4])
+    direction = np.sign(_dot(second[..., :2] - first[..., :2], heading))
+    gain = direction * _dot(first_change - second_change, heading)
+    times = np.where(gap <= 0, 0.0, least_root(gain / 2, closing, -gap))
+    return _known(np.where(beside, np.inf, times), closing + gain)
 
 
 def relative_speed(first_velocity: FloatArray, second_velocity: FloatArray) -> FloatArray:
-    """Length (…,) of the difference of two velocities (…, 2)."""
+    """Return the length (…,) of the difference of two velocities (…, 2)."""
     return _length(second_velocity - first_velocity)
 
 
 def closing_speed(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
-    """Speed (…,) with which the centres come closer; negative if they part, NaN if they are one point."""
-    return _closing(second[..., :2] - first[..., :2], second_velocity - first_velocity)
+    """Return the speed (…,) with which the centres approach each other.
+
+    It is negative if they part, NaN if they are one point.
+    """
+    offset = second[..., :2] - first[..., :2]
+    return _closing(offset, second_velocity - first_velocity)
 
 
 def closing_speed_of_boxes(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
-    """Speed (…,) with which the gap between the boxes shrinks; negative if it grows, NaN where they touch."""
+    """Return the speed (…,) with which the gap between the boxes shrinks.
+
+    It is negative if the gap grows, NaN where the boxes touch.
+    """
     return _closing(separations_of_pairs(first, second), second_velocity - first_velocity)
 
 
@@ -129,42 +143,66 @@ def delta_v(
     first_mass: FloatArray,
     second_mass: FloatArray,
 ) -> FloatArray:
-    """How much the velocity of the first and of the second would change if they collided now: (…, 2) m/s.
+    """Return the changes of velocity of both actors if they collided now, shape (…, 2), m/s.
 
-    Plastic and central: they go on together. Masses (…,) in kilograms; `masses_of` assumes some.
+    The collision is plastic and central: they go on together. Masses (…,) are in kilograms;
+    `masses_of` assumes some.
     """
-    shares = np.stack([second_mass, first_mass], axis=-1) / (first_mass + second_mass)[..., None]
-    return np.asarray(shares * relative_speed(first_velocity, second_velocity)[..., None])
+    total_mass = first_mass + second_mass
+    shares = np.stack([second_mass, first_mass], axis=-1) / total_mass[..., None]
+    speed = relative_speed(first_velocity, second_velocity)
+    return np.asarray(shares * speed[..., None])
 
 
 def impact_heading(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The second's heading as the first sees it (…,), in (−π, π]: 0 the same direction, ±π head-on."""
+    """Return the second's heading relative to the first's (…,), in (−π, π].
+
+    0 is the same direction, ±π is head-on.
+    """
     return wrapped(second[..., 4] - first[..., 4])
 
 
 def impact_direction(
     first: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> FloatArray:
-    """The direction (…,) in which the first moves relative to the second, as the first sees it, in (−π, π].
+    """Return the direction in which the first moves relative to the second (…,), in (−π, π].
 
-    0 is straight ahead. NaN where there is no relative motion.
+    It is relative to the first's heading: 0 is straight ahead. NaN where there is no relative
+    motion.
     """
     motion = first_velocity - second_velocity
-    direction = wrapped(np.arctan2(motion[..., 1], motion[..., 0]) - first[..., 4])
+    world_direction = np.arctan2(motion[..., 1], motion[..., 0])
+    direction = wrapped(world_direction - first[..., 4])
     return np.where(_length(motion) > 0, direction, np.nan)
 
 
 def time_exposed(times: FloatArray, threshold: float, step: float) -> FloatArray:
-    """Time exposed TET (…,): seconds of moments (…, T), `step` apart, whose time to collision is within a threshold."""
-    return np.asarray((np.asarray(times) <= threshold).sum(axis=-1) * step)
+    """Return the time exposed TET (…,), seconds.
+
+    It is the duration of the moments with a time to collision within the threshold.
+
+    Args:
+        times: Times to collision at T moments, shape (…, T), seconds.
+        threshold: Largest time to collision that counts, seconds.
+        step: Time between two moments, seconds.
+    """
+    within = np.asarray(times) <= threshold
+    return np.asarray(within.sum(axis=-1) * step)
 
 
 def time_integrated(times: FloatArray, threshold: float, step: float) -> FloatArray:
-    """Time integrated TIT (…,), s²: sum of (threshold − time) · step over moments (…, T) within a threshold."""
-    below = np.asarray(times) <= threshold
-    return np.asarray(
-        np.where(below, threshold - np.where(below, times, 0.0), 0.0).sum(axis=-1) * step
-    )
+    """Return the time integrated TIT (…,), s².
+
+    It is the sum of (threshold − time) · step over the moments within the threshold.
+
+    Args:
+        times: Times to collision at T moments, shape (…, T), seconds.
+        threshold: Largest time to collision that counts, seconds.
+        step: Time between two moments, seconds.
+    """
+    within = np.asarray(times) <= threshold
+    shortfall = np.where(within, threshold - np.where(within, times, 0.0), 0.0)
+    return np.asarray(shortfall.sum(axis=-1) * step)
 
 
 def nearest_approach(
@@ -174,43 +212,58 @@ def nearest_approach(
     second_velocity: FloatArray,
     horizon: float = 20.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """The least gap of pairs that keep their velocities, and when.
+    """Return the smallest gap of pairs that keep their velocities, and its time.
 
-    The gap of convex outlines that move steadily shrinks and then grows. Where the two never touch, it is least at the
-    horizon's begin or end, or where a corner passes the other's outline: these are compared.
+    The gap of convex outlines that move steadily shrinks and then grows. Where the two never touch,
+    it is smallest at the horizon's begin or end, or where a corner passes the other's outline:
+    these moments are compared.
 
     Args:
-        first: (…, 5) boxes.
-        second: (…, 5) boxes.
-        first_velocity: (…, 2) metres a second.
-        second_velocity: (…, 2) metres a second.
-        horizon: seconds to look ahead.
+        first: First boxes, shape (…, 5).
+        second: Second boxes, shape (…, 5).
+        first_velocity: Velocities of the first boxes, shape (…, 2), m/s.
+        second_velocity: Velocities of the second boxes, shape (…, 2), m/s.
+        horizon: Time to look ahead, seconds.
 
     Returns:
-        (…,) metres, 0 for those that touch; (…,) seconds, the first such moment; NaN where a velocity is.
+        Gaps, shape (…,), metres, 0 for pairs that touch; and the first moment with this gap, shape
+        (…,), seconds. NaN where a velocity is NaN.
     """
     first, second = np.broadcast_arrays(first, second)
     motion = np.broadcast_to(second_velocity - first_velocity, (*first.shape[:-1], 2))
-    touch = time_to_collision(first, second, first_velocity, second_velocity)
-    ways = (
-        corner_offsets(second)[..., :, None, :] - corner_offsets(first)[..., None, :, :]
-    ).reshape(*first.shape[:-1], 16, 2) + (second[..., :2] - first[..., :2])[..., None, :]
-    speed = (motion**2).sum(axis=-1)[..., None]
+    contact_times = time_to_collision(first, second, first_velocity, second_velocity)
+    offsets = _corner_to_corner(first, second)
+    squared_speed = (motion**2).sum(axis=-1)[..., None]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        passing = np.where(speed > 0, -along(ways, motion) / speed, 0.0).clip(0, horizon)
-    at_passing = np.hypot(*np.moveaxis(ways + passing[..., None] * motion[..., None, :], -1, 0))
-    moved = np.concatenate([second[..., :2] + horizon * motion, second[..., 2:]], axis=-1)
-    ends = np.stack([gaps_of_pairs(first, second), gaps_of_pairs(first, moved)], axis=-1)
-    times = np.concatenate([np.zeros_like(speed), np.full_like(speed, horizon), passing], axis=-1)
-    gaps = np.concatenate([ends, at_passing], axis=-1)
-    best = _first_least(gaps, times)[..., None]
-    gap, time = (np.take_along_axis(values, best, axis=-1)[..., 0] for values in (gaps, times))
-    touches = touch <= horizon
-    unknown = np.isnan(touch)
+        passing_times = np.where(squared_speed > 0, -along(offsets, motion) / squared_speed, 0.0)
+        passing_times = passing_times.clip(0, horizon)
+    passing_offsets = offsets + passing_times[..., None] * motion[..., None, :]
+    passing_gaps = np.hypot(*np.moveaxis(passing_offsets, -1, 0))
+    moved_centers = second[..., :2] + horizon * motion
+    moved = np.concatenate([moved_centers, second[..., 2:]], axis=-1)
+    end_gaps = np.stack([gaps_of_pairs(first, second), gaps_of_pairs(first, moved)], axis=-1)
+    begins = np.zeros_like(squared_speed)
+    ends = np.full_like(squared_speed, horizon)
+    times = np.concatenate([begins, ends, passing_times], axis=-1)
+    gaps = np.concatenate([end_gaps, passing_gaps], axis=-1)
+    best = _first_smallest(gaps, times)[..., None]
+    gap = np.take_along_axis(gaps, best, axis=-1)[..., 0]
+    time = np.take_along_axis(times, best, axis=-1)[..., 0]
+    touches = contact_times <= horizon
+    unknown = np.isnan(contact_times)
     return (
         np.where(unknown, np.nan, np.where(touches, 0.0, gap)),
-        np.where(unknown, np.nan, np.where(touches, touch, time)),
+        np.where(unknown, np.nan, np.where(touches, contact_times, time)),
     )
+
+
+def _corner_to_corner(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the offsets from each corner of the first to each of the second, shape (…, 16, 2)."""
+    first_corners = corner_offsets(first)[..., None, :, :]
+    second_corners = corner_offsets(second)[..., :, None, :]
+    differences = second_corners - first_corners
+    centers_offset = second[..., :2] - first[..., :2]
+    return differences.reshape(*first.shape[:-1], 16, 2) + centers_offset[..., None, :]
 
 
 def modified_ttc(
@@ -221,40 +274,50 @@ def modified_ttc(
     first_acceleration: FloatArray,
     second_acceleration: FloatArray,
 ) -> FloatArray:
-    """Seconds until pairs touch if each keeps its heading and its acceleration; one that brakes stays where it stops.
+    """Return the time until pairs touch if each keeps its heading and its acceleration, seconds.
 
-    Along each direction of a side the boxes' distance is a parabola, in up to three pieces, since either may stop. The
-    boxes first touch at a root of one of these; all roots are tried.
+    A braking actor stays where it stops. Along each direction of a side the boxes' distance is a
+    parabola, in up to three pieces, since either may stop. The boxes first touch at a root of one
+    of these; all roots are tried.
 
     Args:
-        first: (…, 5) boxes.
-        second: (…, 5) boxes.
-        first_speed: (…,) metres a second along the heading; negative for reversing.
-        second_speed: (…,) the same.
-        first_acceleration: (…,) m/s² along the heading.
-        second_acceleration: (…,) the same.
+        first: First boxes, shape (…, 5).
+        second: Second boxes, shape (…, 5).
+        first_speed: Speeds of the first boxes along the heading, shape (…,), m/s; negative for
+            reversing.
+        second_speed: Speeds of the second boxes along the heading, shape (…,), m/s; negative for
+            reversing.
+        first_acceleration: Accelerations of the first boxes along the heading, shape (…,), m/s².
+        second_acceleration: Accelerations of the second boxes along the heading, shape (…,), m/s².
 
     Returns:
-        (…,) 0 for boxes that touch now, infinite for boxes that never touch; NaN where a speed or acceleration is.
+        Times, shape (…,): 0 for boxes that touch now, infinite for boxes that never touch; NaN
+        where a speed or an acceleration is NaN.
     """
-    given = (first_speed, second_speed, first_acceleration, second_acceleration)
-    shape = np.broadcast_shapes(first.shape[:-1], second.shape[:-1], *map(np.shape, given))
-    motion = np.stack([np.broadcast_to(each, shape).ravel() for each in given], axis=-1)
-    first, second = (
-        np.broadcast_to(boxes, (*shape, 5)).reshape(-1, 5) for boxes in (first, second)
-    )
-    parts = [slice(start, start + _PAIRS_AT_ONCE) for start in range(0, len(first), _PAIRS_AT_ONCE)]
-    times = [_accelerated(first[part], second[part], motion[part]) for part in parts]
-    return np.concatenate([np.zeros(0), *times]).reshape(shape)
+    motions = (first_speed, second_speed, first_acceleration, second_acceleration)
+    motion_shapes = [np.shape(values) for values in motions]
+    shape = np.broadcast_shapes(first.shape[:-1], second.shape[:-1], *motion_shapes)
+    motion = np.stack([np.broadcast_to(values, shape).ravel() for values in motions], axis=-1)
+    first = np.broadcast_to(first, (*shape, 5)).reshape(-1, 5)
+    second = np.broadcast_to(second, (*shape, 5)).reshape(-1, 5)
+    times = [np.zeros(0)]
+    for start in range(0, len(first), _PAIRS_AT_ONCE):
+        part = slice(start, start + _PAIRS_AT_ONCE)
+        times.append(_accelerated_ttc(first[part], second[part], motion[part]))
+    return np.concatenate(times).reshape(shape)
 
 
 def wrapped(angles: FloatArray) -> FloatArray:
-    """Angles in (−π, π]."""
-    return np.asarray(np.pi - np.mod(np.pi - angles, 2 * np.pi))
+    """Return angles wrapped to (−π, π]."""
+    turns = np.mod(np.pi - angles, 2 * np.pi)
+    return np.asarray(np.pi - turns)
 
 
 def least_root(square: FloatArray, linear: FloatArray, constant: FloatArray) -> FloatArray:
-    """The least root above 0 of square·t² + linear·t + constant, whose constant is below 0; infinite without one."""
+    """Return the smallest positive root of square·t² + linear·t + constant; infinite without one.
+
+    The constant is negative.
+    """
     roots = _roots(square, linear, constant)
     return np.asarray(np.where(roots > 0, roots, np.inf).min(axis=0))
 
@@ -262,63 +325,83 @@ def least_root(square: FloatArray, linear: FloatArray, constant: FloatArray) -> 
 def _along_heading(
     first: FloatArray, second: FloatArray, first_velocity: FloatArray, second_velocity: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Along the first's heading: the gap, the speed with which it closes, and whether the two pass side by side."""
-    heading, apart = normals(first[..., 4]), second[..., :2] - first[..., :2]
+    """Return the relation of two boxes along the first's heading.
+
+    Returns:
+        Gap, metres; speed with which it closes, m/s; and whether the two pass side by side. Each of
+        shape (…,).
+    """
+    heading = normals(first[..., 4])
+    offset = second[..., :2] - first[..., :2]
     turn = second[..., 4] - first[..., 4]
-    cosine, sine = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    length, width = second[..., 2], second[..., 3]
-    ahead = _dot(apart, heading)
-    aside = heading[..., 0] * apart[..., 1] - heading[..., 1] * apart[..., 0]
-    gap = np.abs(ahead) - (first[..., 2] + length * cosine + width * sine) / 2
-    closing = np.sign(ahead) * _dot(first_velocity - second_velocity, heading)
-    beside: BoolArray = np.abs(aside) > (first[..., 3] + length * sine + width * cosine) / 2
+    cosine = np.abs(np.cos(turn))
+    sine = np.abs(np.sin(turn))
+    length = second[..., 2]
+    width = second[..., 3]
+    forward = _dot(offset, heading)
+    sideways = heading[..., 0] * offset[..., 1] - heading[..., 1] * offset[..., 0]
+    gap = np.abs(forward) - (first[..., 2] + length * cosine + width * sine) / 2
+    closing = np.sign(forward) * _dot(first_velocity - second_velocity, heading)
+    half_widths = (first[..., 3] + length * sine + width * cosine) / 2
+    beside: BoolArray = np.abs(sideways) > half_widths
     return gap, closing, beside
 
 
-def _closing(way: FloatArray, relative_velocity: FloatArray) -> FloatArray:
-    """Speed with which a way (…, 2) gets shorter; NaN where it has no length."""
+def _closing(offset: FloatArray, relative_velocity: FloatArray) -> FloatArray:
+    """Return the speed with which an offset (…, 2) gets shorter; NaN where it has no length."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return np.asarray(-_dot(way, relative_velocity) / _length(way))
+        return np.asarray(-_dot(offset, relative_velocity) / _length(offset))
 
 
 def _known(values: FloatArray, source: FloatArray) -> FloatArray:
-    """`values`, NaN where `source` is."""
+    """Return `values`, NaN where `source` is NaN."""
     return np.where(np.isnan(source), np.nan, values)
 
 
-def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
-    return np.asarray((one * other).sum(axis=-1))
+def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the dot products (…,) of vectors (…, 2)."""
+    return np.asarray((first * second).sum(axis=-1))
 
 
 def _length(vectors: FloatArray) -> FloatArray:
+    """Return the lengths (…,) of vectors (…, 2)."""
     return np.hypot(vectors[..., 0], vectors[..., 1])
 
 
-def _accelerated(first: FloatArray, second: FloatArray, motion: FloatArray) -> FloatArray:
-    """`modified_ttc` of (P, 5) boxes and (P, 4) motions: both speeds, both accelerations."""
+def _accelerated_ttc(first: FloatArray, second: FloatArray, motion: FloatArray) -> FloatArray:
+    """Return `modified_ttc` of P pairs.
+
+    Args:
+        first: First boxes, shape (P, 5).
+        second: Second boxes, shape (P, 5).
+        motion: Both speeds and both accelerations, shape (P, 4).
+    """
     normal, gap, reach = side_gaps(first, second)
-    speeds, rates = motion[:, :2], motion[:, 2:]
-    stops = _stops(speeds, rates)
-    shares = [  # of the way of each, along a side
-        sign * along(normal, normals(box[:, 4]))[:, :, None]
-        for sign, box in ((-1.0, first), (1.0, second))
-    ]
-    edges = np.concatenate([np.zeros((len(first), 1)), np.sort(stops, axis=1)], axis=1)
-    candidates = [np.zeros((len(first), 1))]
+    speeds = motion[:, :2]
+    rates = motion[:, 2:]
+    stops = _stop_times(speeds, rates)
+    # Shares of each actor's path along the directions of the sides.
+    shares = []
+    for sign, boxes in ((-1.0, first), (1.0, second)):
+        shares.append(sign * along(normal, normals(boxes[:, 4]))[:, :, None])
+    no_time = np.zeros((len(first), 1))
+    piece_begins = np.concatenate([no_time, np.sort(stops, axis=1)], axis=1)
+    candidates = [no_time]
     for piece in range(3):
-        begin = edges[:, piece, None]
-        moves = stops > begin  # a piece begins where one stops
+        begin = piece_begins[:, piece, None]
+        moves = stops > begin  # a piece begins where an actor stops
         travelled = _travelled(begin, speeds, rates, stops)
-        speed_then = np.where(moves, speeds + rates * np.where(np.isfinite(begin), begin, 0.0), 0.0)
+        finite_begin = np.where(np.isfinite(begin), begin, 0.0)
+        piece_speeds = np.where(moves, speeds + rates * finite_begin, 0.0)
         constant = gap + _along_sides(shares, travelled)
-        linear = _along_sides(shares, speed_then)
+        linear = _along_sides(shares, piece_speeds)
         square = _along_sides(shares, np.where(moves, rates, 0.0)) / 2
         offsets = np.concatenate([constant - reach, constant + reach], axis=1)
-        times = begin + np.hstack([*_roots(np.tile(square, 2), np.tile(linear, 2), offsets)])
+        roots = _roots(np.tile(square, 2), np.tile(linear, 2), offsets)
+        times = begin + np.hstack([*roots])
         candidates.append(np.where(times >= 0, times, np.inf))
-    return np.where(
-        np.isnan(motion).any(axis=1), np.nan, _first_touch(candidates, (gap, reach), shares, motion)
-    )
+    contact_times = _first_touch(candidates, (gap, reach), shares, motion)
+    return np.where(np.isnan(motion).any(axis=1), np.nan, contact_times)
 
 
 def _first_touch(
@@ -327,30 +410,47 @@ def _first_touch(
     shares: list[FloatArray],
     motion: FloatArray,
 ) -> FloatArray:
-    """The earliest (P,) of some times at which boxes touch along all four sides; infinite if they do at none."""
+    """Return the earliest candidate time at which boxes touch along all four sides, shape (P,).
+
+    Infinite if they touch at none of the times.
+
+    Args:
+        candidates: Arrays of times, each of shape (P, any number), seconds.
+        sides: Gaps and reaches along the directions of the sides, each of shape (P, 4).
+        shares: Shares of each actor's path along the sides, each of shape (P, 4, 1).
+        motion: Both speeds and both accelerations, shape (P, 4).
+    """
     gap, reach = sides
-    speeds, rates = motion[:, :2], motion[:, 2:]
-    stops = _stops(speeds, rates)
+    speeds = motion[:, :2]
+    rates = motion[:, 2:]
+    stops = _stop_times(speeds, rates)
     times = np.concatenate(candidates, axis=1)
     touch = np.isfinite(times)
-    ways = [
-        _travelled(times, *(each[:, which, None] for each in (speeds, rates, stops)))
-        for which in (0, 1)
-    ]
+    first_path, second_path = (
+        _travelled(times, speeds[:, actor, None], rates[:, actor, None], stops[:, actor, None])
+        for actor in (0, 1)
+    )
     for side in range(4):
-        distance = shares[0][:, side] * ways[0] + shares[1][:, side] * ways[1] + gap[:, side, None]
+        first_distance = shares[0][:, side] * first_path
+        second_distance = shares[1][:, side] * second_path
+        distance = first_distance + second_distance + gap[:, side, None]
         with np.errstate(invalid="ignore"):
-            touch &= np.abs(distance) <= reach[:, side, None] + _TOLERANCE
+            touch &= np.abs(distance) <= reach[:, side, None] + _CONTACT_TOLERANCE_M
     return np.asarray(np.where(touch, times, np.inf).min(axis=1))
 
 
 def _along_sides(shares: list[FloatArray], values: FloatArray) -> FloatArray:
-    """(P, 4) what the values (P, 2) of both come to along each direction of a side."""
-    return shares[0][..., 0] * values[:, None, 0] + shares[1][..., 0] * values[:, None, 1]
+    """Return the sum of both actors' values (P, 2) along each direction of a side, shape (P, 4)."""
+    first_part = shares[0][..., 0] * values[:, None, 0]
+    second_part = shares[1][..., 0] * values[:, None, 1]
+    return first_part + second_part
 
 
-def _stops(speeds: FloatArray, rates: FloatArray) -> FloatArray:
-    """When each comes to a stop, infinite if never; one that stands and is not sped up forward stays."""
+def _stop_times(speeds: FloatArray, rates: FloatArray) -> FloatArray:
+    """Return when each actor stops, infinite if never.
+
+    An actor that stands and does not accelerate forward has stopped at 0.
+    """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         braking = np.where(speeds * rates < 0, -speeds / rates, np.inf)
     return np.where((speeds == 0) & (rates <= 0), 0.0, braking)
@@ -359,24 +459,31 @@ def _stops(speeds: FloatArray, rates: FloatArray) -> FloatArray:
 def _travelled(
     times: FloatArray, speeds: FloatArray, rates: FloatArray, stops: FloatArray
 ) -> FloatArray:
-    """Way along the heading at times, which stays where it stops; of infinite times those of 0."""
-    until = np.minimum(np.where(np.isfinite(times), times, 0.0), stops)
-    return np.asarray(speeds * until + rates * until**2 / 2)
+    """Return the distance along the heading at times, constant after the stop.
+
+    Infinite times have the distance of time 0.
+    """
+    duration = np.minimum(np.where(np.isfinite(times), times, 0.0), stops)
+    return np.asarray(speeds * duration + rates * duration**2 / 2)
 
 
 def _roots(square: FloatArray, linear: FloatArray, constant: FloatArray) -> FloatArray:
-    """Both roots (2, …) of parabolas square·t² + linear·t + constant, infinite where there are none.
+    """Return both roots of the parabolas square·t² + linear·t + constant, shape (2, …).
 
-    In the form that loses no digits where the square is small.
+    Infinite where there are none. The formula loses no digits where the square is small.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        inner = linear**2 - 4 * square * constant
-        half = -(linear + np.copysign(np.sqrt(inner), linear)) / 2
+        discriminant = linear**2 - 4 * square * constant
+        half = -(linear + np.copysign(np.sqrt(discriminant), linear)) / 2
         roots = np.stack(np.broadcast_arrays(constant / half, half / square))
     return np.where(np.isfinite(roots), roots, np.inf)
 
 
-def _first_least(gaps: FloatArray, times: FloatArray) -> AnyArray:
-    """Positions (…) along the last axis of the least gaps, of equal ones (to a rounding) the earliest."""
-    least = gaps.min(axis=-1, keepdims=True)
-    return np.asarray(np.where(gaps <= least + _TOLERANCE * 1e-3, times, np.inf).argmin(axis=-1))
+def _first_smallest(gaps: FloatArray, times: FloatArray) -> AnyArray:
+    """Return the positions (…) of the smallest gaps along the last axis.
+
+    Among gaps that are equal to a rounding, it is the position of the earliest.
+    """
+    smallest = gaps.min(axis=-1, keepdims=True)
+    tied_times = np.where(gaps <= smallest + _CONTACT_TOLERANCE_M * 1e-3, times, np.inf)
+    return np.asarray(tied_times.argmin(axis=-1))

@@ -1,21 +1,24 @@
-"""Motion labels and model outputs: FIERY-style maps of the bird's-eye view, and what is computed from them.
+"""Motion labels and model outputs: FIERY-style maps of the bird's-eye view, and their instances.
 
-The way of a label, from a release to a model, and of a model's outputs to instances:
+These are the steps from a release to the labels for a model, and from a model's outputs to
+instances:
 
-| step | from → to | where |
+| step | from → to | module |
 |---|---|---|
-| which samples, and what they show | tables → `BoxRows`, ego motion | `sample_labels` |
-| who is rasterised, and where | boxes → `Polygons` → `Footprints` | `box_polygons`, `exact.polygon_fill` |
-| ids, centres, flow, maps | footprints → centres here and at the next frame → `MotionLabels` | `drawing`, `labels` |
+| samples and their boxes | tables → `BoxRows`, ego motion | `sample_labels` |
+| rasterised actors | boxes → `Polygons` → `Footprints` | `box_polygons` |
+| ids, centres, flow | footprints → centres, also at the next frame | `drawing` |
+| maps | centres and cells → `MotionLabels` | `drawing`, `labels` |
 | all frames in the present ego frame | `MotionLabels` → the same, warped | `labels`, `warping` |
 | to another code, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
-| a prediction, and the instances of a frame | arrays → `MotionHeads` → cells by centre | `grouping` |
+| a prediction, and instances of a frame | arrays → `MotionHeads` → cells by centre | `grouping` |
 | the same id in all frames | instances → `LinkedInstances` | `instances` |
-| boxes along the paths | linked instances → their redrawn maps | `exact.contours` |
+| boxes along the paths | linked instances → their redrawn maps | `instances` |
 
-A `MotionLabelConfig` says what is rasterised, a `LabelProtocol` how (both in `config`: every quirk of the released
-code is a switch), and a grid's orientation how cells lie (`geometry.bev_grid`). `warping` also warps a model's own maps
-as labels are warped.
+`reference_arithmetic` has the arithmetic of other libraries for these steps. A `MotionLabelConfig`
+decides what is rasterised, a `LabelProtocol` how (both are in `config`: every quirk of the released
+code is an option), and a grid's orientation how cells lie (`geometry.bev_grid`). `warping` also
+warps a model's own maps like labels.
 """
 
 from deepaccident_devkit.motion.augmentation import Augmentation

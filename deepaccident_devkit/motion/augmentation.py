@@ -16,12 +16,12 @@ from deepaccident_devkit.support.arrays import FloatArray, checked_flag, checked
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
-    """A change of the ground plane in training: first turn, then scale, then mirror; right-handed.
+    """A change of the ground plane in training: rotation, then scale, then flip; right-handed.
 
     Attributes:
-        rotation: radians about z, counter-clockwise.
-        scale: factor of all lengths.
-        flip: mirror left and right: y changes its sign.
+        rotation: Angle about z, radians, counter-clockwise.
+        scale: Factor of all lengths.
+        flip: Whether to mirror left and right: y changes its sign.
     """
 
     rotation: float = 0.0
@@ -29,7 +29,7 @@ class Augmentation:
     flip: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
+        """Raise ConfigError unless the values are in range."""
         rotation = checked_setting("augmentation: rotation", self.rotation, "finite radians")
         scale = checked_setting("augmentation: scale", self.scale, "a factor above 0, 1 for none")
         if scale <= 0:
@@ -42,8 +42,12 @@ class Augmentation:
 
     @property
     def matrix(self) -> FloatArray:
-        """(4, 4) A = flip · scale · rotation, right-handed, metres: points of the ego frame to augmented ones."""
-        cosine, sine = math.cos(self.rotation), math.sin(self.rotation)
+        """Matrix A = flip · scale · rotation from the ego frame to the augmented one, shape (4, 4).
+
+        Right-handed, metres.
+        """
+        cosine = math.cos(self.rotation)
+        sine = math.sin(self.rotation)
         turn = np.eye(4)
         turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
         mirror = np.diag([1.0, -1.0 if self.flip else 1.0, 1.0, 1.0])

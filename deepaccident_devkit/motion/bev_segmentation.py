@@ -20,7 +20,7 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 BEV_CLASSES: Final = ("road", "lane_line", "sidewalk", "vehicle", "pedestrian")
-"""The classes of the targets, in their order."""
+"""Classes of the targets, in their order."""
 _TAGS: Final = tuple(
     TAGS[tag] for tag in ("road", "road_line", "sidewalk", "vehicle", "pedestrian")
 )
@@ -31,18 +31,22 @@ COVERAGE: Final[Mapping[str, float]] = {
     "vehicle": 0.5,
     "pedestrian": 0.0,
 }
-"""The share of a cell that a class must cover; 0: any part is enough, for classes that are thinner than a cell."""
+"""Smallest share of a cell that a class must cover.
+
+With 0 any part is enough, for classes that are thinner than a cell.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BevSegmentation(ShortRepr):
-    """The classes that cover each cell around an agent; arrays are read-only.
+    """Classes that cover each cell around an agent; arrays are read-only.
 
     Attributes:
-        grid: the cells and how they lie.
-        masks: (5, H, W) bool, one layer for each of `BEV_CLASSES`. Only the upper surface counts: no road beneath a
-            car, nothing beneath a bridge or a tree.
-        known: (H, W) bool, whether the cell is within the camera's ±60 m; outside all masks are False.
+        grid: Cells and their orientation.
+        masks: Layer for each of `BEV_CLASSES`, shape (5, H, W), bool. Only the upper surface
+            counts: no road beneath a car, nothing beneath a bridge or a tree.
+        known: Whether the cell is within the camera's ±60 m, shape (H, W), bool; outside all masks
+            are False.
     """
 
     grid: BevGrid
@@ -55,8 +59,9 @@ class BevSegmentation(ShortRepr):
         object.__setattr__(self, "known", readonly(self.known))
 
     def mask(self, name: str) -> BoolArray:
-        """(H, W) bool, the layer of a class. Raises ChoiceError."""
-        return np.asarray(self.masks[BEV_CLASSES.index(choice("class", name, BEV_CLASSES))])
+        """Return the layer of a class, shape (H, W), bool. Raises ChoiceError."""
+        index = BEV_CLASSES.index(choice("class", name, BEV_CLASSES))
+        return np.asarray(self.masks[index])
 
 
 def bev_segmentation(
@@ -66,18 +71,18 @@ def bev_segmentation(
     *,
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
-    """The segmentation targets of a sample on a grid of its ego frame.
+    """Return the segmentation targets of a sample on a grid of its ego frame.
 
     Args:
-        dataset: the release.
-        sample: token or record.
-        grid: cells, right-handed metres; None for ±50 m in cells of 0.5 m.
-        augmentation: turns, scales or mirrors the ground as it does labels; None for no change.
+        dataset: The release.
+        sample: Token or record.
+        grid: Cells, right-handed metres; None for ±50 m in cells of 0.5 m.
+        augmentation: Rotation, scale and flip of the ground, as for labels; None for no change.
 
     Raises:
-        TokenError: no such sample.
-        MissingFileError: the BEV camera's file was not downloaded (the test split has none).
-        SensorFileError: the file cannot be read.
+        TokenError: No such sample.
+        MissingFileError: The BEV camera's file was not downloaded (the test split has none).
+        SensorFileError: The file cannot be read.
     """
     return segmentation_of(dataset.load_bev(sample), grid or BevGrid(), augmentation=augmentation)
 
@@ -88,34 +93,38 @@ def segmentation_of(
     *,
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
-    """The targets on a grid, from a BEV camera's array; arguments and errors as in `bev_segmentation`."""
-    index = _pixels_of_cells(grid, augmentation)
-    tags = np.append(image.semantic.reshape(-1), np.uint8(0))[index]
-    needed = [max(1, math.ceil(COVERAGE[name] * index.shape[-1])) for name in BEV_CLASSES]
-    layers = [
-        np.count_nonzero(tags == tag, axis=-1) >= pixels
-        for tag, pixels in zip(_TAGS, needed, strict=True)
-    ]
-    return BevSegmentation(
-        grid=grid, masks=np.stack(layers), known=np.all(index < image.semantic.size, axis=-1)
-    )
+    """Return the targets on a grid from the image of a BEV camera.
+
+    Arguments and errors are as in `bev_segmentation`.
+    """
+    pixels = _pixels_of_cells(grid, augmentation)
+    tags = np.append(image.semantic.reshape(-1), np.uint8(0))[pixels]
+    layers = []
+    for name, tag in zip(BEV_CLASSES, _TAGS, strict=True):
+        min_pixels = max(1, math.ceil(COVERAGE[name] * pixels.shape[-1]))
+        layers.append(np.count_nonzero(tags == tag, axis=-1) >= min_pixels)
+    known = np.all(pixels < image.semantic.size, axis=-1)
+    return BevSegmentation(grid=grid, masks=np.stack(layers), known=known)
 
 
 @functools.lru_cache(maxsize=4)
 def _pixels_of_cells(grid: BevGrid, augmentation: Augmentation | None) -> IntArray:
-    """(H, W, P) flat indices of the pixels at P points spread evenly over each cell; outside the image, its size."""
-    size_x, size_y = grid.x[2], grid.y[2]
-    per_cell = [max(1, round(size / BEV_RESOLUTION)) for size in (size_x, size_y)]
-    within = [(np.arange(count) + 0.5) / count - 0.5 for count in per_cell]
-    spread = np.stack(np.meshgrid(within[0] * size_x, within[1] * size_y), axis=-1).reshape(-1, 2)
+    """Return flat indices of the pixels at P points spread evenly over each cell, shape (H, W, P).
+
+    Outside the image the index is the size of the image.
+    """
+    offsets = []
+    for size in (grid.x[2], grid.y[2]):
+        count = max(1, round(size / BEV_RESOLUTION))
+        offsets.append(((np.arange(count) + 0.5) / count - 0.5) * size)
+    spread = np.stack(np.meshgrid(*offsets), axis=-1).reshape(-1, 2)
     points = grid.centers()[:, :, None] + spread
     if augmentation is not None:
         points = points @ np.linalg.inv(augmentation.matrix)[:2, :2].T
-    # from the middle of the image to a pixel's centre there are whole pixels and a half
-    row, column = (
-        np.rint(BEV_SHAPE[axis] / 2 - 0.5 - points[..., axis] / BEV_RESOLUTION) for axis in (0, 1)
-    )
-    inside = (row >= 0) & (row < BEV_SHAPE[0]) & (column >= 0) & (column < BEV_SHAPE[1])
-    return readonly(
-        np.where(inside, row * BEV_SHAPE[1] + column, BEV_SHAPE[0] * BEV_SHAPE[1]).astype(np.int64)
-    )
+    num_rows, num_columns = BEV_SHAPE
+    # From the middle of the image to a pixel's centre there are whole pixels and a half.
+    row = np.rint(num_rows / 2 - 0.5 - points[..., 0] / BEV_RESOLUTION)
+    column = np.rint(num_columns / 2 - 0.5 - points[..., 1] / BEV_RESOLUTION)
+    inside = (row >= 0) & (row < num_rows) & (column >= 0) & (column < num_columns)
+    pixels = np.where(inside, row * num_columns + column, num_rows * num_columns)
+    return readonly(pixels.astype(np.int64))

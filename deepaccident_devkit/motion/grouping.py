@@ -1,8 +1,8 @@
-"""From the maps of a model's heads to instances: cells grouped around centres, and instances linked over time.
+"""Instances from the maps of a model's heads: cells grouped around centres, and linked over time.
 
-The rules are the released ones (docs/released_code.md, Post-processing), FIERY's: everything in float32, cells in
-row-major order, and of equals the first one counts; frames are linked with another distance than FIERY's. Arrays here
-are in the orientation of `PostProcessing.scan`.
+The rules are the released ones (docs/released_code.md, Post-processing), FIERY's: everything in
+float32, cells in row-major order, and the first one of equals counts; frames are linked with
+another distance than FIERY's. Arrays are in the orientation of `PostProcessing.scan`.
 """
 
 from __future__ import annotations
@@ -31,23 +31,28 @@ from deepaccident_devkit.support.arrays import (
 from deepaccident_devkit.support.text import settle_choices
 
 LABEL_LOGIT: Final = 10.0
-"""The right class's logit when the released evaluation treats labels as a prediction; the other class has 0."""
-# In cells: no offset or flow may be longer; the squares of much longer ones overflow in float32.
-_LARGEST: Final = 1e15
+"""Logit of the right class when the released evaluation treats labels as a prediction.
+
+The other class has 0.
+"""
+# Offsets and flows may not be longer, since the squares of much longer ones overflow in float32.
+_MAX_VECTOR_CELLS: Final = 1e15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionHeads(ShortRepr):
-    """The maps of one prediction, T frames from the present on, H × W cells; arrays are read-only.
+    """Maps of one prediction, T frames from the present on, H × W cells; arrays are read-only.
 
     Attributes:
-        segmentation: (T, 2, H, W) float32 logits: background, actor.
-        centerness: (T, 1, H, W) float32: how surely a cell is an instance's centre; (T, H, W) is accepted, too.
-        offset: (T, 2, H, W) float32 cells (down the rows, along the columns) to the instance's centre.
-        flow: (T, 2, H, W) float32 cells (rows, columns) to where the instance is at the next frame.
-        orientation: how the cells lie; the vectors' channels follow the rows and columns of that orientation.
-        ignore_index: the value of offset and flow where they are undefined, as in labels; it stays the same in all
-            orientations. None if all values are vectors.
+        segmentation: Logits of background and actor, shape (T, 2, H, W), float32.
+        centerness: Confidence that a cell is an instance's centre, shape (T, 1, H, W), float32; (T,
+            H, W) is accepted, too.
+        offset: Rows and columns to the instance's centre, shape (T, 2, H, W), float32, cells.
+        flow: Rows and columns to the instance's position at the next frame, shape (T, 2, H, W),
+            float32, cells.
+        orientation: Orientation of the cells; the vectors' channels follow its rows and columns.
+        ignore_index: Value of offset and flow where they are undefined, as in labels; it stays the
+            same in all orientations. None if all values are vectors.
     """
 
     segmentation: AnyArray
@@ -58,7 +63,7 @@ class MotionHeads(ShortRepr):
     ignore_index: int | None = None
 
     def __post_init__(self) -> None:
-        """Check and freeze; raises GeometryError, or ChoiceError for an unknown orientation."""
+        """Check and freeze the maps; raises GeometryError, or ChoiceError for the orientation."""
         settle_choices(self, {"orientation": ORIENTATIONS})
         _check_channels(np.shape(self.segmentation))
         segmentation = checked("segmentation", self.segmentation, (None, 2, None, None), np.float32)
@@ -79,13 +84,12 @@ class MotionHeads(ShortRepr):
             "flow": checked("flow", self.flow, shape, np.float32),
         }
         for name, values in maps.items():
-            _check_values(
-                name, values, np.inf if name in {"segmentation", "centerness"} else _LARGEST
-            )
+            limit = np.inf if name in {"segmentation", "centerness"} else _MAX_VECTOR_CELLS
+            _check_values(name, values, limit)
             object.__setattr__(self, name, readonly(values))
 
     def __repr__(self) -> str:
-        """Frames, cells and orientation."""
+        """Return the number of frames and cells, and the orientation."""
         frames, _, height, width = self.segmentation.shape
         return f"MotionHeads({frames} frames of {height} × {width} cells, {self.orientation})"
 
@@ -100,13 +104,15 @@ class MotionHeads(ShortRepr):
         *,
         ignore_index: int | None = None,
     ) -> MotionHeads:
-        """Heads from arrays of any framework (`support.arrays.as_numbers`) or lists, in the order of models' outputs.
+        """Return heads from arrays of any framework or lists, in the order of models' outputs.
 
-        float32 arrays in the processor's memory are not copied.
+        `support.arrays.as_numbers` reads the arrays. Float32 arrays in the processor's memory are
+        not copied.
 
         Raises:
-            GeometryError: another shape, NaN, or an array that cannot be read from here (see the message's remedy).
-            ChoiceError: no such orientation.
+            GeometryError: Another shape, NaN, or an array that cannot be read from here (see the
+                message's remedy).
+            ChoiceError: No such orientation.
         """
         return cls(
             segmentation=as_numbers("segmentation", segmentation, dtype=np.float32),
@@ -119,9 +125,10 @@ class MotionHeads(ShortRepr):
 
     @classmethod
     def from_labels(cls, labels: MotionLabels) -> MotionHeads:
-        """Labels as the prediction of a perfect model, with which the released evaluation compares.
+        """Return labels as the prediction of a perfect model, as the released evaluation uses them.
 
-        Segmentation is 10 for the right class and 0 for the other; centerness, offset and flow are as they are.
+        Segmentation is 10 for the right class and 0 for the other; centerness, offset and flow do
+        not change.
         """
         actor = np.asarray(labels.segmentation) == 1
         return cls(
@@ -134,7 +141,10 @@ class MotionHeads(ShortRepr):
         )
 
     def in_orientation(self, orientation: Orientation) -> MotionHeads:
-        """The same prediction with its cells, and its vectors, in another orientation. Raises ChoiceError."""
+        """Return the same prediction with its cells, and its vectors, in another orientation.
+
+        Raises ChoiceError.
+        """
         if orientation == self.orientation:
             return self
 
@@ -158,34 +168,38 @@ class MotionHeads(ShortRepr):
 
 
 def _check_channels(shape: tuple[int, ...]) -> None:
+    """Raise GeometryError if the segmentation does not have two channels."""
     if len(shape) != 4 or shape[1] == 2:
         return
     remedy = "; move the channels to the second axis" if shape[-1] == 2 else ""
     if shape[1] == 1:
         remedy = "; of a single logit x for actors, stack -x and x"
     raise GeometryError(
-        f"segmentation: expected (T, 2, H, W), the logits of background and actor, found {shape}{remedy}"
+        "segmentation: expected (T, 2, H, W), the logits of background and actor, "
+        f"found {shape}{remedy}"
     )
 
 
-def _check_values(name: str, values: AnyArray, most: float) -> None:
-    lowest, highest = values.min(), values.max()
-    if not (lowest >= -most and highest <= most):  # NaN is neither
-        at = tuple(np.argwhere(~(np.abs(values) <= most))[0].tolist())
+def _check_values(name: str, values: AnyArray, limit: float) -> None:
+    """Raise GeometryError if a value is NaN or its magnitude exceeds a limit."""
+    if not (values.min() >= -limit and values.max() <= limit):  # NaN is neither
+        index = tuple(np.argwhere(~(np.abs(values) <= limit))[0].tolist())
         raise GeometryError(
-            f"{name}: {values[at]} at {at} cannot be used; did the model diverge, or is there a mask in its output?"
+            f"{name}: {values[index]} at {index} cannot be used; did the model diverge, "
+            "or is there a mask in its output?"
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameGroups:
-    """The instances of one frame; ids run from 1 to I without gaps, (row, column) are cells.
+    """Instances of one frame; ids run from 1 to I without gaps, (row, column) are cells.
 
     Attributes:
-        ids: (P,) int64 the instance of each cell of the foreground; 0 for cells that count as background all the same.
-        count: (I + 1,) cells of each id.
-        position_sum: (2, I + 1) float64 sums of their rows and columns.
-        moved_sum: (2, I + 1) float64 sums of where the flow takes them.
+        ids: Instance of each cell of the foreground, shape (P,), int64; 0 for cells that still
+            count as background.
+        count: Number of cells of each id, shape (I + 1,).
+        position_sum: Sums of the cells' rows and columns, shape (2, I + 1), float64.
+        moved_sum: Sums of the cells' rows and columns after the flow, shape (2, I + 1), float64.
     """
 
     ids: IntArray
@@ -195,89 +209,109 @@ class FrameGroups:
 
     @property
     def instances(self) -> int:
-        """How many instances there are: the highest id."""
+        """Number of instances: the highest id."""
         return len(self.count) - 1
 
 
 def group_cells(
     peaks: IntArray, position: AnyArray, offset: AnyArray, flow: AnyArray, *, all_cells: bool
 ) -> FrameGroups:
-    """Instances of one frame: the foreground's cells by the peak (K, 2) nearest to where their offset points.
+    """Return the instances of one frame: its foreground, grouped by the peak nearest to each cell.
 
-    `position`, `offset` and `flow` are (2, P) float32 rows and columns. If `all_cells` of the frame are foreground, the
-    lowest instance becomes the background: ids are the ranks of all ids that occur, from 0.
+    Args:
+        peaks: Rows and columns of the peaks, shape (K, 2).
+        position: Rows and columns of the foreground's cells, shape (2, P), float32.
+        offset: Rows and columns to the instances' centres, shape (2, P), float32.
+        flow: Rows and columns to the positions at the next frame, shape (2, P), float32.
+        all_cells: Whether all cells of the frame are foreground. The lowest instance then becomes
+            the background: ids are the ranks of all ids that occur, from 0.
     """
     nearest = nearest_peaks(position + offset, peaks.astype(np.float32)) + 1
     occurs = np.bincount(nearest, minlength=len(peaks) + 1) > 0
     occurs[0] = not all_cells
     ids = (np.cumsum(occurs) - 1)[nearest]
-    length = max(int(occurs.sum()), 1)
+    num_ids = max(int(occurs.sum()), 1)
+    moved = position + flow
     return FrameGroups(
         ids=ids,
-        count=np.bincount(ids, minlength=length).astype(np.float64),
-        position_sum=np.stack([sums_by(ids, along, length) for along in position]),
-        moved_sum=np.stack([sums_by(ids, along, length) for along in position + flow]),
+        count=np.bincount(ids, minlength=num_ids).astype(np.float64),
+        position_sum=np.stack([sums_by(ids, component, num_ids) for component in position]),
+        moved_sum=np.stack([sums_by(ids, component, num_ids) for component in moved]),
     )
 
 
 def sums_by(ids: IntArray, values: AnyArray, length: int) -> FloatArray:
-    """(length,) float64 sums of `values` by `ids`; ids from `length` on are left out."""
+    """Return the sums of `values` by `ids`, shape (length,), float64.
+
+    Ids from `length` on are left out.
+    """
     return np.bincount(ids, values, length)[:length].astype(np.float64, copy=False)
 
 
 def means(sums: FloatArray, counts: FloatArray) -> AnyArray:
-    """(2, N) sums over (N,) counts → (N, 2) float32 means, equal to torch's of float32 values."""
+    """Return means of sums (2, N) over counts (N,), shape (N, 2), float32.
+
+    They are equal to torch's means of float32 values.
+    """
     return (sums / counts).T.astype(np.float32)
 
 
 def link_frames(groups: Sequence[FrameGroups], distance: float) -> list[IntArray]:
-    """Consistent ids (I + 1,) of the instances of consecutive frames, 0 for 0.
+    """Return consistent ids of the instances of consecutive frames.
 
-    Instances are paired one to one with those of the frame before, which the flow has moved, so that the sum of the
-    distances is smallest. Pairs nearer than `distance`, cells, share an id. The others get new ids, counted from the
-    first frame's highest id. A frame without instances, and the frame after it, keep their own ids, which do not count
-    as given: later instances may get the same ids.
+    Each frame has an array of shape (I + 1,), with 0 for 0.     Instances are paired one to one
+    with the instances of the frame before, moved by the flow, so that the sum of the distances is
+    smallest. Pairs closer than `distance`, cells, share an id. The others get new ids, counted from
+    the first frame's highest id. A frame without instances, and the frame after it, keep their own
+    ids, which do not count as used: later instances may get the same ids.
     """
-    names = [np.arange(groups[0].instances + 1)]
-    newest = groups[0].instances
-    for before, after in pairwise(groups):
-        if before.instances == 0 or after.instances == 0:
-            names.append(np.arange(after.instances + 1))
+    linked_ids = [np.arange(groups[0].instances + 1)]
+    newest_id = groups[0].instances
+    for previous, current in pairwise(groups):
+        if previous.instances == 0 or current.instances == 0:
+            linked_ids.append(np.arange(current.instances + 1))
             continue
-        known, expected = _expected(before, names[-1])
-        distances = _distances(expected, means(after.position_sum[:, 1:], after.count[1:]))
-        linked, newest = _linked(known, distances, distance, newest)
-        names.append(linked)
-    return names
+        previous_ids, expected = _expected_positions(previous, linked_ids[-1])
+        positions = means(current.position_sum[:, 1:], current.count[1:])
+        distances = _distances(expected, positions)
+        frame_ids, newest_id = _linked(previous_ids, distances, distance, newest_id)
+        linked_ids.append(frame_ids)
+    return linked_ids
 
 
-def _expected(before: FrameGroups, names: IntArray) -> tuple[IntArray, AnyArray]:
-    """The ids (N,) of a frame and where the flow takes them (N, 2); instances that share an id are one."""
-    known, which = np.unique(names[1:], return_inverse=True)
-    sums = np.stack([sums_by(which, along[1:], len(known)) for along in before.moved_sum])
-    return known, means(sums, sums_by(which, before.count[1:], len(known)))
+def _expected_positions(previous: FrameGroups, linked_ids: IntArray) -> tuple[IntArray, AnyArray]:
+    """Return the ids of a frame (N,), and the positions (N, 2) to which the flow moves them.
+
+    Instances that share an id are one.
+    """
+    ids, instance = np.unique(linked_ids[1:], return_inverse=True)
+    moved_sum = [sums_by(instance, component[1:], len(ids)) for component in previous.moved_sum]
+    counts = sums_by(instance, previous.count[1:], len(ids))
+    return ids, means(np.stack(moved_sum), counts)
 
 
 def _distances(first: AnyArray, second: AnyArray) -> AnyArray:
-    """(N, M) float32 distances between points (N, 2) and (M, 2)."""
-    apart = second - first[:, None]
-    return np.asarray(np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1]))
+    """Return the distances between points (N, 2) and (M, 2), shape (N, M), float32."""
+    offset = second - first[:, None]
+    down = offset[..., 0]
+    across = offset[..., 1]
+    return np.asarray(np.sqrt(down * down + across * across))
 
 
 def _linked(
-    known: IntArray, distances: AnyArray, limit: float, newest: int
+    previous_ids: IntArray, distances: AnyArray, limit: float, newest_id: int
 ) -> tuple[IntArray, int]:
-    """The next frame's ids (M + 1,), and the highest id given so far."""
+    """Return the ids of the next frame (M + 1,), and the highest id used so far."""
     from scipy.optimize import linear_sum_assignment
 
-    before, after = linear_sum_assignment(distances)
-    near = distances[before, after] < np.float32(limit)
-    matched = (after[near] + 1).tolist()
-    names = np.zeros(distances.shape[1] + 1, dtype=np.int64)
-    names[matched] = known[before[near]]
-    # new ids are given in the order of a Python set, as the released code makes it: not always the ascending one
-    rest = set(range(len(names))).difference(set(matched))
-    rest.remove(0)
-    new = list(rest)
-    names[new] = np.arange(newest + 1, newest + 1 + len(new))
-    return names, newest + len(new)
+    previous, current = linear_sum_assignment(distances)
+    is_close = distances[previous, current] < np.float32(limit)
+    matched = (current[is_close] + 1).tolist()
+    linked_ids = np.zeros(distances.shape[1] + 1, dtype=np.int64)
+    linked_ids[matched] = previous_ids[previous[is_close]]
+    # New ids follow the order of a Python set, as in the released code: it does not always ascend.
+    unmatched = set(range(len(linked_ids))).difference(set(matched))
+    unmatched.remove(0)
+    new = list(unmatched)
+    linked_ids[new] = np.arange(newest_id + 1, newest_id + 1 + len(new))
+    return linked_ids, newest_id + len(new)

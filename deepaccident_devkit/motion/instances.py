@@ -1,4 +1,4 @@
-"""From a model's maps to instances with the same id in all frames, and their paths."""
+"""Instances from a model's maps, with the same id in all frames, and their paths."""
 
 from __future__ import annotations
 
@@ -45,29 +45,32 @@ from deepaccident_devkit.support.text import choice
 Foreground = Literal["argmax", "sigmoid"]
 FOREGROUND_THRESHOLD: Final = 0.4
 """Sigmoid of an actor's logit that a cell of the foreground `sigmoid` must exceed."""
-_MOST_CENTERS: Final = 2**24
+_MAX_CENTERS: Final = 2**24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostProcessing:
-    """How instances are found in a model's maps; the defaults are the released ones for VPQ.
+    """Rules by which instances are found in a model's maps.
 
-    See docs/released_code.md, Post-processing.
+    The defaults are the released rules for VPQ. See docs/released_code.md, Post-processing.
 
     Attributes:
-        foreground: which cells are actors: `argmax` of both logits (background where they are equal), or `sigmoid`:
-            those whose actor logit's sigmoid exceeds `FOREGROUND_THRESHOLD`, whatever the background's is.
-        labels_bypass_sigmoid: with `sigmoid`, if the highest of all logits is 10 and the lowest 0, they are treated as
-            labels (`MotionHeads.from_labels`), and the actor's logit itself is compared with the threshold: the sigmoid
-            of its 0 would be above the released threshold.
-        center_threshold: centerness that a centre must exceed.
-        max_centers: how many centres a frame can have; if there are more, the first ones in row-major order are kept,
-            not the highest.
-        scan: the orientation in which cells are in that order; of several equally near centres, the first one in it is
-            chosen. Heads in another orientation are turned to it, and the result is turned back.
-        link_distance: cells; an instance has the id of one of the frame before if it is nearer than this to where the
-            flow moves that one.
-        redraw: rasterise boxes along the paths of the first frame's instances, for the accident evaluation.
+        foreground: Rule for the cells of actors: `argmax` of both logits (background where they are
+            equal), or `sigmoid`: the cells with a sigmoid of the actor's logit above
+            `FOREGROUND_THRESHOLD`, for any logit of the background.
+        labels_bypass_sigmoid: Whether logits are treated as labels (`MotionHeads.from_labels`) with
+            `sigmoid`, if the highest of all logits is 10 and the lowest 0. The actor's logit itself
+            is then compared with the threshold: the sigmoid of its 0 would be above the released
+            threshold.
+        center_threshold: Centerness that a centre must exceed.
+        max_centers: Largest number of centres of a frame; if there are more, the first ones in
+            row-major order count, not the highest.
+        scan: Orientation in which cells are in that order; it also decides between equally near
+            centres. Heads in another orientation are turned to it, and the result is turned back.
+        link_distance: Distance below which an instance has the id of one of the frame before, moved
+            by the flow, cells.
+        redraw: Whether to rasterise boxes along the paths of the first frame's instances, for the
+            accident evaluation.
     """
 
     foreground: Foreground = "argmax"
@@ -79,7 +82,7 @@ class PostProcessing:
     redraw: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
+        """Raise ChoiceError or ConfigError unless the values are valid."""
         values = {
             "foreground": choice("foreground", self.foreground, get_args(Foreground)),
             "labels_bypass_sigmoid": checked_flag(
@@ -89,7 +92,7 @@ class PostProcessing:
                 "center_threshold", self.center_threshold, "a number from 0", 0.0
             ),
             "max_centers": checked_count(
-                "max_centers", self.max_centers, "centres of a frame", _MOST_CENTERS
+                "max_centers", self.max_centers, "centres of a frame", _MAX_CENTERS
             ),
             "scan": choice("scan", self.scan, ORIENTATIONS),
             "link_distance": checked_setting(
@@ -108,17 +111,18 @@ POST_PROCESSING: Final[Mapping[str, PostProcessing]] = MappingProxyType(
         "fiery": PostProcessing(link_distance=3.0, scan="fiery"),
     }
 )
-"""The settings of the released evaluation of motion (IoU, VPQ) and of accidents, and those of FIERY."""
+"""Settings of the released evaluation of motion (IoU, VPQ) and of accidents, and of FIERY."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InstancePath(ShortRepr):
-    """One instance of the first frame; arrays are read-only.
+    """Path of an instance of the first frame; arrays are read-only.
 
     Attributes:
-        frames: (n,) int64 in which it is, rising from 0.
-        centers: (n, 2) float64 row and column of the mean of its cells there (a float32's value).
-        cell_counts: (T,) int64 how many cells it has in each frame, 0 where it is not.
+        frames: Frames that have the instance, shape (n,), int64, rising from 0.
+        centers: Row and column of the mean of its cells in these frames, shape (n, 2), float64 (a
+            float32's value).
+        cell_counts: Number of its cells in each frame, shape (T,), int64, 0 in frames without it.
     """
 
     frames: IntArray
@@ -133,17 +137,19 @@ class InstancePath(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LinkedInstances(ShortRepr):
-    """The instances of one prediction over T frames of H × W cells in `orientation`; arrays are read-only.
+    """Instances of one prediction over T frames of H × W cells; arrays are read-only.
 
     Attributes:
-        settings: how they were found.
-        orientation: how the cells lie; that of the heads.
-        instance: (T, H, W) int32: ids that are the same in all frames, 0 elsewhere.
-        frame_instance: (T, H, W) int32: each frame's own ids before linking, 1 to I without gaps, 0 elsewhere.
-        redrawn: (T, H, W) int32: the ids of boxes rasterised along the paths, 0 elsewhere; None without
-            `settings.redraw`.
-        frame_centers: T times (K, 2) int64: rows and columns of the centres that cells were grouped around.
-        paths: the instances of the first frame by id, ascending.
+        settings: Rules by which they were found.
+        orientation: Orientation of the cells, that of the heads.
+        instance: Ids that are the same in all frames, shape (T, H, W), int32, 0 elsewhere.
+        frame_instance: Ids of each frame before linking, shape (T, H, W), int32, 1 to I without
+            gaps, 0 elsewhere.
+        redrawn: Ids of boxes rasterised along the paths, shape (T, H, W), int32, 0 elsewhere; None
+            without `settings.redraw`.
+        frame_centers: Rows and columns of each frame's centres of groups, T arrays of shape (K, 2),
+            int64.
+        paths: Instances of the first frame by id, ascending.
     """
 
     settings: PostProcessing
@@ -158,107 +164,119 @@ class LinkedInstances(ShortRepr):
         """Freeze arrays and maps."""
         object.__setattr__(self, "instance", readonly(self.instance))
         object.__setattr__(self, "frame_instance", readonly(self.frame_instance))
-        object.__setattr__(
-            self, "redrawn", None if self.redrawn is None else readonly(self.redrawn)
-        )
-        object.__setattr__(
-            self, "frame_centers", tuple(readonly(centers) for centers in self.frame_centers)
-        )
+        if self.redrawn is not None:
+            object.__setattr__(self, "redrawn", readonly(self.redrawn))
+        frame_centers = tuple(readonly(centers) for centers in self.frame_centers)
+        object.__setattr__(self, "frame_centers", frame_centers)
         object.__setattr__(self, "paths", MappingProxyType(dict(self.paths)))
 
     @property
     def centers(self) -> dict[int, FloatArray]:
-        """Id → (n, 2) row and column in each frame of `paths[id].frames`."""
+        """Id → row and column in each frame of `paths[id].frames`, shape (n, 2)."""
         return {identity: path.centers for identity, path in self.paths.items()}
 
 
 def predict_instances(
     heads: MotionHeads, settings: PostProcessing | str = "motion"
 ) -> LinkedInstances:
-    """Instances with the same id in all frames, as the released code finds them.
+    """Return instances with the same id in all frames, as the released code finds them.
 
     See docs/released_code.md, Post-processing and FIERY's own labels.
 
     Args:
-        heads: a model's maps, or `MotionHeads.from_labels`.
-        settings: a name in `POST_PROCESSING`, or your own.
+        heads: Maps of a model, or `MotionHeads.from_labels`.
+        settings: Name in `POST_PROCESSING`, or settings of your own.
 
     Raises:
-        ChoiceError: no settings have that name.
+        ChoiceError: No settings have that name.
         ConfigError: `heads` are no heads, or `settings` no settings.
     """
     rules = post_processing(settings)
     if not isinstance(heads, MotionHeads):
         raise ConfigError(
-            f"heads: expected MotionHeads, found {type(heads).__name__}; MotionHeads.from_labels takes labels, "
-            "from_arrays a model's maps"
+            f"heads: expected MotionHeads, found {type(heads).__name__}; MotionHeads.from_labels "
+            "takes labels, from_arrays a model's maps"
         )
-    turn = _Turn(heads.segmentation.shape[-2:], heads.orientation, rules.scan)
-    centerness = turn.maps(heads.centerness[:, 0])
+    scan = _Scan(heads.segmentation.shape[-2:], heads.orientation, rules.scan)
+    centerness = scan.maps(heads.centerness[:, 0])
+    foreground = scan.maps(foreground_cells(heads.segmentation, rules))
     peaks = [find_peaks(frame, rules.center_threshold, rules.max_centers) for frame in centerness]
-    foreground = turn.maps(foreground_cells(heads.segmentation, rules))
-    positions = [
-        np.stack(np.nonzero(here & (len(found) > 0)))
-        for here, found in zip(foreground, peaks, strict=True)
-    ]
-    groups = [
-        group_cells(
-            found,
-            position.astype(np.float32),
-            turn.vectors_at(position, offset, heads.ignore_index),
-            turn.vectors_at(position, flow, heads.ignore_index),
-            all_cells=position.shape[1] == offset[0].size,
-        )
-        for found, position, offset, flow in zip(
-            peaks, positions, heads.offset, heads.flow, strict=True
-        )
-    ]
-    names = link_frames(groups, rules.link_distance)
-    centers, counts = _paths(groups, names)
+    positions = []
+    for frame_foreground, frame_peaks in zip(foreground, peaks, strict=True):
+        positions.append(np.stack(np.nonzero(frame_foreground & (len(frame_peaks) > 0))))
+    groups = _grouped(heads, peaks, positions, scan)
+    frame_ids = [group.ids for group in groups]
+    linked_ids = link_frames(groups, rules.link_distance)
+    ids = [linked[own_ids] for linked, own_ids in zip(linked_ids, frame_ids, strict=True)]
+    centers, counts = _centers_and_counts(groups, linked_ids)
     redrawn = None
     if rules.redraw:
         hulls = first_hulls(positions[0], groups[0].ids, groups[0].instances)
-        redrawn = turn.raster(*redrawn_cells(hulls, centers, counts > 0, turn.scanned_shape))
+        redrawn = scan.raster(*redrawn_cells(hulls, centers, counts > 0, scan.scanned_shape))
+    paths = {}
+    turned_centers = scan.points(centers)
+    for identity, (points, cells) in enumerate(zip(turned_centers, counts, strict=True), start=1):
+        paths[identity] = InstancePath(
+            frames=np.flatnonzero(cells), centers=points[cells > 0], cell_counts=cells
+        )
     return LinkedInstances(
         settings=rules,
         orientation=heads.orientation,
-        instance=turn.raster(
-            positions, [name[group.ids] for name, group in zip(names, groups, strict=True)]
-        ),
-        frame_instance=turn.raster(positions, [group.ids for group in groups]),
+        instance=scan.raster(positions, ids),
+        frame_instance=scan.raster(positions, frame_ids),
         redrawn=redrawn,
-        frame_centers=[turn.points(frame) for frame in peaks],
-        paths={
-            identity: InstancePath(
-                frames=np.flatnonzero(cells), centers=points[cells > 0], cell_counts=cells
-            )
-            for identity, (points, cells) in enumerate(
-                zip(turn.points(centers), counts, strict=True), start=1
-            )
-        },
+        frame_centers=[scan.points(frame_peaks) for frame_peaks in peaks],
+        paths=paths,
     )
 
 
+def _grouped(
+    heads: MotionHeads, peaks: Sequence[IntArray], positions: Sequence[IntArray], scan: _Scan
+) -> list[FrameGroups]:
+    """Return the instances of each frame before linking.
+
+    Args:
+        heads: Maps of a model.
+        peaks: Scanned rows and columns of each frame's peaks, shape (K, 2).
+        positions: Scanned rows and columns of each frame's foreground, shape (2, P).
+        scan: Change of orientation.
+    """
+    groups = []
+    for frame, (frame_peaks, position) in enumerate(zip(peaks, positions, strict=True)):
+        offset = scan.vectors_at(position, heads.offset[frame], heads.ignore_index)
+        flow = scan.vectors_at(position, heads.flow[frame], heads.ignore_index)
+        all_cells = position.shape[1] == heads.offset[frame, 0].size
+        group = group_cells(
+            frame_peaks, position.astype(np.float32), offset, flow, all_cells=all_cells
+        )
+        groups.append(group)
+    return groups
+
+
 def foreground_cells(segmentation: AnyArray, rules: PostProcessing) -> BoolArray:
-    """(T, H, W) which cells are actors by the settings, of logits (T, 2, H, W) of one prediction: background, actor."""
-    background, actor = segmentation[:, 0], segmentation[:, 1]
+    """Return which cells are actors by the settings, shape (T, H, W).
+
+    Args:
+        segmentation: Logits of background and actor of one prediction, shape (T, 2, H, W).
+        rules: The settings.
+    """
+    background = segmentation[:, 0]
+    actor = segmentation[:, 1]
     if rules.foreground == "argmax":
         return np.asarray(actor > background)
     threshold = np.float32(FOREGROUND_THRESHOLD)
-    if (
-        rules.labels_bypass_sigmoid
-        and segmentation.max() == LABEL_LOGIT
-        and segmentation.min() == 0
-    ):
-        return np.asarray(actor > threshold)
-    # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. That point's own logit is compared
-    # with instead, which needs no exponential of every cell.
-    beyond = (float(threshold) + float(np.nextafter(threshold, np.float32(1)))) / 2
-    return np.asarray(actor > np.float32(np.log(beyond / (1 - beyond))))
+    if rules.labels_bypass_sigmoid:
+        if segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
+            return np.asarray(actor > threshold)
+    # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. The logits are
+    # compared with that point's own logit, which needs no exponential of every cell.
+    next_value = np.nextafter(threshold, np.float32(1))
+    half_way = (float(threshold) + float(next_value)) / 2
+    return np.asarray(actor > np.float32(np.log(half_way / (1 - half_way))))
 
 
 def post_processing(settings: PostProcessing | str) -> PostProcessing:
-    """Settings by their name, or as they are given; raises ChoiceError or ConfigError."""
+    """Return settings by their name, or settings unchanged; raises ChoiceError or ConfigError."""
     if isinstance(settings, PostProcessing):
         return settings
     if not isinstance(settings, str):
@@ -275,21 +293,24 @@ def trajectories(
     *,
     half_cell_shift: bool | None = None,
 ) -> dict[int, FloatArray]:
-    """The paths of the first frame's instances in metres.
+    """Return the paths of the first frame's instances in metres.
 
     Args:
-        linked: from `predict_instances`.
-        grid: what the cells cover, in any orientation.
-        protocol: of the labels, or of the labels that the model learned. If it has the `half_cell_shift`, that is
-            undone: a cell stands for its corner with the lowest row and column in the protocol's native orientation.
-        half_cell_shift: in place of the protocol's own; with False a cell always stands for its middle.
+        linked: Result of `predict_instances`.
+        grid: Ground that the cells cover, in any orientation.
+        protocol: Protocol of the labels, or of the labels that the model learned. If it has the
+            `half_cell_shift`, the shift is undone: a cell stands for its corner with the lowest row
+            and column in the protocol's native orientation.
+        half_cell_shift: Value that replaces the protocol's own; with False a cell always stands for
+            its middle.
 
     Returns:
-        Id → (n, 2) x forward, y left, metres in the maps' ego frame, at the frames `linked.paths[id].frames`.
+        Id → positions, shape (n, 2), x forward, y left, metres in the maps' ego frame, at the
+        frames `linked.paths[id].frames`.
 
     Raises:
-        GeometryError: the grid has other rows and columns than the instances.
-        ChoiceError: no such protocol.
+        GeometryError: The grid has other rows and columns than the instances.
+        ChoiceError: No such protocol.
     """
     shape = grid.with_orientation(linked.orientation).shape
     if linked.instance.shape[1:] != shape:
@@ -299,30 +320,44 @@ def trajectories(
     rules = label_protocol(protocol)
     if half_cell_shift is not None:
         rules = replace(rules, half_cell_shift=half_cell_shift)
-    within = np.array(rules.place_in_cell)
+    point_in_cell = np.array(rules.place_in_cell)
     low, size = np.array([(low, size) for low, _, size in (grid.x, grid.y)]).T
-    return {
-        name: low
-        + (_points_in(points, shape, linked.orientation, "devkit")[:, ::-1] + within) * size
-        for name, points in linked.centers.items()
-    }
+    paths = {}
+    for identity, points in linked.centers.items():
+        cells = _points_in(points, shape, linked.orientation, "devkit")[:, ::-1]
+        paths[identity] = low + (cells + point_in_cell) * size
+    return paths
 
 
-def _paths(groups: Sequence[FrameGroups], names: Sequence[IntArray]) -> tuple[FloatArray, IntArray]:
-    """(I, T, 2) mean rows and columns of the first frame's ids 1 to I, 0 where there are none, and (I, T) counts."""
-    length = groups[0].instances + 1
-    pairs = list(zip(groups, names, strict=True))
-    counts = np.stack([sums_by(name, group.count, length) for group, name in pairs])
-    sums = np.stack(
-        [[sums_by(name, along, length) for along in group.position_sum] for group, name in pairs]
-    )
-    centers = (sums / np.maximum(counts, 1)[:, None]).astype(np.float32).astype(np.float64)
+def _centers_and_counts(
+    groups: Sequence[FrameGroups], linked_ids: Sequence[IntArray]
+) -> tuple[FloatArray, IntArray]:
+    """Return the centres and cell counts of the first frame's instances 1 to I in T frames.
+
+    Returns:
+        Mean rows and columns, shape (I, T, 2), 0 where there are none; and counts, shape (I, T).
+    """
+    num_ids = groups[0].instances + 1
+    frame_counts = []
+    frame_sums = []
+    for group, ids in zip(groups, linked_ids, strict=True):
+        frame_counts.append(sums_by(ids, group.count, num_ids))
+        frame_sums.append([sums_by(ids, component, num_ids) for component in group.position_sum])
+    counts = np.stack(frame_counts)
+    means = np.stack(frame_sums) / np.maximum(counts, 1)[:, None]
+    centers = means.astype(np.float32).astype(np.float64)
     return centers.transpose(2, 0, 1)[1:], counts.T[1:].astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
-class _Turn:
-    """From the heads' orientation, in which the shape is `shape`, to the scanned orientation, and back."""
+class _Scan:
+    """Change from the heads' orientation to the scanned orientation, and back.
+
+    Attributes:
+        shape: Rows and columns in the heads' orientation.
+        heads: The heads' orientation.
+        scan: The scanned orientation.
+    """
 
     shape: tuple[int, int]
     heads: Orientation
@@ -331,33 +366,47 @@ class _Turn:
     @property
     def scanned_shape(self) -> tuple[int, int]:
         """Rows and columns of the scanned orientation."""
-        return self.shape[::-1] if (self.heads == "fiery") != (self.scan == "fiery") else self.shape
+        is_transposed = (self.heads == "fiery") != (self.scan == "fiery")
+        return self.shape[::-1] if is_transposed else self.shape
 
     def maps(self, maps: AnyArray) -> AnyArray:
-        """The heads' maps (…, H, W), in the scanned orientation."""
+        """Return the heads' maps (…, H, W) in the scanned orientation."""
         return to_orientation(maps, vectors=False, source=self.heads, target=self.scan)
 
     def vectors_at(self, position: IntArray, vectors: AnyArray, ignore: int | None) -> AnyArray:
-        """The heads' vectors (2, H, W) at scanned rows and columns (2, P), as (2, P) scanned ones."""
-        taken = np.take(vectors.reshape(2, -1), self._flat(position), axis=1)
-        rasters = taken.T[..., None, None]  # of one cell each: no cell moves, only the vectors turn
+        """Return the heads' vectors at some cells, in the scanned orientation, shape (2, P).
+
+        Args:
+            position: Scanned rows and columns of the cells, shape (2, P).
+            vectors: Vectors in the heads' orientation, shape (2, H, W).
+            ignore: Value of undefined vectors; None if all are defined.
+        """
+        cell_vectors = np.take(vectors.reshape(2, -1), self._flat(position), axis=1)
+        # Rasters of one cell each: no cell moves, only the vectors turn.
+        rasters = cell_vectors.T[..., None, None]
         turned = to_orientation(
             rasters, vectors=True, source=self.heads, target=self.scan, ignore=ignore
         )
         return turned[..., 0, 0].T
 
     def raster(self, positions: Sequence[IntArray], ids: Sequence[IntArray]) -> AnyArray:
-        """(T, H, W) int32 in the heads' orientation, with `ids` (P,) at each frame's scanned positions (2, P)."""
+        """Return rasters of ids in the heads' orientation, shape (T, H, W), int32.
+
+        Args:
+            positions: Scanned rows and columns of each frame's cells, shape (2, P).
+            ids: Ids of each frame's cells, shape (P,).
+        """
         result = np.zeros((len(positions), math.prod(self.shape)), dtype=np.int32)
         for frame, position, values in zip(result, positions, ids, strict=True):
             frame[self._flat(position)] = values
         return result.reshape(-1, *self.shape)
 
     def points(self, points: AnyArray) -> AnyArray:
-        """Scanned rows and columns (…, 2), in the heads' orientation."""
+        """Return scanned rows and columns (…, 2) in the heads' orientation."""
         return _points_in(points, self.scanned_shape, self.scan, self.heads)
 
     def _flat(self, position: IntArray) -> IntArray:
+        """Return the indices of scanned cells in a flat raster of the heads' orientation."""
         row, column = cells_in(position[0], position[1], self.scanned_shape, self.scan, self.heads)
         return np.asarray(row * self.shape[1] + column)
 
@@ -365,5 +414,5 @@ class _Turn:
 def _points_in(
     points: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation
 ) -> AnyArray:
-    """Rows and columns (…, 2) of one orientation, `shape` its cells, in another."""
+    """Return rows and columns (…, 2) of one orientation, with `shape` cells, in another."""
     return np.stack(cells_in(points[..., 0], points[..., 1], shape, source, target), axis=-1)

@@ -1,27 +1,30 @@
-"""Warping rasters into another ego frame: by which transform, and from which source cell or point each cell's value is.
+"""Warping rasters into another ego frame: transforms, and the source cell or point of each cell.
 
-6-vectors and matrices that go in are right-handed. Transforms of frames, past moments and agents are products of the
-motions in between, in the handedness of the protocol's native orientation; `stretched` and `fiery` compute them in
-float32 as their codes do, `exact` in float64.
+Arguments are right-handed 6-vectors and matrices. Transforms of frames, past moments and agents are
+products of the motions in between, in the handedness of the protocol's native orientation;
+`stretched` and `fiery` compute them in float32 as their codes do, `exact` in float64.
 
-Sampling is done in a protocol's `native` orientation, with matrices of that orientation's handedness, by one of
-three rules (`WarpRule`):
+Rasters are sampled in a protocol's `native` orientation, with matrices of that orientation's
+handedness, by one of three rules (`WarpRule`):
 
-- `stretched`: the released `FeatureWarper` (docs/released_code.md, Warps), which is BEVerse's. Sample points stand at
-  linspace(−49.75, 50, 200) along either axis instead of at the cells' centres, and the outermost of them are treated
-  as the grid's ends: without motion, cell i samples 0.4975 + 0.9975 i, which nearest sampling rounds to i, and which
-  blurs bilinear sampling by up to half a cell. Each rounding to float32 is repeated, since the last bit decides for
-  points that lie on the border between two cells (except for the angles of `egomotion`). Grids that
-  are not centred on the ego have no meaning in the released code; they are stretched about their own middle.
+- `stretched`: the released `FeatureWarper` (docs/released_code.md, Warps), which is BEVerse's.
+  Sample points stand at linspace(−49.75, 50, 200) along either axis instead of at the cells'
+  centres, and the outermost of them are treated as the grid's ends: without motion, cell i samples
+  0.4975 + 0.9975 i, which nearest sampling rounds to i, and which blurs bilinear sampling by up to
+  half a cell. Each rounding to float32 is repeated, since the last bit decides for points that lie
+  on the border between two cells (except for the angles of `egomotion`). Grids that are not centred
+  on the ego do not occur in the released code; they are stretched about their own middle.
 - `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode.
-- `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres; of the motion only
-  the 6-vector's yaw and planar translation count, combined as source = Rot(−yaw) · target + (−tx, +ty): the sideways
-  shift has the wrong sign, and neither shift is turned. FIERY has only square grids centred on the ego; on others we
-  measure in metres from the ego.
+- `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres;
+  of the motion only the 6-vector's yaw and planar translation count, combined as source =
+  Rot(−yaw) · target + (−tx, +ty): the sideways shift has the wrong sign, and neither shift is
+  turned. FIERY has only square grids centred on the ego; other grids are measured in metres from
+  the ego.
 
-The transform is rigid (or A · rigid · A⁻¹ with an augmentation A). Points lie on the plane z = 0; only x and y of the
-transformed points count. `source_from_target` maps points of the result's frame to points of the raster's frame:
-`sampling_matrix` gets it from the released code's arguments, which go the other way.
+The transform is rigid (or A · rigid · A⁻¹ with an augmentation A). Points lie on the plane z = 0;
+only x and y of the transformed points count. `source_from_target` maps points of the result's frame
+to points of the raster's frame: `sampling_matrix` gets it from the released code's arguments, which
+go the other way.
 """
 
 import functools
@@ -54,11 +57,13 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.v2x import future_egomotion
 
 WarpMode = Literal["nearest", "bilinear"]
-# How many cells float32 can number.
-_COUNTABLE: Final = 2**24
+# Float32 can number this many cells.
+_MAX_CELLS: Final = 2**24
 
 
 class _Arithmetic(NamedTuple):
+    """Functions for matrices in one precision."""
+
     matrices: Callable[[AnyArray], AnyArray]
     rigid_inverse: Callable[[AnyArray], AnyArray]
     inverse: Callable[[AnyArray], AnyArray]
@@ -80,47 +85,52 @@ _ARITHMETIC: Final[Mapping[str, _Arithmetic]] = {
 
 
 def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    """`v2x.future_egomotion` of poses (T + 1, 4, 4) in a protocol's arithmetic: (T, 6) float32.
+    """Return `v2x.future_egomotion` of poses in a protocol's arithmetic, shape (T, 6), float32.
 
-    The released code has the poses in float32. If a sample point lies on a border between cells, their last bits decide
-    to which cell it belongs.
+    The poses have the shape (T + 1, 4, 4). The released code has the poses in float32. If a sample
+    point lies on a border between cells, their last bits decide to which cell it belongs.
     """
     if rules.warp == "exact":
         return future_egomotion(world_from_ego, valid).astype(np.float32)
     poses = checked("world_from_ego", world_from_ego, (None, 4, 4)).astype(np.float32)
     known = checked("valid", valid, (len(poses),), np.bool_)
-    both = known[:-1] & known[1:]
-    motion = np.zeros((len(both), 6), dtype=np.float32)
-    next_from_world = single_precision.rigid_inverse(poses[1:][both])
-    # torch's atan2 is not correctly rounded, so its angles can differ in the last bit: at a tie, where a sample point
-    # lies on a border between cells, a cell can (one in three of about 330 warped outputs of the released code)
-    next_from_this = single_precision.fused_product(next_from_world, poses[:-1][both])
-    motion[both] = conventions.six_vectors_of(next_from_this).astype(np.float32)
+    has_motion = known[:-1] & known[1:]
+    motion = np.zeros((len(has_motion), 6), dtype=np.float32)
+    next_from_world = single_precision.rigid_inverse(poses[1:][has_motion])
+    # torch's atan2 is not correctly rounded, so its angles can differ in the last bit: at a tie,
+    # where a sample point lies on a border between cells, a cell can differ (in one of three of
+    # about 330 warped outputs of the released code).
+    next_from_this = single_precision.fused_product(next_from_world, poses[:-1][has_motion])
+    motion[has_motion] = conventions.six_vectors_of(next_from_this).astype(np.float32)
     return motion
 
 
 def present_from_frames(
     egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Transforms (T, 4, 4) of the present and each future frame to the present: C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹.
+    """Return the transforms of the present and each future frame to the present.
 
-    `egomotion` (T, 6) is `next_from_this` from the present on; of the last row nothing is used. Augmented, C becomes A
-    C A⁻¹.
+    They are C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹, shape (T, 4, 4). With an augmentation A, C becomes A C
+    A⁻¹.
+
+    Args:
+        egomotion: `next_from_this` from the present on, shape (T, 6); the last row is not used.
+        rules: Protocol of the labels.
+        augmentation: Augmentation of all frames.
     """
     arithmetic = _ARITHMETIC[rules.warp]
     this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rules)[:-1])
-    chain = accumulate(
-        this_from_next, arithmetic.product, initial=np.eye(4, dtype=this_from_next.dtype)
-    )
+    identity = np.eye(4, dtype=this_from_next.dtype)
+    chain = accumulate(this_from_next, arithmetic.product, initial=identity)
     return _augmented(np.stack(list(chain)), rules, augmentation)
 
 
 def frames_from_next(
     egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Transforms (T, 4, 4) from each frame's next frame to that frame, of `next_from_this` (T, 6).
+    """Return the transforms from each frame's next frame to that frame, shape (T, 4, 4).
 
-    The released code has a special way to invert these.
+    The released code has a special method to invert `next_from_this` (T, 6).
     """
     inverse = _ARITHMETIC[rules.warp].inverse(_native_matrices(egomotion, rules))
     return _augmented(inverse, rules, augmentation)
@@ -129,52 +139,65 @@ def frames_from_next(
 def present_from_past(
     egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Transforms (P, 4, 4) of past moments to the present, of their `next_from_this` (P, 6), the oldest first.
+    """Return the transforms of past moments to the present, shape (P, 4, 4), the oldest first.
 
-    The released code and FIERY multiply the motions in the order of time, E_0 E_1, and so are wrong from the second
-    moment before the present on; `exact` multiplies E_1 E_0.
+    The released code and FIERY multiply the motions in the order of time, E_0 E_1, and are
+    therefore wrong from the second moment before the present on; `exact` multiplies E_1 E_0.
+
+    Args:
+        egomotion: `next_from_this` of the past moments, shape (P, 6), the oldest first.
+        rules: Protocol of the labels.
+        augmentation: Augmentation of all moments.
     """
-    product, steps = _ARITHMETIC[rules.warp].product, _native_matrices(egomotion, rules)
-    way = product if rules.warp == "exact" else lambda later, earlier: product(earlier, later)
-    chain = list(accumulate(steps[::-1], way))
+    product = _ARITHMETIC[rules.warp].product
+    steps = _native_matrices(egomotion, rules)
+
+    def reversed_product(later: AnyArray, earlier: AnyArray) -> AnyArray:
+        return product(earlier, later)
+
+    combine = product if rules.warp == "exact" else reversed_product
+    chain = list(accumulate(steps[::-1], combine))
     return _augmented(np.reshape(chain[::-1], steps.shape), rules, augmentation)
 
 
 def ego_from_agents(
     relative_pose: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Transforms (K, 4, 4) of agents' frames to the ego's from right-handed 6-vectors (K, 6); raises GeometryError."""
+    """Return the transforms of agents' frames to the ego's, shape (K, 4, 4).
+
+    The relative poses are right-handed 6-vectors (K, 6). Raises GeometryError.
+    """
     return _augmented(_native_matrices(relative_pose, rules), rules, augmentation)
 
 
-def _native_matrices(six: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    vectors = checked("egomotion", six, (None, 6))
-    return _ARITHMETIC[rules.warp].matrices(
-        vectors if rules.right_handed else flip_six_vector(vectors)
-    )
+def _native_matrices(six_vectors: ArrayLike, rules: LabelProtocol) -> AnyArray:
+    """Return the matrices of right-handed 6-vectors in the protocol's handedness and precision."""
+    vectors = checked("egomotion", six_vectors, (None, 6))
+    if not rules.right_handed:
+        vectors = flip_six_vector(vectors)
+    return _ARITHMETIC[rules.warp].matrices(vectors)
 
 
 def _augmented(
     transforms: AnyArray, rules: LabelProtocol, augmentation: Augmentation | None
 ) -> AnyArray:
-    """A · transforms · A⁻¹."""
+    """Return A · transforms · A⁻¹ for an augmentation A."""
     if augmentation is None or not len(transforms):
         return transforms
     arithmetic = _ARITHMETIC[rules.warp]
-    given = augmentation.matrix if rules.right_handed else flip_pose(augmentation.matrix)
-    matrix = given[None].astype(transforms.dtype)
-    return arithmetic.product(arithmetic.product(matrix, transforms), arithmetic.inverse(matrix))
+    native = augmentation.matrix if rules.right_handed else flip_pose(augmentation.matrix)
+    matrix = native[None].astype(transforms.dtype)
+    changed = arithmetic.product(matrix, transforms)
+    return arithmetic.product(changed, arithmetic.inverse(matrix))
 
 
 def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    """`source_from_target` of transforms (N, 4, 4), as the protocol computes it: in float32 or float64."""
+    """Return `source_from_target` of transforms (N, 4, 4) in the protocol's float32 or float64."""
+    shape = (None, 4, 4)
     if rules.warp == "stretched":
-        return single_precision.inverse(
-            checked("target_from_source", target_from_source, (None, 4, 4), np.float32)
-        )
-    return np.asarray(
-        np.linalg.inv(checked("target_from_source", target_from_source, (None, 4, 4)))
-    )
+        transforms = checked("target_from_source", target_from_source, shape, np.float32)
+        return single_precision.inverse(transforms)
+    return np.asarray(np.linalg.inv(checked("target_from_source", target_from_source, shape)))
 
 
 def nearest_indices(
@@ -184,12 +207,22 @@ def nearest_indices(
     *,
     orientation: Orientation | None = None,
 ) -> CellIndices:
-    """The source cell (H · W,) of each target cell: row · W + column, `OUTSIDE` where the sample point is off the grid.
+    """Return the source cell of each target cell, shape (H · W,): row · W + column.
 
-    `source_from_target` (4, 4) is in metres and the protocol's handedness. Both rasters lie in `orientation`, None for
-    the protocol's native one. Points half-way between two cells go to the even one. Raises GeometryError.
+    It is `OUTSIDE` where the sample point is off the grid. Points half-way between two cells go to
+    the even one.
+
+    Args:
+        source_from_target: Transform in metres and the protocol's handedness, shape (4, 4).
+        grid: Cells of both rasters.
+        rules: Protocol of the labels.
+        orientation: Orientation of both rasters; None for the protocol's native one.
+
+    Raises:
+        GeometryError: The transform is not finite, or the grid has too many cells.
     """
-    return rounded_points(sample_points(source_from_target, grid, rules), grid, rules, orientation)
+    points = sample_points(source_from_target, grid, rules)
+    return rounded_points(points, grid, rules, orientation)
 
 
 def rounded_points(
@@ -198,26 +231,29 @@ def rounded_points(
     rules: LabelProtocol,
     orientation: Orientation | None = None,
 ) -> CellIndices:
-    """`nearest_indices` from the sample points."""
-    if grid.cells > _COUNTABLE:
+    """Return `nearest_indices` from the sample points."""
+    if grid.cells > _MAX_CELLS:
         raise GeometryError(
-            f"grid: {grid.cells} cells are more than a warp can number; choose at most {_COUNTABLE}"
+            f"grid: {grid.cells} cells are more than a warp can number; choose at most {_MAX_CELLS}"
         )
-    row, column = np.rint(points[0]), np.rint(points[1])
+    row = np.rint(points[0])
+    column = np.rint(points[1])
     rows, columns = row.shape
-    beside = (row < 0) | (row >= rows)
-    beside |= column < 0
-    beside |= column >= columns
+    is_outside = (row < 0) | (row >= rows)
+    is_outside |= column < 0
+    is_outside |= column >= columns
     native = rules.native
-    lying = native if orientation is None else orientation
-    first, down, along = _numbering(grid.with_orientation(lying), native)
-    row *= down
-    column *= along
+    raster_orientation = native if orientation is None else orientation
+    first, row_step, column_step = _numbering(grid.with_orientation(raster_orientation), native)
+    # The rows become the indices, in place.
+    row *= row_step
+    column *= column_step
     row += column
     row += first
-    np.copyto(row, OUTSIDE, where=beside)
+    np.copyto(row, OUTSIDE, where=is_outside)
     cells = row.astype(np.int32)  # first to int32, then to intp: three times as fast
-    return grid.with_orientation(native).reorient(cells, lying).astype(np.intp).ravel()
+    native_grid = grid.with_orientation(native)
+    return native_grid.reorient(cells, raster_orientation).astype(np.intp).ravel()
 
 
 def warp(
@@ -230,37 +266,52 @@ def warp(
     fill: float = 0,
     orientation: Orientation | None = None,
 ) -> AnyArray:
-    """Rasters (…, H, W) in another frame, all the same way: of the same dtype if `nearest`, float32 if `bilinear`.
+    """Warp rasters (…, H, W) into another frame, all by the same transform.
 
-    `source_from_target`, `orientation` and errors as in `nearest_indices`; `fill` is the value outside the grid, which
-    mixes with the border's cells if bilinear. Only cells change places: vectors do not turn.
+    Only cells move: vectors do not turn.
+
+    Args:
+        raster: Rasters, shape (…, H, W).
+        source_from_target: Transform, as in `nearest_indices`.
+        grid: Cells of the rasters.
+        rules: Protocol of the labels.
+        mode: How to sample.
+        fill: Value outside the grid, which mixes with the border's cells if `bilinear`.
+        orientation: Orientation of the rasters, as in `nearest_indices`.
+
+    Returns:
+        Rasters of the same dtype if `nearest`, float32 if `bilinear`.
+
+    Raises:
+        GeometryError: As in `nearest_indices`.
+        ChoiceError: No such mode.
     """
     native = rules.native
-    lying = grid.with_orientation(orientation or native)
+    raster_grid = grid.with_orientation(orientation or native)
     source = np.asarray(raster)
-    by_native_rows = lying.reorient(source, native)  # a view; refuses other shapes
+    native_source = raster_grid.reorient(source, native)  # a view; refuses other shapes
     if checked_mode(mode) == "nearest":
         indices = nearest_indices(source_from_target, grid, rules, orientation=orientation)
-        return take_cells(source.reshape(*source.shape[:-2], -1), indices, fill).reshape(
-            source.shape
-        )
+        flat_source = source.reshape(*source.shape[:-2], -1)
+        return take_cells(flat_source, indices, fill).reshape(source.shape)
     result = np.empty(source.shape, dtype=np.float32)
     points = sample_points(source_from_target, grid, rules)
-    lying.reorient(result, native)[...] = blend_cells(by_native_rows, points, fill)
+    raster_grid.reorient(result, native)[...] = blend_cells(native_source, points, fill)
     return result
 
 
 def checked_mode(mode: WarpMode) -> WarpMode:
-    """`mode`, or ChoiceError."""
+    """Return `mode`, or raise ChoiceError."""
     return choice("mode", mode, get_args(WarpMode))
 
 
 def sample_points(
     source_from_target: ArrayLike, grid: BevGrid, rules: LabelProtocol
 ) -> tuple[AnyArray, AnyArray]:
-    """Where in the source each target cell samples: rows and columns (H, W), in cells, 0 the first cell's centre.
+    """Return the rows and columns at which each target cell samples the source, each (H, W).
 
-    Native orientation; float32, but float64 if `exact`. Raises GeometryError.
+    They are in cells, 0 the first cell's centre, in native orientation; float32, but float64 if
+    `exact`. Raises GeometryError.
     """
     matrix = checked("source_from_target", source_from_target, (4, 4))
     rows, columns = sampling_lines(matrix[None], grid, rules)
@@ -270,19 +321,19 @@ def sample_points(
 def sampling_lines(
     matrices: AnyArray, grid: BevGrid, rules: LabelProtocol
 ) -> tuple[SamplingLine, SamplingLine]:
-    """What `sample_points` computes its rows and columns from, for matrices (N, 4, 4): to sample only some cells.
+    """Return the lines from which `sample_points` computes its rows and columns.
 
-    Raises GeometryError.
+    With them only some cells can be sampled. The matrices have the shape (N, 4, 4). Raises
+    GeometryError.
     """
     if not np.isfinite(matrices).all():
         raise GeometryError(
             "source_from_target: not all numbers are finite; leave out frames without a pose"
         )
     if rules.warp == "fiery":
-        numbers = (
-            conventions.six_vectors_of(np.linalg.inv(matrices)).astype(np.float32).T[..., None]
-        )
-        return fiery_lines(numbers[0], numbers[1], numbers[5], grid.x, grid.y)
+        six_vectors = conventions.six_vectors_of(np.linalg.inv(matrices)).astype(np.float32)
+        components = six_vectors.T[..., None]
+        return fiery_lines(components[0], components[1], components[5], grid.x, grid.y)
     native = grid.with_orientation(rules.native)
     order = [0, 1] if native.orientation == "fiery" else [1, 0]
     planes = matrices[:, order][:, :, [*order, 3]]  # z = 0: metres along rows and columns
@@ -293,13 +344,17 @@ def sampling_lines(
 
 @functools.lru_cache(maxsize=64)
 def _numbering(grid: BevGrid, native: Orientation) -> tuple[int, int, int]:
-    """How `grid`'s orientation numbers the cells of the native one: the first, the step of a row, of a column."""
+    """Return how the orientation of `grid` numbers the cells of the native one.
+
+    Returns:
+        Number of the first cell, step of a row, and step of a column.
+    """
     numbers = grid.reorient(np.arange(grid.cells).reshape(grid.shape), native)
-    first, below, beside = (
+    first, last_row, last_column = (
         int(corner) for corner in (numbers[0, 0], numbers[-1, 0], numbers[0, -1])
     )
-    rows, columns = (max(count - 1, 1) for count in numbers.shape)
-    return first, (below - first) // rows, (beside - first) // columns
+    row_steps, column_steps = (max(count - 1, 1) for count in numbers.shape)
+    return first, (last_row - first) // row_steps, (last_column - first) // column_steps
 
 
 def past_to_present(
@@ -311,25 +366,28 @@ def past_to_present(
     mode: WarpMode = "nearest",
     augmentation: Augmentation | None = None,
 ) -> AnyArray:
-    """An agent's maps of past moments in its present ego frame; the present, the last one, stays as it is.
+    """Warp an agent's maps of past moments into its present ego frame.
+
+    The present, the last map, does not change.
 
     Args:
-        features: (T, …, H, W) maps in the orientation of `grid`, the oldest first.
-        egomotion: (≥ T − 1, 6) right-handed 6-vectors, `next_from_this` from the oldest moment on, such as
-            `MotionLabels.future_egomotion`; further rows are not used.
-        grid: the maps' cells; the released ones in the devkit's orientation if None.
-        protocol: whose sampling rule, and whose order of the motions (see `present_from_past`).
-        mode: how to sample.
-        augmentation: the one that all maps have.
+        features: Maps in the orientation of `grid`, shape (T, …, H, W), the oldest first.
+        egomotion: Right-handed 6-vectors, shape (≥ T − 1, 6), `next_from_this` from the oldest
+            moment on, such as `MotionLabels.future_egomotion`; further rows are not used.
+        grid: Cells of the maps; None for the released cells in the devkit's orientation.
+        protocol: Protocol with the sampling rule and the order of the motions (see
+            `present_from_past`).
+        mode: How to sample.
+        augmentation: Augmentation of all maps.
 
     Returns:
-        The same shape; of the same dtype if `nearest`, float32 if `bilinear`.
+        Maps of the same shape; of the same dtype if `nearest`, float32 if `bilinear`.
 
     Raises:
-        GeometryError: shapes that do not fit.
-        ChoiceError: no such protocol or mode.
+        GeometryError: Shapes that do not fit.
+        ChoiceError: No such protocol or mode.
     """
-    maps = _maps(features)
+    maps = _checked_maps(features)
     motion = checked("egomotion", egomotion, (None, 6))
     if len(maps) > len(motion) + 1:
         raise GeometryError(
@@ -349,30 +407,29 @@ def agents_to_ego(
     mode: WarpMode = "nearest",
     augmentation: Augmentation | None = None,
 ) -> AnyArray:
-    """Agents' maps of one moment in the ego's frame; the ego's own, the first one, stays as it is.
+    """Warp agents' maps of one moment into the ego's frame.
+
+    The ego's own map, the first one, does not change. The result and the errors are as in
+    `past_to_present`.
 
     Args:
-        features: (K, …, H, W) maps in the orientation of `grid`, the ego's first.
-        relative_pose: (K, 6) right-handed 6-vectors `ego_from_agent`, as `v2x.relative_pose_to_ego` gives them.
-        grid: see `past_to_present`, as for all later arguments, the result and the errors.
-        protocol: whose sampling rule.
-        mode: how to sample.
-        augmentation: the one that all maps have.
+        features: Maps in the orientation of `grid`, shape (K, …, H, W), the ego's first.
+        relative_pose: Right-handed 6-vectors `ego_from_agent`, shape (K, 6), as
+            `v2x.relative_pose_to_ego` returns them.
+        grid: Cells of the maps; None for the released cells in the devkit's orientation.
+        protocol: Protocol with the sampling rule.
+        mode: How to sample.
+        augmentation: Augmentation of all maps.
     """
-    maps = _maps(features)
+    maps = _checked_maps(features)
     poses = checked("relative_pose", relative_pose, (len(maps), 6))
     rules = label_protocol(protocol)
-    return _warped(
-        maps,
-        list(range(1, len(maps))),
-        ego_from_agents(poses[1:], rules, augmentation),
-        rules,
-        grid,
-        mode,
-    )
+    transforms = ego_from_agents(poses[1:], rules, augmentation)
+    return _warped(maps, list(range(1, len(maps))), transforms, rules, grid, mode)
 
 
-def _maps(features: ArrayLike) -> AnyArray:
+def _checked_maps(features: ArrayLike) -> AnyArray:
+    """Return features as an array (K, …, H, W), or raise GeometryError."""
     maps = as_numbers("features", features, "maps (K, …, H, W)", dtype=None)
     if maps.ndim < 3 or not len(maps):
         raise GeometryError(
@@ -389,9 +446,10 @@ def _warped(
     grid: BevGrid | None,
     mode: WarpMode,
 ) -> AnyArray:
-    """A copy of the maps in which those numbered `moved` are warped, each with its transform."""
+    """Return a copy of the maps; the maps with numbers `moved` are warped by their transforms."""
     cells = BevGrid() if grid is None else grid
+    orientation = cells.orientation
     result = maps.astype(maps.dtype if checked_mode(mode) == "nearest" else np.float32)
     for index, matrix in zip(moved, sampling_matrix(target_from_source, rules), strict=True):
-        result[index] = warp(maps[index], matrix, cells, rules, mode, orientation=cells.orientation)
+        result[index] = warp(maps[index], matrix, cells, rules, mode, orientation=orientation)
     return result

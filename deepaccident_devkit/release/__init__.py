@@ -1,6 +1,7 @@
 """The files of a release on disk, exactly as they are: a reader and a writer for each kind.
 
-Readers convert CARLA's left-handed values to the devkit's right-handed ones unless called with `raw=True`.
+Readers convert CARLA's left-handed values to the devkit's right-handed ones unless called with
+`raw=True`.
 """
 
 from deepaccident_devkit.release.calib import (

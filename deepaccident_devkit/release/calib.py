@@ -1,4 +1,4 @@
-"""`calib/*.pkl`: the poses and cameras of one agent at one frame (docs/format.md, Calib)."""
+"""Calib files `calib/*.pkl`: poses and cameras of an agent at a frame (docs/format.md, Calib)."""
 
 import pickle
 from collections.abc import Mapping, Sequence
@@ -39,13 +39,15 @@ _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibs(ShortRepr):
-    """The calibration of F frames, right-handed, cameras optical; arrays are read-only.
+    """Calibration of F frames, right-handed, cameras optical; arrays are read-only.
 
     Attributes:
-        ego_from_lidar: (F, 4, 4) float64.
-        world_from_ego: (F, 4, 4) float64.
-        camera_from_lidar: (F, 6, 4, 4) float64, in the order of `taxonomy.CAMERAS`.
-        intrinsic: (F, 6, 3, 3) float64, K = [[f, 0, cx], [0, f, cy], [0, 0, 1]], pixels.
+        ego_from_lidar: Poses of the LiDAR on the agent, shape (F, 4, 4), float64.
+        world_from_ego: Poses of the agent, shape (F, 4, 4), float64.
+        camera_from_lidar: Transforms to the cameras in the order of `taxonomy.CAMERAS`, shape (F,
+            6, 4, 4), float64.
+        intrinsic: Matrices K = [[f, 0, cx], [0, f, cy], [0, 0, 1]], shape (F, 6, 3, 3), float64,
+            pixels.
     """
 
     ego_from_lidar: FloatArray
@@ -59,19 +61,20 @@ class Calibs(ShortRepr):
             object.__setattr__(self, name, readonly(getattr(self, name)))
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.world_from_ego)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calib(ShortRepr):
-    """The calibration of one agent at one frame, right-handed.
+    """Calibration of one agent at one frame, right-handed.
 
     Attributes:
-        ego_from_lidar: the LiDAR's pose on the agent.
-        world_from_ego: the agent's pose.
-        camera_from_lidar: camera channel → LiDAR frame to the camera's optical frame.
-        intrinsic: camera channel → K (3, 3), pixels.
+        ego_from_lidar: Pose of the LiDAR on the agent.
+        world_from_ego: Pose of the agent.
+        camera_from_lidar: Camera channel → transform from the LiDAR frame to the camera's optical
+            frame.
+        intrinsic: Camera channel → matrix K, shape (3, 3), pixels.
     """
 
     ego_from_lidar: SE3
@@ -85,40 +88,45 @@ def read_calib(path: ReleasePath, *, raw: Literal[False] = False) -> Calib: ...
 @overload
 def read_calib(path: ReleasePath, *, raw: Literal[True]) -> dict[str, AnyArray]: ...
 def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
-    """The calibration in one file.
+    """Return the calibration in one file.
 
     Args:
-        path: the file.
-        raw: return the file's own dict instead: left-handed matrices, cameras with x depth, y right, z up.
+        path: The file.
+        raw: Whether to return the file's own dictionary: left-handed matrices, cameras with x
+            depth, y right, z up.
 
     Raises:
-        MissingFileError: there is no such file.
-        CalibError: it is damaged, lacks a key, holds an array of a wrong shape, NaN, a number beyond 1e9 or a transform
-            that is not rigid, or asks for anything but numpy arrays to be made (nothing of such a file is run).
+        MissingFileError: There is no such file.
+        CalibError: The file is damaged, lacks a key, holds an array of a wrong shape, NaN, a number
+            beyond 1e9 or a transform that is not rigid, or would make objects other than numpy
+            arrays (nothing of such a file is run).
     """
-    file = read_unchecked_calib(path)
-    calibs = _converted([path], _stacked([file]))
+    raw_arrays = read_unchecked_calib(path)
+    calibs = _converted([path], _stacked([raw_arrays]))
     if raw:
-        return file
+        return raw_arrays
+    camera_from_lidar = {}
+    intrinsic = {}
+    for index, name in enumerate(CAMERAS):
+        camera_from_lidar[name] = SE3(calibs.camera_from_lidar[0, index])
+        intrinsic[name] = readonly(calibs.intrinsic[0, index])
     return Calib(
         ego_from_lidar=SE3(calibs.ego_from_lidar[0]),
         world_from_ego=SE3(calibs.world_from_ego[0]),
-        camera_from_lidar={
-            name: SE3(calibs.camera_from_lidar[0, k]) for k, name in enumerate(CAMERAS)
-        },
-        intrinsic={name: readonly(calibs.intrinsic[0, k]) for k, name in enumerate(CAMERAS)},
+        camera_from_lidar=camera_from_lidar,
+        intrinsic=intrinsic,
     )
 
 
 def read_calibs(paths: Sequence[ReleasePath]) -> Calibs:
-    """The calibrations of several files as stacked arrays; raises as `read_calib` does."""
+    """Return the calibrations of several files as stacked arrays; raises as `read_calib` does."""
     contents = [read_content(path, "calib", CalibError) for path in paths]
+    # Load the first file to check its keys and shapes; files with the same layout are stacked.
     files = [_loaded(path, content) for path, content in zip(paths[:1], contents[:1], strict=True)]
-    arrays = load_stacked(contents)  # of the first one's layout, whose keys and shapes are checked
+    arrays = load_stacked(contents)
     if arrays is None:
-        files += [
-            _loaded(path, content) for path, content in zip(paths[1:], contents[1:], strict=True)
-        ]
+        for path, content in zip(paths[1:], contents[1:], strict=True):
+            files.append(_loaded(path, content))
         arrays = _stacked(files)
     return _converted(paths, arrays)
 
@@ -130,26 +138,25 @@ def write_calib(path: Path, calib: Calib) -> None:
         "ego_to_world": conventions.flip_pose(calib.world_from_ego.matrix),
     }
     for camera in CAMERAS:
-        raw[f"lidar_to_{camera}"] = conventions.camera_from_lidar_to_raw(
-            calib.camera_from_lidar[camera].matrix
-        )
+        camera_from_lidar = calib.camera_from_lidar[camera].matrix
+        raw[f"lidar_to_{camera}"] = conventions.camera_from_lidar_to_raw(camera_from_lidar)
         raw[f"intrinsic_{camera}"] = conventions.intrinsic_to_raw(calib.intrinsic[camera])
     write_raw_calib(path, raw)
 
 
 def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
-    """Write a file's own dict, as `read_calib(raw=True)` returns it; it is not checked that this can be read again.
+    """Write a file's own dictionary, as `read_calib(raw=True)` returns it.
 
-    Old numpy versions can read it too.
+    The arrays are not checked, so that `read_calib` may refuse the file. Old numpy versions can
+    also read it.
     """
-    arrays = {
-        key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()
-    }  # + 0.0: no negative zeros
+    # Adding 0.0 removes negative zeros.
+    arrays = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}
     write_bytes(path, pickled(arrays))
 
 
 def read_unchecked_calib(path: ReleasePath) -> dict[str, AnyArray]:
-    """A file's own dict, as `read_calib(raw=True)` returns it, but whatever its numbers are: only keys and shapes hold.
+    """Return a file's own dictionary like `read_calib(raw=True)`, without a check of its numbers.
 
     Raises as `read_calib` does, but not for NaN and transforms that are not rigid.
     """
@@ -157,53 +164,50 @@ def read_unchecked_calib(path: ReleasePath) -> dict[str, AnyArray]:
 
 
 def _loaded(path: ReleasePath, content: bytes) -> dict[str, AnyArray]:
+    """Return the arrays in a file's bytes, or raise CalibError."""
     try:
-        loaded = load_arrays(content)
+        value = load_arrays(content)
     except pickle.UnpicklingError as error:
         detail = str(error) if content else "the file is empty"
         raise CalibError(f"{path}: not a readable calibration ({detail}); {REMEDY}") from error
-    return _checked_raw(path, loaded)
+    return _checked_raw(path, value)
 
 
-def _checked_raw(path: ReleasePath, loaded: Any) -> dict[str, AnyArray]:
-    if not isinstance(loaded, dict):
+def _checked_raw(path: ReleasePath, value: Any) -> dict[str, AnyArray]:
+    """Return the value of a file if it has all arrays in their shapes, or raise CalibError."""
+    if not isinstance(value, dict):
         raise CalibError(
-            f"{path}: expected a dict of arrays, found {type(loaded).__name__}; {REMEDY}"
+            f"{path}: expected a dict of arrays, found {type(value).__name__}; {REMEDY}"
         )
-    missing = [key for key in KEYS if key not in loaded]
+    missing = [key for key in KEYS if key not in value]
     if missing:
         raise CalibError(f"{path}: lacks {', '.join(missing)}; {REMEDY}")
     for key, shape in KEYS.items():
-        array = loaded[key]
-        if (
-            not isinstance(array, np.ndarray)
-            or array.shape != shape
-            or array.dtype.kind not in "fiu"
-        ):
-            found = (
-                f"{array.shape} of {array.dtype}"
-                if isinstance(array, np.ndarray)
-                else type(array).__name__
-            )
-            raise CalibError(
-                f"{path}: {key}: expected numbers of shape {shape}, found {found}; {REMEDY}"
-            )
-    return loaded
+        array = value[key]
+        if not isinstance(array, np.ndarray):
+            fault = type(array).__name__
+        elif array.shape != shape or array.dtype.kind not in "fiu":
+            fault = f"{array.shape} of {array.dtype}"
+        else:
+            continue
+        raise CalibError(
+            f"{path}: {key}: expected numbers of shape {shape}, found {fault}; {REMEDY}"
+        )
+    return value
 
 
 def _stacked(files: Sequence[Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
-    return {
-        key: np.array([file[key] for file in files]).reshape(-1, *shape)
-        for key, shape in KEYS.items()
-    }
+    """Return the arrays of several files, stacked by key."""
+    stacked = {}
+    for key, shape in KEYS.items():
+        stacked[key] = np.array([file[key] for file in files]).reshape(-1, *shape)
+    return stacked
 
 
 def _converted(paths: Sequence[ReleasePath], arrays: Mapping[str, AnyArray]) -> Calibs:
     """Check the numbers of all files (N, …) at once and turn them right-handed."""
-    poses, intrinsics = (
-        np.stack([arrays[key] for key in keys], axis=1).astype(np.float64)
-        for keys in (_POSE_KEYS, _INTRINSIC_KEYS)
-    )
+    poses = np.stack([arrays[key] for key in _POSE_KEYS], axis=1).astype(np.float64)
+    intrinsics = np.stack([arrays[key] for key in _INTRINSIC_KEYS], axis=1).astype(np.float64)
     rigid = _surely_rigid(poses).all(axis=1)
     finite = in_range(intrinsics).all(axis=(1, 2, 3))
     for index in np.flatnonzero(~(rigid & finite)).tolist():
@@ -220,25 +224,24 @@ def _converted(paths: Sequence[ReleasePath], arrays: Mapping[str, AnyArray]) -> 
 
 
 def _surely_rigid(poses: FloatArray) -> BoolArray:
-    """Which transforms (…, 4, 4) are certainly rigid; the others are checked one by one."""
-    turns = poses[..., :3, :3]
+    """Return which transforms (…, 4, 4) are certainly rigid; the others are checked separately."""
+    rotations = poses[..., :3, :3]
     with np.errstate(invalid="ignore", over="ignore"):
-        off = np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-        proper = (off < RIGID_TOLERANCE / 2) & (np.linalg.det(turns) > 0)
-    return np.asarray(
-        proper & in_range(poses).all(axis=(-1, -2)) & (poses[..., 3, :] == _LAST_ROW).all(axis=-1)
-    )
+        products = rotations @ np.swapaxes(rotations, -1, -2)
+        deviations = np.abs(products - np.eye(3)).max(axis=(-1, -2))
+        proper = (deviations < RIGID_TOLERANCE / 2) & (np.linalg.det(rotations) > 0)
+    finite = in_range(poses).all(axis=(-1, -2))
+    return np.asarray(proper & finite & (poses[..., 3, :] == _LAST_ROW).all(axis=-1))
 
 
 def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
-    faults = [
-        f"{key}: {fault}"
-        for key, pose in zip(_POSE_KEYS, poses, strict=True)
-        if (fault := rigid_fault(pose))
-    ]
-    faults += [
-        f"{key}: holds NaN or infinity, or a number beyond {LARGEST_NUMBER:.0e}"
-        for key, matrix in zip((*_POSE_KEYS, *_INTRINSIC_KEYS), (*poses, *intrinsics), strict=True)
-        if not in_range(matrix).all()
-    ]
-    return faults[0] if faults else None
+    """Return the first fault of a file's numbers, or None."""
+    for key, pose in zip(_POSE_KEYS, poses, strict=True):
+        fault = rigid_fault(pose)
+        if fault:
+            return f"{key}: {fault}"
+    keys = (*_POSE_KEYS, *_INTRINSIC_KEYS)
+    for key, matrix in zip(keys, (*poses, *intrinsics), strict=True):
+        if not in_range(matrix).all():
+            return f"{key}: holds NaN or infinity, or a number beyond {LARGEST_NUMBER:.0e}"
+    return None

@@ -1,10 +1,11 @@
-"""Checkpoints as `torch.save` writes them, read without PyTorch: what they say of tensors, and the bytes of these.
+"""Checkpoints of `torch.save`, read without PyTorch: descriptions of tensors, and their bytes.
 
-A checkpoint is a pickle in which a tensor is a view of a storage: an offset, a shape and strides. The storages' bytes
-lie beside the pickle, in a zip whose members are not compressed; before PyTorch 1.6 they follow it in one file.
+A checkpoint is a pickle in which a tensor is a view of a storage: an offset, a shape and strides.
+The storages' bytes lie beside the pickle, in a zip with uncompressed members; before PyTorch 1.6
+they follow it in one file.
 
-The pickle goes through the gate of all pickles (`_unpickle`), which runs nothing of the file. Who makes tensors adds up
-their `size` first, since a view may be larger than its storage.
+The pickle is read by `_unpickle`, which runs nothing of the file. Callers should add up the `size`
+of tensors before they make them, since a view may be larger than its storage.
 """
 
 import math
@@ -16,7 +17,8 @@ from typing import Any, Final, NamedTuple, TypeAlias
 from deepaccident_devkit.release._unpickle import Machine, dict_of
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_member
 
-# What a file that is no checkpoint, a damaged or a hostile one can raise; a Warning where warnings are errors.
+# Errors of a file that is no checkpoint, or is damaged or hostile; a Warning where warnings are
+# errors.
 FAULTS: Final = (
     pickle.UnpicklingError,
     TypeError,
@@ -25,19 +27,20 @@ FAULTS: Final = (
     Warning,
     *DAMAGED_ARCHIVE,
 )
-# Kind of numbers, as PyTorch calls it → bytes of one.
+# PyTorch's name of a type of numbers → bytes of a number.
 NUMBER_BYTES: Final[Mapping[str, int]] = {
     **dict.fromkeys(("float64", "int64"), 8),
     **dict.fromkeys(("float32", "int32"), 4),
     **dict.fromkeys(("float16", "bfloat16", "int16"), 2),
     **dict.fromkeys(("int8", "uint8", "bool"), 1),
 }
-# How a file begins that is no zip: two pickles, of a number that stands for the format, and of its version.
-_OLD: Final = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03."
-# Some 30 are a tensor.
-_MOST_OPCODES: Final = 500_000
-_MOST_DIMENSIONS: Final = 64
-# From a storage's name to its bytes; raises one of `FAULTS`.
+# First bytes of a file that is no zip: two pickles, of a number that stands for the format, and of
+# its version.
+_OLD_SIGNATURE: Final = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03."
+# A tensor has about 30 opcodes.
+_MAX_OPCODES: Final = 500_000
+_MAX_DIMENSIONS: Final = 64
+# Function from a storage's name to its bytes; raises one of `FAULTS`.
 Storages: TypeAlias = Callable[[str], bytes | memoryview]
 
 
@@ -45,11 +48,11 @@ class StoredTensor(NamedTuple):
     """A view of a storage.
 
     Attributes:
-        storage: its name.
-        dtype: kind of numbers, one of `NUMBER_BYTES`.
-        offset: of the first element, in elements.
-        shape: of the tensor, which may be too large for the storage.
-        strides: in elements, one for each dimension.
+        storage: Name of the storage.
+        dtype: Type of the numbers, one of `NUMBER_BYTES`.
+        offset: Position of the first element, in elements.
+        shape: Shape of the tensor, which may be too large for the storage.
+        strides: Strides of all dimensions, in elements.
     """
 
     storage: str
@@ -60,24 +63,29 @@ class StoredTensor(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes that a copy of it takes."""
+        """Size of a copy of the tensor, bytes."""
         return math.prod(self.shape) * NUMBER_BYTES[self.dtype]
 
 
 def read_checkpoint(content: bytes) -> tuple[object, Storages]:
-    """What a checkpoint's pickle holds, with `StoredTensor` in the place of tensors, and the bytes of its storages.
+    """Return the value of a checkpoint's pickle, and a function to its storages' bytes.
 
-    What trainings note beside tensors (numbers of numpy, paths) is None. Raises one of `FAULTS`.
+    The value has a `StoredTensor` for each tensor, and None for other notes of trainings (numbers
+    of numpy, paths). Raises one of `FAULTS`.
     """
     if not content.startswith(b"PK"):
         return _of_old_file(content)
     archive = open_zip(content)
     entries = archive.infolist()
-    stored = all(each.compress_type == zipfile.ZIP_STORED for each in entries)
-    if not stored or sum(each.file_size for each in entries) > len(content):
+    are_stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+    if not are_stored or sum(entry.file_size for entry in entries) > len(content):
         raise ValueError("its members are compressed, or larger than the file")
     names = archive.namelist()
-    root = next((name.removesuffix("data.pkl") for name in names if name.endswith("/data.pkl")), "")
+    root = ""
+    for name in names:
+        if name.endswith("/data.pkl"):
+            root = name.removesuffix("data.pkl")
+            break
 
     def member(name: str) -> bytes:
         return read_member(archive, archive.getinfo(f"{root}{name}"), "weights")
@@ -88,66 +96,85 @@ def read_checkpoint(content: bytes) -> tuple[object, Storages]:
 
 
 def _of_old_file(content: bytes) -> tuple[object, Storages]:
-    if not content.startswith(_OLD):
+    """Return the content of a checkpoint from before PyTorch 1.6."""
+    if not content.startswith(_OLD_SIGNATURE):
         raise ValueError("it begins in another way")
-    kinds: dict[str, str] = {}
-    about = _read(content, kinds, len(_OLD))
-    if about.value["little_endian"] is not True:
+    dtypes: dict[str, str] = {}
+    system = _read(content, dtypes, len(_OLD_SIGNATURE))
+    if system.value["little_endian"] is not True:
         raise ValueError("its numbers are big-endian")
-    held = _read(content, kinds, about.end)
-    names = _read(content, kinds, held.end)
-    storages, at = {}, names.end
+    checkpoint = _read(content, dtypes, system.end)
+    names = _read(content, dtypes, checkpoint.end)
+    storages = {}
+    end = names.end
     for name in names.value:
         if type(name) is not str:
             raise ValueError("a storage whose name is no text is not allowed")
-        first = at + 8  # bytes that say how many elements it has
-        at = first + int.from_bytes(content[at:first], "little") * NUMBER_BYTES[kinds[name]]
-        storages[name] = memoryview(content)[first:at]
-    if at != len(content):
+        begin = end + 8  # after the number of its elements
+        num_elements = int.from_bytes(content[end:begin], "little")
+        end = begin + num_elements * NUMBER_BYTES[dtypes[name]]
+        storages[name] = memoryview(content)[begin:end]
+    if end != len(content):
         raise ValueError("its storages do not end where the file does")
-    return held.value, storages.__getitem__
+    return checkpoint.value, storages.__getitem__
 
 
-def _read(content: bytes, kinds: dict[str, str], start: int = 0) -> Machine:
-    """The pickle that begins at a byte; the kinds of numbers of its storages are added to `kinds`."""
+def _read(content: bytes, dtypes: dict[str, str], start: int = 0) -> Machine:
+    """Read the pickle that begins at a byte.
 
-    def storage(notes: Any) -> StoredTensor:
-        what, kind, name, _device, _count, *view = notes
-        # first of all types: the hash of a tuple can take all time
-        if (
-            {type(kind), type(name)} != {str}
-            or what != "storage"
-            or kind not in NUMBER_BYTES
-            or any(view)
-        ):
+    The types of numbers of its storages are added to `dtypes`.
+    """
+
+    def storage(persistent_id: Any) -> StoredTensor:
+        form, dtype, name, _device, _count, *view = persistent_id
+        # Types are checked first: the hash of a tuple can take unlimited time.
+        is_text = {type(dtype), type(name)} == {str}
+        if not is_text or form != "storage" or dtype not in NUMBER_BYTES or any(view):
             raise ValueError("a storage of another form is not allowed")
-        kinds[name] = kind
-        return StoredTensor(name, kind, 0, (), ())
+        dtypes[name] = dtype
+        return StoredTensor(name, dtype, 0, (), ())
 
-    return Machine(content, _NAMES, _MOST_OPCODES, start=start, refer=storage)
+    return Machine(content, _NAMES, _MAX_OPCODES, start=start, refer=storage)
 
 
-def _ordered(items: list[Any] | None = None) -> dict[Any, Any]:
-    """An ordered dict; Python 2 gives its items, which are taken away, since they may be given to many."""
-    made = dict_of(items or ())
+def _ordered_dict(items: list[Any] | None = None) -> dict[Any, Any]:
+    """Return an ordered dictionary; Python 2 passes its items.
+
+    The list is emptied, since a pickle may pass it many times.
+    """
+    result = dict_of(items or ())
     if items is not None:
         items.clear()
-    return made
+    return result
 
 
 def _tensor(
-    storage: StoredTensor, offset: Any, shape: Any, strides: Any, *_further: object
+    storage: StoredTensor, offset: Any, shape: Any, strides: Any, *_unused: object
 ) -> StoredTensor:
-    if not len(shape) == len(strides) <= _MOST_DIMENSIONS:
-        raise ValueError(f"a tensor of more than {_MOST_DIMENSIONS} dimensions is not allowed")
-    if not all(type(each) is int and each >= 0 for each in (offset, *shape, *strides)):
+    """Return a view of a storage."""
+    if not len(shape) == len(strides) <= _MAX_DIMENSIONS:
+        raise ValueError(f"a tensor of more than {_MAX_DIMENSIONS} dimensions is not allowed")
+    if not all(type(number) is int and number >= 0 for number in (offset, *shape, *strides)):
         raise ValueError("a tensor whose shape is not of whole numbers is not allowed")
     return storage._replace(offset=offset, shape=tuple(shape), strides=tuple(strides))
 
 
-# What a pickle may name, and what stands for it.
+# Names of NumPy and other modules that trainings note beside tensors.
+_IGNORED_NAMES: Final = (
+    "numpy dtype",
+    "numpy ndarray",
+    "_codecs encode",
+    "torch device",
+    "pathlib PosixPath",
+    "numpy.core.multiarray scalar",
+    "numpy.core.multiarray _reconstruct",
+    "numpy._core.multiarray scalar",
+    "numpy._core.multiarray _reconstruct",
+    *(f"torch {dtype}" for dtype in NUMBER_BYTES),
+)
+# Name that a pickle may contain → its stand-in.
 _NAMES: Final[Mapping[str, object]] = {
-    "collections OrderedDict": _ordered,
+    "collections OrderedDict": _ordered_dict,
     **{f"torch._utils _rebuild_{name}": _tensor for name in ("tensor", "tensor_v2")},
     **dict.fromkeys(
         (
@@ -157,24 +184,7 @@ _NAMES: Final[Mapping[str, object]] = {
         ),
         lambda value, *_: value,
     ),
-    **dict.fromkeys(
-        (
-            *(
-                "numpy dtype",
-                "numpy ndarray",
-                "_codecs encode",
-                "torch device",
-                "pathlib PosixPath",
-            ),
-            *(
-                f"numpy.{core}.multiarray {name}"
-                for core in ("core", "_core")
-                for name in ("scalar", "_reconstruct")
-            ),
-            *(f"torch {kind}" for kind in NUMBER_BYTES),
-        ),
-        lambda *_: None,
-    ),
+    **dict.fromkeys(_IGNORED_NAMES, lambda *_: None),
     "torch DoubleStorage": "float64",
     "torch FloatStorage": "float32",
     "torch HalfStorage": "float16",

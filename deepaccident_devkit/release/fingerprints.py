@@ -1,4 +1,4 @@
-"""Hashes of the truth: the bytes of a scenario's label, meta and calib files, as they are in the release."""
+"""Hashes of the ground truth: the bytes of a scenario's label, meta and calib files."""
 
 from __future__ import annotations
 
@@ -33,28 +33,29 @@ if TYPE_CHECKING:
 
 _Reader: TypeAlias = Callable[[ReleasePath, FileKind], bytes]
 _DIGEST_BYTES: Final = 16
-# The number of LiDAR points in a line of a label.
-_POINTS: Final = re.compile(rb" (\d{1,7})(?= (?:True|False)[ \t\r]*$)", re.MULTILINE)
-_UNCOUNTED: Final = attrgetter("meta", "calib", "boxes")
-# LiDAR points by which a scenario's boxes may differ: the root of the sum of their squares. docs/benchmark.md says how
-# much was measured.
+# Number of LiDAR points in a line of a label.
+_POINTS_PATTERN: Final = re.compile(rb" (\d{1,7})(?= (?:True|False)[ \t\r]*$)", re.MULTILINE)
+_HASHES_WITHOUT_POINTS: Final = attrgetter("meta", "calib", "boxes")
+# The LiDAR points of a scenario's boxes may differ by this root of the sum of squares.
+# docs/benchmark.md has the measurement.
 POINTS_TOLERANCE: Final = 12.0
-# What to do about an index that was made from other files.
+# Remedy for an index that was made from other files.
 INDEX_REMEDY: Final = "update it with: deepaccident check index DATAROOT"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioHashes:
-    """Of one scenario's files, each a blake2b of 16 bytes in hexadecimal digits; None where it has no such file.
+    """Hashes of one scenario's files.
 
-    Files go into it by agent (`taxonomy.AGENTS`) and frame, each as its name, its length and its bytes.
+    Each is a blake2b of 16 bytes in hexadecimal digits, or None if there is no such file. It covers
+    files by agent (`taxonomy.AGENTS`) and frame, each with its name, its length and its bytes.
 
     Attributes:
-        label: of all agents' label files.
-        meta: of the meta file.
-        calib: of all agents' calib files.
-        boxes: of all agents' label files without `num_lidar_pts`; None if unknown.
-        points: the sketch of `num_lidar_pts` of all boxes.
+        label: Hash of all agents' label files.
+        meta: Hash of the meta file.
+        calib: Hash of all agents' calib files.
+        boxes: Hash of all agents' label files without `num_lidar_pts`; None if unknown.
+        points: Sketch of `num_lidar_pts` of all boxes.
     """
 
     label: str | None
@@ -64,95 +65,101 @@ class ScenarioHashes:
     points: Sketch = field(default=(), compare=False)
 
     def as_dict(self) -> dict[str, str | None]:
-        """Return the hashes of whole files by name."""
+        """Return the hashes of complete files by name."""
         return {"label": self.label, "meta": self.meta, "calib": self.calib}
 
     def is_like(self, other: ScenarioHashes | None) -> bool:
-        """Return whether the files are the same, but for a few LiDAR points more or less in some boxes."""
+        """Return whether the files are equal, except for the LiDAR points of some boxes.
+
+        The points may differ by `POINTS_TOLERANCE`.
+        """
         if other is None or None in (self.boxes, other.boxes):
             return self == other
-        return (
-            _UNCOUNTED(self) == _UNCOUNTED(other)
-            and distance(self.points, other.points) <= POINTS_TOLERANCE
-        )
+        if _HASHES_WITHOUT_POINTS(self) != _HASHES_WITHOUT_POINTS(other):
+            return False
+        return distance(self.points, other.points) <= POINTS_TOLERANCE
 
 
 class Located(Protocol):
-    """An opened release, such as a `Dataset`: where it is, and what its index was made from."""
+    """An opened release, such as a `Dataset`, with its location and the hashes of its index."""
 
     @property
     def dataroot(self) -> ReleasePath:
-        """The release's folder."""
+        """Folder of the release."""
 
     @property
     def version(self) -> str:
-        """`v1` or `v1-mini`."""
+        """Version, `v1` or `v1-mini`."""
 
     def indexed_hashes(self, scenario: str) -> ScenarioHashes | None:
-        """Return the hashes of the files that a scenario's rows were made from; None where they are unknown."""
+        """Return the hashes of the files from which a scenario's rows were made, or None."""
 
 
 @runtime_checkable
 class HasTruth(Protocol):
-    """A source whose truth is not in a release's files."""
+    """A source with a ground truth that is not in a release's files."""
 
     def truth_hashes(self, scenario: str) -> ScenarioHashes:
-        """The hashes of a scenario's truth; raises TokenError."""
+        """Return the hashes of a scenario's ground truth; raises TokenError."""
 
 
 def scenario_hashes(
-    dataset: Located, scenarios: Collection[str], **how: Unpack[Engine]
+    dataset: Located, scenarios: Collection[str], **engine: Unpack[Engine]
 ) -> dict[str, ScenarioHashes]:
-    """Return the hashes of some scenarios' files by token, in order; scenarios that the release lacks are left out.
+    """Return the hashes of some scenarios' files by token, in order.
 
-    Reads the files, and compares them with those that the index was made from: it does not notice a file that was
-    written in place, so that numbers would be of other files than the hashes.
+    Scenarios that the release lacks are left out. The files are read, and compared with the hashes
+    of the index: the index does not notice a file that was overwritten, so that numbers and hashes
+    would belong to different files.
 
     Args:
-        dataset: the release.
-        scenarios: their tokens.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        scenarios: Tokens of the scenarios.
+        **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
 
     Raises:
-        DatarootError: the release's folder is gone, or one of its folders cannot be listed.
-        IndexStoreError: the index was made from other files.
-        ReleaseError: a file cannot be read.
+        DatarootError: The release's folder no longer exists, or one of its folders cannot be
+            listed.
+        IndexStoreError: The index was made from other files.
+        ReleaseError: A file cannot be read.
     """
     if isinstance(dataset, HasTruth):
         return {token: dataset.truth_hashes(token) for token in sorted(set(scenarios))}
-    from deepaccident_devkit.support.parallel import (
-        Places,
-        run_batch,
-    )  # here: opening a release waits for this module
+    # Imported late, since opening a release waits for this module.
+    from deepaccident_devkit.support.parallel import Places, run_batch
 
     folders = scenario_folders(dataset, scenarios)
-    work, places = partial(checked_hashes, dataset), Places(reads=places_of(dataset.dataroot))
-    return dict(
-        zip(folders, run_batch(work, list(folders.values()), places=places, **how), strict=True)
-    )
+    work = partial(checked_hashes, dataset)
+    places = Places(reads=places_of(dataset.dataroot))
+    results = run_batch(work, list(folders.values()), places=places, **engine)
+    return dict(zip(folders, results, strict=True))
 
 
 def checked_hashes(dataset: Located, scenario: ScenarioFolder) -> ScenarioHashes:
-    """Return the hashes of a scenario's files as they are now; raises as `scenario_hashes`."""
-    hashes, indexed = folder_hashes(scenario), dataset.indexed_hashes(scenario.token)
-    if indexed not in (None, hashes):
+    """Return the hashes of a scenario's present files; raises as `scenario_hashes`."""
+    hashes = folder_hashes(scenario)
+    indexed_hashes = dataset.indexed_hashes(scenario.token)
+    if indexed_hashes not in (None, hashes):
         raise IndexStoreError(
-            f"{dataset.dataroot}: the index is out of date: files of {scenario.token} have changed since it was made; "
-            f"{INDEX_REMEDY}"
+            f"{dataset.dataroot}: the index is out of date: files of {scenario.token} have changed "
+            f"since it was made; {INDEX_REMEDY}"
         )
     return hashes
 
 
 def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, ScenarioFolder]:
-    """Where some scenarios' files lie, by token in order, if they are in the release; raises DatarootError."""
-    folders = {
-        each.token: each
-        for each in reversed(find_release(dataset.dataroot, dataset.version).scenarios)
-    }
+    """Return the folders of some scenarios by token in order, if they are in the release.
+
+    Raises DatarootError.
+    """
+    layout = find_release(dataset.dataroot, dataset.version)
+    # Reversed, so that the first of two folders of a scenario remains.
+    folders = {folder.token: folder for folder in reversed(layout.scenarios)}
     return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
 
 
 def _read(path: ReleasePath, kind: FileKind) -> bytes:
+    """Return a file's bytes, or raise ReleaseError."""
     return read_content(path, kind, ReleaseError)
 
 
@@ -160,61 +167,65 @@ def folder_hashes(scenario: ScenarioFolder, read: _Reader = _read) -> ScenarioHa
     """Return the hashes of a scenario's files.
 
     Args:
-        scenario: where the files lie.
-        read: gives a file's bytes.
+        scenario: Folders of the files.
+        read: Function that returns a file's bytes.
 
     Raises:
-        DatarootError: a folder cannot be listed.
-        ReleaseError: a file cannot be read.
+        DatarootError: A folder cannot be listed.
+        ReleaseError: A file cannot be read.
     """
 
     def contents(kind: FileKind, ending: str) -> dict[ReleasePath, bytes]:
-        paths = [
-            scenario.file(agent, kind, frame, ending)
-            for agent in AGENTS
-            for frame in frame_numbers(scenario.kind_folder(agent, kind), ending)[0]
-        ]
+        paths = []
+        for agent in AGENTS:
+            frames, _ = frame_numbers(scenario.kind_folder(agent, kind), ending)
+            paths += [scenario.file(agent, kind, frame, ending) for frame in frames]
         return {path: read(path, kind) for path in paths}
 
-    labels, meta = contents("label", "txt"), scenario.meta_path
-    counts = [count for text in labels.values() for count in _POINTS.findall(text)]
+    labels = contents("label", "txt")
+    counts = []
+    boxes = {}
+    for path, content in labels.items():
+        counts += _POINTS_PATTERN.findall(content)
+        boxes[path] = _POINTS_PATTERN.sub(b"", content)
+    meta_path = scenario.meta_path
+    meta = {meta_path: read(meta_path, "meta")} if meta_path.is_file() else {}
     base = scenario.root / scenario.folder / scenario.scenario_type
     return ScenarioHashes(
         label=_digest(labels, base),
-        meta=_digest({meta: read(meta, "meta")} if meta.is_file() else {}, meta.parent),
+        meta=_digest(meta, meta_path.parent),
         calib=_digest(contents("calib", "pkl"), base),
-        boxes=_digest({path: _POINTS.sub(b"", text) for path, text in labels.items()}, base),
+        boxes=_digest(boxes, base),
         points=sketch(np.array(counts, dtype=np.float32)),
     )
 
 
 def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) -> str:
-    """A hash of frames and sizes of sensor files of a scenario's agents and channels; folders are only listed."""
-    sizes = [
-        (
-            agent,
-            channel,
-            list(
-                frame_sizes(scenario.kind_folder(agent, channel), CHANNEL_FORMAT[channel]).items()
-            ),
-        )
-        for agent, channel in sensors
-    ]
-    return digest_of(sizes)
+    """Return a hash of frames and sizes of sensor files of a scenario's agents and channels.
+
+    Folders are only listed.
+    """
+    all_sizes = []
+    for agent, channel in sensors:
+        folder = scenario.kind_folder(agent, channel)
+        sizes = frame_sizes(folder, CHANNEL_FORMAT[channel])
+        all_sizes.append((agent, channel, list(sizes.items())))
+    return digest_of(all_sizes)
 
 
 def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:
-    """One hash for the truth of several scenarios, in any order."""
-    return digest_of({token: each.as_dict() for token, each in hashes.items()})
+    """Return one hash for the ground truth of several scenarios, in any order."""
+    return digest_of({token: scenario.as_dict() for token, scenario in hashes.items()})
 
 
 def digest_of(value: Any) -> str:
-    """A hash of a JSON value; the order of names does not matter."""
+    """Return a hash of a JSON value; the order of names does not matter."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
 
 
 def _digest(contents: Mapping[ReleasePath, bytes], base: ReleasePath) -> str | None:
+    """Return a hash of files with their names below a base folder; None without files."""
     if not contents:
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)

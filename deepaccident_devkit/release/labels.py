@@ -1,11 +1,12 @@
 """Label files, and the frames of their velocities.
 
-The release writes `(vx, vy) = Rz(yaw) · v_world`, with the row's own yaw in the agent's LiDAR frame. The rule is the
-same in CARLA's left-handed axes and in the devkit's: mirroring negates both the angle and y. The agent's own row has
-yaw 0, so it reads as the world's.
+The release writes `(vx, vy) = Rz(yaw) · v_world`, with the row's own yaw in the agent's LiDAR
+frame. The rule is the same in CARLA's left-handed axes and in the devkit's: mirroring negates both
+the angle and y. The agent's own row has yaw 0, so it reads as the world's.
 
-Files are parsed in bulk: the bodies of many files are joined, and Arrow casts their columns. Files that it cannot read
-(CRLF, blanks at line ends, one-token lines, faults) are tidied, or their fault is named.
+Files are parsed in bulk: the bodies of many files are joined, and Arrow casts their columns. Files
+that it cannot read (CRLF, blanks at line ends, one-token lines, faults) are normalised, or their
+fault is reported.
 """
 
 import codecs
@@ -35,29 +36,6 @@ from deepaccident_devkit.support.reading import LIMITS_VARIABLE, byte_limit
 from deepaccident_devkit.support.text import integer_of, number_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-
-def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
-    """(N, 2) m/s as a label writes them.
-
-    Args:
-        velocity: (N, 2) m/s in world.
-        yaw: (N,) radians, each box's in the LiDAR frame of the label, of the same handedness.
-    """
-    return turned_vectors(velocity, yaw)
-
-
-def world_from_label_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
-    """(N, 2) m/s in world: the inverse of `label_from_world_velocity`; NaN stays NaN."""
-    return turned_vectors(velocity, -yaw)
-
-
-def turned_vectors(vectors: FloatArray, angle: FloatArray) -> FloatArray:
-    """Vectors (N, 2) turned by angles (N,), from the first axis to the second."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    x, y = vectors[:, 0], vectors[:, 1]
-    return np.column_stack([cos * x - sin * y, sin * x + cos * y])
-
-
 # The 13 fields of a box line, in order.
 LABEL_FIELDS = (
     "class",
@@ -78,35 +56,68 @@ _FINITE_FIELDS = LABEL_FIELDS[1:8]
 _FLOAT_FIELDS = LABEL_FIELDS[1:10]
 _INTEGER_FIELDS = ("id", "num_lidar_pts")
 _HEADER = ("speed_x", "speed_y")
-_FILES_A_CALL = 250
-_MOST_THREADS = 4
-# Of the longest lines; a file that is as large as it may be has so many lines at the most.
-_BYTES_A_LINE = 192
-# Lines among which a fault is looked for one by one.
-_LINES_A_STEP = 1000
+_FILES_PER_CALL = 250
+_MAX_THREADS = 4
+# Length of the longest lines; it limits the number of lines of a file of the largest size.
+_MAX_BYTES_PER_LINE = 192
+# A fault is searched line by line among this many lines.
+_LINES_PER_STEP = 1000
 _REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
+
+
+def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Return velocities in the form of a label, shape (N, 2), m/s.
+
+    Args:
+        velocity: Velocities in the world frame, shape (N, 2), m/s.
+        yaw: Yaws of the boxes in the label's LiDAR frame, shape (N,), radians, with the same
+            handedness.
+    """
+    return turned_vectors(velocity, yaw)
+
+
+def world_from_label_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Return velocities in the world frame, shape (N, 2), m/s.
+
+    This is the inverse of `label_from_world_velocity`; NaN stays NaN.
+    """
+    return turned_vectors(velocity, -yaw)
+
+
+def turned_vectors(vectors: FloatArray, angle: FloatArray) -> FloatArray:
+    """Return vectors (N, 2) turned by angles (N,), from the first axis to the second."""
+    cos = np.cos(angle)
+    sin = np.sin(angle)
+    x = vectors[:, 0]
+    y = vectors[:, 1]
+    turned_x = cos * x - sin * y
+    turned_y = sin * x + cos * y
+    return np.column_stack([turned_x, turned_y])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Labels(ShortRepr):
-    """The N boxes of F label files, file after file; arrays are read-only.
+    """N boxes of F label files, file after file; arrays are read-only.
 
-    Right-handed (x forward, y left, yaw counter-clockwise) unless read with `raw=True`, then as the files say
-    (y right, yaw clockwise).
+    Right-handed (x forward, y left, yaw counter-clockwise) unless read with `raw=True`, then in the
+    files' own axes (y right, yaw clockwise).
 
     Attributes:
-        raw: whether the values are the files' own.
-        num_boxes: (F,) int64, boxes of each file.
-        agent_velocity: (F, 2) float64, m/s, the recording agent's velocity in the world frame; NaN as well.
-        category: (N,) int8, index into `taxonomy.CATEGORIES`.
-        center: (N, 3) float64, metres, box centre in the agent's LiDAR frame.
-        size: (N, 3) float64, full length, width, height, metres.
-        yaw: (N,) float64, radians about z in the LiDAR frame.
-        velocity: (N, 2) float64, m/s, as the label says; NaN where the label's is NaN, infinite or beyond 1e9. The
-            world's, turned once more by `yaw` (`world_from_label_velocity`).
-        actor_id: (N,) int64; −100 the recording agent, −1 untracked, from 20000 on parked.
-        num_lidar_pts: (N,) int64.
-        camera_visible: (N,) bool.
+        raw: Whether the values are the files' own.
+        num_boxes: Number of boxes of each file, shape (F,), int64.
+        agent_velocity: Velocity of the recording agent in the world frame, shape (F, 2), float64,
+            m/s; may be NaN.
+        category: Index into `taxonomy.CATEGORIES`, shape (N,), int8.
+        center: Centre in the agent's LiDAR frame, shape (N, 3), float64, metres.
+        size: Full length, width, height, shape (N, 3), float64, metres.
+        yaw: Yaw about z in the LiDAR frame, shape (N,), float64, radians.
+        velocity: Velocity as in the label, shape (N, 2), float64, m/s; NaN where the label's is
+            NaN, infinite or beyond 1e9. It is the velocity in the world frame, turned once more by
+            `yaw` (`world_from_label_velocity`).
+        actor_id: Actor id, shape (N,), int64; −100 the recording agent, −1 untracked, from 20000 on
+            parked.
+        num_lidar_pts: Number of LiDAR points, shape (N,), int64.
+        camera_visible: Whether a camera sees the box, shape (N,), bool.
     """
 
     raw: bool
@@ -129,53 +140,56 @@ class Labels(ShortRepr):
                 object.__setattr__(self, field.name, readonly(value))
 
     def __len__(self) -> int:
-        """Number of boxes."""
+        """Return the number of boxes."""
         return len(self.center)
 
     def boxes(self) -> Boxes:
-        """The boxes in the LiDAR frame, with the label's velocity; right-handed, whatever `raw` was."""
-        sign = conventions.flip_yaw if self.raw else np.asarray
-        center, velocity = self.center, self.velocity
+        """Return the boxes in the LiDAR frame, with the label's velocity; always right-handed."""
+        center = self.center
+        velocity = self.velocity
+        yaw = self.yaw
         if self.raw:
-            center, velocity = conventions.flip_points(center), conventions.flip_vectors2(velocity)
+            center = conventions.flip_points(center)
+            velocity = conventions.flip_vectors2(velocity)
+            yaw = conventions.flip_yaw(yaw)
+        rows = [np.arange(count) for count in self.num_boxes]
         return Boxes(
             frame="lidar",
             center=center,
             size=self.size,
-            rotation=quaternions.from_yaw(sign(self.yaw)),
+            rotation=quaternions.from_yaw(yaw),
             velocity=np.column_stack([velocity, np.zeros(len(self))]),
             category=self.category,
             actor_id=self.actor_id,
             num_lidar_pts=self.num_lidar_pts,
             camera_visible=self.camera_visible,
-            row=np.concatenate([np.arange(count) for count in self.num_boxes] or [np.zeros(0)]),
+            row=np.concatenate(rows or [np.zeros(0)]),
         )
 
 
 def read_label(path: ReleasePath, *, raw: bool = False) -> Labels:
-    """One label file; see `read_labels`."""
+    """Read one label file; see `read_labels`."""
     return read_labels([path], raw=raw)
 
 
 def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
-    """The boxes of several label files.
+    """Read the boxes of several label files.
 
-    Lines with one token or none are skipped (`read_lone_words` tells them), blanks at line ends and CRLF are read, a
-    file with only line 1 is valid.
+    Lines with one token or none are skipped (`read_lone_words` returns them), blanks at line ends
+    and CRLF are accepted, a file with only line 1 is valid.
 
     Args:
-        paths: the files.
-        raw: keep CARLA's left-handed values.
+        paths: The files.
+        raw: Whether to keep CARLA's left-handed values.
 
     Raises:
-        MissingFileError: a file is not there.
-        LabelError: a file is truncated or too large, or a line has another number of fields, a word where a number
-            belongs, an unknown class, NaN, infinity or more than 1e9 in a position, size or yaw; the message names file
-            and line.
+        MissingFileError: A file does not exist.
+        LabelError: A file is truncated or too large, or a line has another number of fields, a word
+            instead of a number, an unknown class, NaN, infinity or more than 1e9 in a position,
+            size or yaw; the message names file and line.
     """
-    batches = [
-        paths[start : start + _FILES_A_CALL] for start in range(0, len(paths), _FILES_A_CALL)
-    ]
+    starts = range(0, len(paths), _FILES_PER_CALL)
+    batches = [paths[start : start + _FILES_PER_CALL] for start in starts]
     parts = _parse_batches(batches or [[]])
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     if not raw:
@@ -187,32 +201,39 @@ def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
 
 
 def read_lone_words(path: ReleasePath) -> list[tuple[int, str, bool]]:
-    """The lines of a label that are skipped since they have one word: number, word, whether the file ends within it.
+    """Return the lines of a label file that are skipped since they have only one word.
 
     Raises as `read_label` does, if the file cannot be read.
+
+    Returns:
+        Number of the line, word, and whether the file ends within the word.
     """
     lines = _content(path, ended=False).splitlines(keepends=True)
-    return [
-        (number, shortened(words[0].decode(errors="replace")), not line.endswith((b"\n", b"\r")))
-        for number, line in enumerate(lines, start=1)
-        if len(words := line.split(maxsplit=1)) == 1
-    ]
+    lone_words = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split(maxsplit=1)
+        if len(words) == 1:
+            word = shortened(words[0].decode(errors="replace"))
+            lone_words.append((number, word, not line.endswith((b"\n", b"\r"))))
+    return lone_words
 
 
 def write_label(path: Path, labels: Labels) -> None:
-    """Write one file's boxes with CARLA's signs; reading it back gives equal values. The last line has no end.
+    """Write one file's boxes with CARLA's signs; reading the file returns equal values.
+
+    The last line has no line end.
 
     Raises:
-        LabelError: `labels` are not those of one file.
+        LabelError: `labels` have another number of files than one.
     """
     if len(labels.num_boxes) != 1:
         raise LabelError(f"{path}: expected the labels of one file, found {len(labels.num_boxes)}")
     flip = 1.0 if labels.raw else -1.0
     signs = np.array([1, flip, 1, 1, 1, 1, flip, 1, flip])
-    numbers = (
-        np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity]) * signs + 0.0
-    )
-    speed = labels.agent_velocity[0] * (1.0, flip) + 0.0  # + 0.0: no negative zeros
+    values = np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity])
+    # Adding 0.0 removes negative zeros.
+    numbers = values * signs + 0.0
+    speed = labels.agent_velocity[0] * (1.0, flip) + 0.0
     lines = [_words(speed.tolist())]
     rows = zip(
         labels.category.tolist(),
@@ -222,67 +243,77 @@ def write_label(path: Path, labels: Labels) -> None:
         labels.camera_visible.tolist(),
         strict=True,
     )
-    lines += [
-        f"{CATEGORIES[code]} {_words(row)} {actor} {points} {seen}"
-        for code, row, actor, points, seen in rows
-    ]
+    for code, row, actor, points, visible in rows:
+        lines.append(f"{CATEGORIES[code]} {_words(row)} {actor} {points} {visible}")
     write_bytes(path, "\n".join(lines).encode("ascii"))
 
 
 def _words(numbers: Iterable[float]) -> str:
+    """Return numbers as words with a blank between them."""
     return " ".join(map(repr, numbers))
 
 
 def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[dict[str, AnyArray]]:
-    """Parse every batch: of several, this thread reads files while other threads parse."""
+    """Parse every batch; of several batches, this thread reads files while others parse."""
     if len(batches) < 2:
         return [_parse_files(batch, [_content(path) for path in batch]) for batch in batches]
     from concurrent.futures import ThreadPoolExecutor
 
-    import pyarrow as pa  # noqa: F401 - here: pyarrow 25.0.0 crashes after the thread has ended that imports it
+    # Imported in this thread: pyarrow 25.0.0 crashes after the end of the thread that imports it.
+    import pyarrow as pa  # noqa: F401
 
-    with ThreadPoolExecutor(min(_MOST_THREADS, usable_cores())) as pool:
-        parts = [
-            pool.submit(_parse_files, batch, [_content(path) for path in batch])
-            for batch in batches
-        ]
+    with ThreadPoolExecutor(min(_MAX_THREADS, usable_cores())) as pool:
+        parts = []
+        for batch in batches:
+            contents = [_content(path) for path in batch]
+            parts.append(pool.submit(_parse_files, batch, contents))
         return [part.result() for part in parts]
 
 
 def _parse_files(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> dict[str, AnyArray]:
-    parsed = _parse_joined(contents)
-    if parsed is None and not any(b"\0" in content for content in contents):
-        parsed = _parse_joined([_tidied(content) for content in contents])
-    if parsed is None or _has_fault(parsed):
+    """Parse files from their bytes, or raise LabelError."""
+    columns = _parse_joined(contents)
+    if columns is None and not any(b"\0" in content for content in contents):
+        columns = _parse_joined([_normalised(content) for content in contents])
+    if columns is None or _has_fault(columns):
         raise _first_fault(paths, contents)
-    return parsed
+    return columns
 
 
 def _content(path: ReleasePath, *, ended: bool = True) -> bytes:
-    """A file's bytes, of not too many lines, ending in a line end if `ended`."""
+    """Return a file's bytes, with a line end at the end if `ended`.
+
+    Raises LabelError if the file has too many lines.
+    """
     content = read_content(path, "label", LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
-    lines = max(content.count(b"\n"), content.count(b"\r"))
-    if lines > (most := byte_limit("label") // _BYTES_A_LINE):
-        sound = f"if it is sound, set {LIMITS_VARIABLE}=label={_BYTES_A_LINE * lines}"
-        raise LabelError(f"{path}: has {lines:,} lines, more than {most:,}; {sound}; {_REMEDY}")
+    num_lines = max(content.count(b"\n"), content.count(b"\r"))
+    max_lines = byte_limit("label") // _MAX_BYTES_PER_LINE
+    if num_lines > max_lines:
+        limit = f"{LIMITS_VARIABLE}=label={_MAX_BYTES_PER_LINE * num_lines}"
+        raise LabelError(
+            f"{path}: has {num_lines:,} lines, more than {max_lines:,}; "
+            f"if it is sound, set {limit}; {_REMEDY}"
+        )
     return content if content.endswith(b"\n") or not ended else content + b"\n"
 
 
 def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
-    """Parse files that end in a line end; None where they need tidying or hold a fault."""
+    """Parse files that end in a line end; return None if they are not normal or hold a fault."""
     import pyarrow as pa
 
-    body_starts = [content.index(b"\n") + 1 for content in contents]
-    header = b"".join(
-        [content[:start] for content, start in zip(contents, body_starts, strict=True)]
-    )
-    body = b"".join(
-        [memoryview(content)[start:] for content, start in zip(contents, body_starts, strict=True)]
-    )
+    headers = []
+    bodies = []
+    for content in contents:
+        body_start = content.index(b"\n") + 1
+        headers.append(content[:body_start])
+        bodies.append(memoryview(content)[body_start:])
+    header = b"".join(headers)
+    body = b"".join(bodies)
     if b"x" in body or b"X" in body:  # Arrow reads hexadecimal integers
         return None
     try:
-        header_words, words = _columns(header, _HEADER), _columns(body, LABEL_FIELDS)
+        header_words = _columns(header, _HEADER)
+        words = _columns(body, LABEL_FIELDS)
         if header_words is None or words is None:
             return None
         num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
@@ -292,10 +323,11 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
 
 
 def _columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
-    """The words of each column, by its name; None unless each line has that many, with one blank between.
+    """Return the words of each column, by its name.
 
-    Not by Arrow's reader of CSV: up to 19 it writes beyond its memory where a line has too many words (apache/arrow
-    45497), and it starts a thread for each call.
+    Return None unless each line has as many words, with one blank between them. Arrow's reader of
+    CSV is not used: up to version 19 it writes beyond its memory if a line has too many words
+    (apache/arrow 45497), and it starts a thread for each call.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -303,27 +335,36 @@ def _columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
     characters = np.frombuffer(content, dtype=np.uint8)
     ends = np.flatnonzero((characters == ord(" ")) | (characters == ord("\n")))
     numbers = np.arange(len(ends))
-    if not np.array_equal(characters[ends] == ord("\n"), numbers % len(names) == len(names) - 1):
+    num_columns = len(names)
+    is_line_end = characters[ends] == ord("\n")
+    if not np.array_equal(is_line_end, numbers % num_columns == num_columns - 1):
         return None
     buffers = [None, pa.py_buffer(np.append(0, ends + 1)), pa.py_buffer(content)]
     words = pa.Array.from_buffers(pa.large_binary(), len(ends), buffers).cast(pa.large_string())
     words = pc.ascii_rtrim(words, characters=" \n")
-    return {name: words.take(pa.array(numbers[at :: len(names)])) for at, name in enumerate(names)}
+    columns = {}
+    for index, name in enumerate(names):
+        columns[name] = words.take(pa.array(numbers[index::num_columns]))
+    return columns
 
 
 def _parse_columns(
     words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray
 ) -> dict[str, AnyArray]:
-    """Raises pyarrow.ArrowInvalid for what is none of its kind; an unknown class is −1."""
+    """Convert the words of columns; an unknown class is −1.
+
+    Raises pyarrow.ArrowInvalid for a word of another type.
+    """
     import pyarrow as pa
     import pyarrow.compute as pc
 
     def numbers(columns: dict[str, Any], names: Sequence[str]) -> FloatArray:
         return np.column_stack([columns[name].cast(pa.float64()).to_numpy() for name in names])
 
-    def codes(name: str, known: Sequence[str]) -> AnyArray:
-        found = pc.index_in(words[name], value_set=pa.array(known, pa.large_string()))
-        return np.asarray(found.fill_null(-1), dtype=np.int8)
+    def codes(name: str, known_words: Sequence[str]) -> AnyArray:
+        value_set = pa.array(known_words, pa.large_string())
+        indices = pc.index_in(words[name], value_set=value_set)
+        return np.asarray(indices.fill_null(-1), dtype=np.int8)
 
     velocity = numbers(words, ("vx", "vy"))
     velocity[~in_range(velocity)] = np.nan
@@ -347,89 +388,95 @@ def _parse_columns(
 
 
 def _has_fault(columns: dict[str, AnyArray]) -> bool:
-    values_good = all(in_range(columns[name]).all() for name in ("center", "size", "yaw"))
-    return not values_good or bool((columns["category"] < 0).any())
+    """Return whether a value is out of range, or a class unknown."""
+    all_in_range = all(in_range(columns[name]).all() for name in ("center", "size", "yaw"))
+    return not all_in_range or bool((columns["category"] < 0).any())
 
 
-def _tidied(content: bytes) -> bytes:
-    """The same label without blank lines, one-token lines, CRLF and superfluous blanks."""
-    lines = (b" ".join(words) for words in map(_split, content.splitlines()) if len(words) > 1)
+def _normalised(content: bytes) -> bytes:
+    """Return the same label without blank lines, one-token lines, CRLF and superfluous blanks."""
+    lines = []
+    for line in content.splitlines():
+        words = _split(line)
+        if len(words) > 1:
+            lines.append(b" ".join(words))
     return b"\n".join([*lines, b""]) or b"\n"
 
 
 def _split(line: bytes) -> list[bytes]:
-    """The words of a line; of one with too many, the last is all the rest."""
+    """Return the words of a line; superfluous words are one."""
     return line.split(maxsplit=len(LABEL_FIELDS))
 
 
 def _first_fault(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> LabelError:
-    """Name the first line that is wrong."""
+    """Return the error of the first wrong line."""
     for path, content in zip(paths, contents, strict=True):
-        if (fault := _faulty_line(content)) is not None:
-            number, what = fault
-            return LabelError(f"{path}:{number}: {what}; {_REMEDY}")
-    odd = [
-        path
-        for path, content in zip(paths, contents, strict=True)
-        if _parse_joined([_tidied(content)]) is None
-    ]
-    return LabelError(
-        f"{(odd or paths)[0]}: cannot be parsed, though each line looks right; {_REMEDY}"
-    )
+        faulty_line = _faulty_line(content)
+        if faulty_line is not None:
+            number, fault = faulty_line
+            return LabelError(f"{path}:{number}: {fault}; {_REMEDY}")
+    odd_paths = []
+    for path, content in zip(paths, contents, strict=True):
+        if _parse_joined([_normalised(content)]) is None:
+            odd_paths.append(path)
+    path = (odd_paths or paths)[0]
+    return LabelError(f"{path}: cannot be parsed, though each line looks right; {_REMEDY}")
 
 
 def _faulty_line(content: bytes) -> tuple[int, str] | None:
-    """The number of the first line that is wrong, and what is."""
-    header_seen = False
+    """Return the number and the fault of the first wrong line; None if there is none."""
+    has_header = False
     for number, line in _suspicious_lines(content.splitlines()):
         if b"\0" in line:
             return number, "holds zero bytes, as a full disk leaves them"
         words = [word.decode("utf-8", errors="replace") for word in _split(line)]
         if len(words) < 2:
             continue
-        fault = _line_fault(words) if header_seen else _header_fault(words)
+        fault = _line_fault(words) if has_header else _header_fault(words)
         if fault:
             return number, fault
-        header_seen = True
-    return None if header_seen else (1, "expected '<speed_x> <speed_y>', found an empty file")
+        has_header = True
+    return None if has_header else (1, "expected '<speed_x> <speed_y>', found an empty file")
 
 
 def _suspicious_lines(lines: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Lines and their numbers, without stretches after the first that are read in bulk and hold no fault."""
-    for start in range(0, len(lines), _LINES_A_STEP):
-        stretch = lines[start : start + _LINES_A_STEP]
-        joined = b"\n".join(stretch)
-        parsed = (
-            _parse_joined([b"0 0\n" + _tidied(joined)]) if start and b"\0" not in joined else None
-        )
-        if parsed is None or _has_fault(parsed):
-            yield from enumerate(stretch, start=start + 1)
+    """Yield lines and their numbers, without blocks that are parsed in bulk and hold no fault.
+
+    The first block is always yielded.
+    """
+    for start in range(0, len(lines), _LINES_PER_STEP):
+        block = lines[start : start + _LINES_PER_STEP]
+        joined = b"\n".join(block)
+        columns = None
+        if start and b"\0" not in joined:
+            columns = _parse_joined([b"0 0\n" + _normalised(joined)])
+        if columns is None or _has_fault(columns):
+            yield from enumerate(block, start=start + 1)
 
 
 def _header_fault(words: Sequence[str]) -> str | None:
+    """Return the fault of the first line, or None."""
     if len(words) != len(_HEADER):
         return f"expected '<speed_x> <speed_y>', found {_counted(words)} fields: {_quoted(words)}"
-    return next(
-        (f"{shortened(word)!r} is no number" for word in words if number_of(word) is None), None
-    )
+    for word in words:
+        if number_of(word) is None:
+            return f"{shortened(word)!r} is no number"
+    return None
 
 
 def _line_fault(words: Sequence[str]) -> str | None:
+    """Return the fault of a box's line, or None."""
     if len(words) != len(LABEL_FIELDS):
         return f"expected {len(LABEL_FIELDS)} fields, found {_counted(words)}: {_quoted(words)}"
-    return next(
-        (
-            fault
-            for fault in (
-                _field_fault(name, word) for name, word in zip(LABEL_FIELDS, words, strict=True)
-            )
-            if fault
-        ),
-        None,
-    )
+    for name, word in zip(LABEL_FIELDS, words, strict=True):
+        fault = _field_fault(name, word)
+        if fault:
+            return fault
+    return None
 
 
 def _field_fault(name: str, word: str) -> str | None:
+    """Return the fault of a field, or None."""
     expected = None
     if name == "class" and word not in CATEGORIES:
         expected = f"one of {', '.join(CATEGORIES)}"
@@ -447,8 +494,10 @@ def _field_fault(name: str, word: str) -> str | None:
 
 
 def _counted(words: Sequence[str]) -> str:
+    """Return the number of words for messages."""
     return str(len(words)) if len(words) <= len(LABEL_FIELDS) else f"more than {len(LABEL_FIELDS)}"
 
 
 def _quoted(words: Sequence[str]) -> str:
+    """Return words as a short quotation."""
     return repr(shortened(" ".join(words)))

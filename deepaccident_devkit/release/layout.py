@@ -1,4 +1,4 @@
-"""Where the files of a release lie (docs/format.md, Tree): folders of either layout, split files, missing files."""
+"""Paths of a release's files (docs/format.md, Tree): folders, split files, missing files."""
 
 from __future__ import annotations
 
@@ -42,13 +42,14 @@ from deepaccident_devkit.support.text import choice, spelled
 from deepaccident_devkit.taxonomy import AGENTS, CHANNEL_FORMAT, VERSIONS, AgentName, OnError
 
 _UNLISTABLE_REMEDY = "unpack its archive again, or make it readable"
-_ABOVE_TYPES = (*SPLIT_FOLDERS, MINI_FOLDER)
-_IN_TYPE = ("meta", *AGENTS)
+_SPLIT_NAMES = (*SPLIT_FOLDERS, MINI_FOLDER)
+_TYPE_SUBFOLDERS = ("meta", *AGENTS)
 _KINDS = ("calib", "label", *CHANNEL_FORMAT)
-# The names that browsers, drives and people give to a copy, or to a part, of a folder of some names.
-_COPY = r"(?:Copy of )?({})(?:\W.*|_*\d.*|_+(?i:copy|part|old|new|backup)\w*)?"
-# Folders that the error of a release without scenarios names at most.
-_MOST_ASIDE = 3
+# Names that browsers, drives and people use for a copy, or for a part, of a folder with one of some
+# names.
+_COPY_PATTERN = r"(?:Copy of )?({})(?:\W.*|_*\d.*|_+(?i:copy|part|old|new|backup)\w*)?"
+# The error of a release without scenarios names at most this number of folders.
+_MAX_NAMED_FOLDERS = 3
 # A table that every version of nuScenes has.
 NUSCENES_TABLE: Final = "scene.json"
 _FRAME_FILE = re.compile(r"_(\d{3,})\.\w+")
@@ -57,14 +58,15 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ScenarioFolder:
-    """Where one scenario's files lie.
+    """Folders of one scenario's files.
 
     Attributes:
-        root: the release's folder.
-        folder: the folder of layout B below the root that holds the scenario (`train`, …); empty in layout A.
-        scenario_type: such as `type1_subtype1_accident`.
-        name: such as `Town03_type001_subtype0001_scenario00024`.
-        agents: the agents that have a calib folder, in the order of `taxonomy.AGENTS`.
+        root: Folder of the release.
+        folder: Folder of layout B below the root that holds the scenario (`train`, …); empty in
+            layout A.
+        scenario_type: Scenario type, such as `type1_subtype1_accident`.
+        name: Name of the scenario, such as `Town03_type001_subtype0001_scenario00024`.
+        agents: Agents that have a calib folder, in the order of `taxonomy.AGENTS`.
     """
 
     root: ReleasePath
@@ -75,49 +77,51 @@ class ScenarioFolder:
 
     @property
     def token(self) -> str:
-        """The scenario's token: a name alone occurs in several types."""
+        """Token of the scenario: its name may occur in several types."""
         return f"{self.scenario_type}/{self.name}"
 
     @property
     def meta_path(self) -> ReleasePath:
-        """The scenario's meta file."""
-        return self._below(f"meta/{self.name}.txt")
+        """Meta file of the scenario."""
+        return self._path(f"meta/{self.name}.txt")
 
     def kind_folder(self, agent: str, kind: str) -> ReleasePath:
-        """The folder of one kind of file (`label`, `calib` or a channel) of one agent."""
-        return self._below(f"{agent}/{kind}/{self.name}")
+        """Return the folder of one kind of file (`label`, `calib` or a channel) of one agent."""
+        return self._path(f"{agent}/{kind}/{self.name}")
 
     def file(self, agent: str, kind: str, frame: int, ending: str) -> ReleasePath:
-        """One frame's file of a kind."""
-        return self._below(f"{agent}/{kind}/{self.name}/{self.name}_{frame:03d}.{ending}")
+        """Return one frame's file of a kind."""
+        return self._path(f"{agent}/{kind}/{self.name}/{self.name}_{frame:03d}.{ending}")
 
-    def _below(self, path: str) -> ReleasePath:
-        place = f"{self.folder}/{self.scenario_type}" if self.folder else self.scenario_type
-        return self.root / f"{place}/{path}"  # one join: a release has half a million files
+    def _path(self, relative: str) -> ReleasePath:
+        """Return a path below the folder of the scenario's type."""
+        folder = f"{self.folder}/{self.scenario_type}" if self.folder else self.scenario_type
+        return self.root / f"{folder}/{relative}"  # one join: a release has half a million files
 
     def label_path(self, agent: str, frame: int) -> ReleasePath:
-        """One frame's label file."""
+        """Return one frame's label file."""
         return self.file(agent, "label", frame, "txt")
 
     def calib_path(self, agent: str, frame: int) -> ReleasePath:
-        """One frame's calib file."""
+        """Return one frame's calib file."""
         return self.file(agent, "calib", frame, "pkl")
 
     def channel_path(self, agent: str, channel: str, frame: int) -> ReleasePath:
-        """One frame's image or array of a sensor channel."""
+        """Return one frame's image or array of a sensor channel."""
         return self.file(agent, channel, frame, CHANNEL_FORMAT[channel])
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseLayout(ShortRepr):
-    """What lies under a dataroot, by the names of folders.
+    """Content of a dataroot, by the names of folders.
 
     Attributes:
-        root: the dataroot.
-        version: `v1` or `v1-mini`.
-        layout: `A` (scenario types in the root), `B` (split folders) or `A+B`.
-        scenarios: in the order of their tokens; a scenario that stands in two split folders occurs twice.
-        split_files: split name → its file, where there is one.
+        root: The dataroot.
+        version: Version, `v1` or `v1-mini`.
+        layout: Layout, `A` (scenario types in the root), `B` (split folders) or `A+B`.
+        scenarios: Scenarios in the order of their tokens; a scenario in two split folders occurs
+            twice.
+        split_files: Split name → its file, if there is one.
     """
 
     root: ReleasePath
@@ -128,16 +132,17 @@ class ReleaseLayout(ShortRepr):
 
 
 def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
-    """Find the scenarios under `root`, which `open_dataroot` gives, by listing folders; opens no file.
+    """Find the scenarios under a root of `open_dataroot` by listing folders; opens no file.
 
     Raises:
-        DatarootError: the folder is missing or holds no release.
-        VersionError: the version is unknown or not under this folder.
+        DatarootError: The folder is missing or holds no release.
+        VersionError: The version is unknown or not under this folder.
     """
     version = spelled(version, VERSIONS)
     if version not in VERSIONS:
+        known_versions = ", ".join(VERSIONS)
         raise VersionError(
-            f"unknown version {version!r}; known are {', '.join(VERSIONS)}{_version_remedy(version)}"
+            f"unknown version {version!r}; known are {known_versions}{_version_remedy(version)}"
         )
     try:
         str(root).encode()
@@ -152,55 +157,65 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
             f"{root}: {state}; give the folder that the release was unpacked into as dataroot"
         )
     folders = _folders_of(root, version)
-    scenarios = [scenario for folder in folders for scenario in _scenarios_in(root, folder)]
+    scenarios: list[ScenarioFolder] = []
+    for folder in folders:
+        scenarios.extend(_scenarios_in(root, folder))
     if not scenarios:
-        if isinstance(root, Path) and nuscenes_tables(root):
-            raise DatarootError(
-                f"{root}: is a dataroot of nuScenes; open it with nuscenes.open_nuscenes"
-            )
-        aside = (
-            f"; it is of one scenario type: give {root.parent}"
-            if SCENARIO_TYPE.fullmatch(root.name)
-            else ""
-        )
-        aside += "".join(
-            f"; {path} {f'looks like {meant}: rename it' if meant else 'is a link that leads nowhere'}"
-            for path, meant in islice(left_aside(root), _MOST_ASIDE)
-        )
-        raise DatarootError(
-            f"{root}: no scenario found{aside}; expected <scenario_type>/<agent>/calib/<scenario>/*.pkl below it, or "
-            f"below its folders {', '.join((*SPLIT_FOLDERS, MINI_FOLDER))} "
-            "(unpack the calib archives, give a folder of zips alone, or make a small release with: deepaccident synth "
-            "OUT)"
-        )
+        raise _no_scenario_error(root)
+    layouts = ["A"] * ("" in folders) + ["B"] * any(folders)
     return ReleaseLayout(
         root=root,
         version=version,
-        layout="+".join(["A"] * ("" in folders) + ["B"] * any(folders)),
+        layout="+".join(layouts),
         scenarios=tuple(sorted(scenarios, key=attrgetter("token", "folder"))),
         split_files=_split_files(root),
     )
 
 
-def nuscenes_tables(dataroot: str | os.PathLike[str]) -> Path | None:
-    """The folder of nuScenes' tables in a dataroot, or this folder itself; None where there is none.
-
-    Raises VersionError: the dataroot has several versions; give the folder of one.
-    """
-    given = Path(dataroot)
-    tables = (given / NUSCENES_TABLE, *given.glob(f"v1.0*/{NUSCENES_TABLE}"))
-    found = sorted(table.parent for table in tables if table.is_file())
-    if len(found) > 1:
-        raise VersionError(
-            f"{given}: has several versions of nuScenes; give the folder of one, such as {found[0]}"
+def _no_scenario_error(root: ReleasePath) -> DatarootError:
+    """Return the error of a folder without scenarios, with hints on its content."""
+    if isinstance(root, Path) and nuscenes_tables(root):
+        return DatarootError(
+            f"{root}: is a dataroot of nuScenes; open it with nuscenes.open_nuscenes"
         )
-    return found[0].absolute() if found else None
+    hints = ""
+    if SCENARIO_TYPE.fullmatch(root.name):
+        hints = f"; it is of one scenario type: give {root.parent}"
+    for path, expected_name in islice(left_aside(root), _MAX_NAMED_FOLDERS):
+        if expected_name:
+            hints += f"; {path} looks like {expected_name}: rename it"
+        else:
+            hints += f"; {path} is a link that leads nowhere"
+    return DatarootError(
+        f"{root}: no scenario found{hints}; expected <scenario_type>/<agent>/calib/<scenario>/*.pkl"
+        f" below it, or below its folders {', '.join((*SPLIT_FOLDERS, MINI_FOLDER))} "
+        "(unpack the calib archives, give a folder of zips alone, or make a small release with: "
+        "deepaccident synth OUT)"
+    )
+
+
+def nuscenes_tables(dataroot: str | os.PathLike[str]) -> Path | None:
+    """Return the folder of nuScenes' tables in a dataroot, which may be the folder itself, or None.
+
+    Raises VersionError if the dataroot has several versions; the caller should use the folder of
+    one of them.
+    """
+    root = Path(dataroot)
+    tables = (root / NUSCENES_TABLE, *root.glob(f"v1.0*/{NUSCENES_TABLE}"))
+    folders = sorted(table.parent for table in tables if table.is_file())
+    if len(folders) > 1:
+        raise VersionError(
+            f"{root}: has several versions of nuScenes; give the folder of one, "
+            f"such as {folders[0]}"
+        )
+    return folders[0].absolute() if folders else None
 
 
 def _version_remedy(version: object) -> str:
-    """What to write where a folder, or a version of nuScenes, was given as the version."""
+    """Return the remedy if a folder, or a version of nuScenes, was used as the version."""
     text = os.fspath(version) if isinstance(version, os.PathLike) else str(version)
-    if os.path.isdir(text) or os.sep in text or text.startswith(("~", ".")):  # noqa: PTH112 - odd texts are no folder
+    # Odd texts are no folder.
+    if os.path.isdir(text) or os.sep in text or text.startswith(("~", ".")):  # noqa: PTH112
         return f"; to open the folder, write DeepAccident(dataroot={text!r})"
     if text.lower().startswith("v1"):
         return f"; did you mean {'v1-mini' if text.lower().endswith('mini') else 'v1'!r}?"
@@ -208,23 +223,25 @@ def _version_remedy(version: object) -> str:
 
 
 def frame_numbers(folder: ReleasePath, ending: str) -> tuple[list[int], list[str]]:
-    """The frame numbers of a folder's files, ascending, and the names with that ending but without a frame number.
+    """Return the frame numbers of a folder's files, and the names without a frame number.
 
-    A folder that is not there has none; one that cannot be listed, or a file in its place, raises DatarootError.
+    Both ascend; the names have the same ending. A folder that does not exist has none; a folder
+    that cannot be listed, or a file with its name, raises DatarootError.
     """
-    frames, odd = [], []
+    frames, odd_names = [], []
     for number, entry in _frame_entries(folder, _entries(folder), ending):
         if number is None:
-            odd.append(entry.name)
+            odd_names.append(entry.name)
         else:
             frames.append(number)
-    return sorted(frames), sorted(odd)
+    return sorted(frames), sorted(odd_names)
 
 
 def frame_sizes(folder: ReleasePath, ending: str) -> dict[int, int]:
-    """Frame number → bytes of a folder's files of frames, ascending, by one look into it; raises DatarootError.
+    """Return frame number → size in bytes of a folder's files of frames, ascending.
 
-    A folder that is not there, or with a file in its place, has none; a link to nothing is no file.
+    The folder is listed once. A folder that does not exist, or a file with its name, has none; a
+    link to nothing is no file. Raises DatarootError.
     """
     sizes = {}
     for number, entry in _frame_entries(folder, _entries(folder, files=True), ending):
@@ -237,7 +254,7 @@ def frame_sizes(folder: ReleasePath, ending: str) -> dict[int, int]:
 def _frame_entries(
     folder: ReleasePath, entries: Iterable[FolderEntry], ending: str
 ) -> Iterator[tuple[int | None, FolderEntry]]:
-    """A folder's entries with an ending, each with its frame number; None if the name has none."""
+    """Yield a folder's entries with an ending, and their frame numbers; None for names without."""
     stem = folder.name
     for entry in entries:
         name = entry.name
@@ -249,90 +266,101 @@ def _frame_entries(
 
 
 def names_without_calib(layout: ReleaseLayout) -> Iterator[tuple[ReleasePath, str]]:
-    """Scenario type folders and the names in them that have labels, meta or sensor files, but no calib of any agent.
+    """Yield scenarios that have labels, meta or sensor files, but no calib of any agent.
 
-    Folders that cannot be listed have none; each scenario of theirs tells that itself.
+    They are the folder of the scenario type and the name. Folders that cannot be listed have none;
+    reading their scenarios raises the error.
     """
-    known: dict[ReleasePath, set[str]] = {}
+    known_names: dict[ReleasePath, set[str]] = {}
     for scenario in layout.scenarios:
-        known.setdefault(scenario.root / scenario.folder / scenario.scenario_type, set()).add(
-            scenario.name
-        )
-    for folder, names in known.items():
-        found: set[str] = set()
+        type_folder = scenario.root / scenario.folder / scenario.scenario_type
+        known_names.setdefault(type_folder, set()).add(scenario.name)
+    for folder, names in known_names.items():
+        all_names: set[str] = set()
         with suppress(DatarootError):
-            found = {
-                entry.name[:-4]
-                for entry in _entries(folder / "meta")
-                if entry.name.endswith(".txt")
-            }
+            for entry in _entries(folder / "meta"):
+                if entry.name.endswith(".txt"):
+                    all_names.add(entry.name[:-4])
         for agent in AGENTS:
             for kind in ("label", *CHANNEL_FORMAT):
                 with suppress(DatarootError):
-                    found.update(_subfolders(folder / agent / kind))
-        for name in sorted(found - names):
+                    all_names.update(_subfolders(folder / agent / kind))
+        for name in sorted(all_names - names):
             yield folder, name
 
 
 def left_aside(root: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
-    """What lies in a release and is not read, though it looks as if it should be.
+    """Yield paths in a release that are not read, although they look as if they should be.
 
-    Each folder with a name that only looks like one of the release (downloads are unpacked beside each other as `…
-    (1)`, `…-001`), and what it looks like; each link that leads nowhere or back, and None.
+    They are folders with a name that only resembles one of the release (downloads are unpacked
+    beside each other as `… (1)`, `…-001`), with that name; and links that lead nowhere or back,
+    with None.
     """
-    splits = [root / name for name in _subfolders(root) if name in _ABOVE_TYPES]
-    yield from _aside_in(root, (SCENARIO_TYPE.pattern, *_ABOVE_TYPES))
+    splits = [root / name for name in _subfolders(root) if name in _SPLIT_NAMES]
+    yield from _aside_in(root, (SCENARIO_TYPE.pattern, *_SPLIT_NAMES))
     for folder in splits:
         yield from _aside_in(folder, (SCENARIO_TYPE.pattern,))
-    for of_type in (
-        folder / name for folder in (root, *splits) for name in _scenario_types(folder)
-    ):
-        yield from _aside_in(of_type, _IN_TYPE)
-        for agent in (of_type / name for name in _subfolders(of_type) if name in AGENTS):
-            yield from _aside_in(agent, _KINDS)
-            for kind in (name for name in _subfolders(agent) if name in _KINDS):
-                yield from _aside_in(agent / kind, ())
+    for folder in (root, *splits):
+        for type_name in _scenario_types(folder):
+            yield from _aside_in_type(folder / type_name)
+
+
+def _aside_in_type(type_folder: ReleasePath) -> Iterator[tuple[ReleasePath, str | None]]:
+    """Yield the paths of `left_aside` in the folder of a scenario type."""
+    yield from _aside_in(type_folder, _TYPE_SUBFOLDERS)
+    for agent in _subfolders(type_folder):
+        if agent not in AGENTS:
+            continue
+        agent_folder = type_folder / agent
+        yield from _aside_in(agent_folder, _KINDS)
+        for kind in _subfolders(agent_folder):
+            if kind in _KINDS:
+                yield from _aside_in(agent_folder / kind, ())
 
 
 def _aside_in(
-    folder: ReleasePath, known: Sequence[str]
+    folder: ReleasePath, known_names: Sequence[str]
 ) -> Iterator[tuple[ReleasePath, str | None]]:
-    """What `left_aside` tells of one folder, in which these names (patterns) are read; of others only links."""
+    """Yield the paths of `left_aside` directly in one folder.
+
+    Its folders with known names (patterns) are read; without known names only links count.
+    """
     entries: list[FolderEntry] = []
-    with suppress(DatarootError):  # told where its scenarios are read
+    with suppress(DatarootError):  # reading its scenarios raises the error
         entries = _entries(folder, files=True)
+    pattern = _COPY_PATTERN.format("|".join(known_names))
     for entry in sorted(entries, key=lambda entry: entry.name):
-        path, found = folder / entry.name, re.fullmatch(_COPY.format("|".join(known)), entry.name)
+        path = folder / entry.name
+        match = re.fullmatch(pattern, entry.name)
+        is_known = match is not None and match[1] == entry.name
         if leads_back(entry):
             yield path, None
-        elif (
-            not known
-            or entry.name.startswith(".")
-            or not is_folder(entry)
-            or (found and found[1] == entry.name)
-        ):
+        elif is_known or not known_names or entry.name.startswith(".") or not is_folder(entry):
             continue
-        elif found and (found[1] not in _ABOVE_TYPES or _holds_types(path)):
-            yield path, found[1]
-        elif known is _IN_TYPE and {"calib", "label"}.intersection(_subfolders(path)):
+        elif match and (match[1] not in _SPLIT_NAMES or _holds_types(path)):
+            yield path, match[1]
+        elif known_names is _TYPE_SUBFOLDERS and {"calib", "label"} & {*_subfolders(path)}:
             yield path, f"an agent, of which the release has {', '.join(AGENTS)}"
 
 
 def _holds_types(folder: ReleasePath) -> bool:
-    """Whether scenario types lie in a folder, or in a split folder in it."""
-    return any(
-        SCENARIO_TYPE.match(name)
-        for below in ("", *_ABOVE_TYPES)
-        for name in _subfolders(folder / below)
-    )
+    """Return whether a folder, or a split folder in it, has scenario types."""
+    for split_name in ("", *_SPLIT_NAMES):
+        if any(map(SCENARIO_TYPE.match, _subfolders(folder / split_name))):
+            return True
+    return False
 
 
 def _folders_of(root: ReleasePath, version: str) -> list[str]:
-    """The folders below the root, `""` for the root itself, that hold scenario types of this version."""
+    """Return the folders below the root that hold scenario types of this version.
+
+    The root itself is `""`.
+    """
     flat = [""] if _scenario_types(root) else []
-    split = [
-        name for name in _subfolders(root) if name in _ABOVE_TYPES and _scenario_types(root / name)
-    ]
+    split = []
+    for name in _subfolders(root):
+        if name in _SPLIT_NAMES and _scenario_types(root / name):
+            split.append(name)
     mini = [split.pop(split.index(MINI_FOLDER))] if MINI_FOLDER in split else []
     root_is_mini = root.resolve().name == MINI_FOLDER
     if version == "v1":
@@ -347,50 +375,56 @@ def _folders_of(root: ReleasePath, version: str) -> list[str]:
 
 
 def _scenario_types(folder: ReleasePath) -> list[str]:
+    """Return the names of the scenario types in a folder, sorted."""
     return sorted(filter(SCENARIO_TYPE.fullmatch, _subfolders(folder)))
 
 
 def _scenarios_in(root: ReleasePath, folder: str) -> Iterator[ScenarioFolder]:
+    """Yield the scenarios in a folder below the root; raises DatarootError."""
     for scenario_type in _scenario_types(root / folder):
-        _entries(
-            root / folder / scenario_type
-        )  # one that cannot be listed would hide its scenarios
-        agents_of: dict[str, list[AgentName]] = {}
-        closed: DatarootError | None = None
+        type_folder = root / folder / scenario_type
+        _entries(type_folder)  # raises if it cannot be listed, which would hide its scenarios
+        scenario_agents: dict[str, list[AgentName]] = {}
+        listing_error: DatarootError | None = None
         for agent in AGENTS:
             try:
-                names = _subfolders(root / folder / scenario_type / agent / "calib", loops=True)
-            except DatarootError as error:  # scenarios that other agents name report this themselves when they are read
-                closed, names = error, []
+                names = _subfolders(type_folder / agent / "calib", loops=True)
+            except DatarootError as error:
+                # Scenarios of other agents raise this error when they are read.
+                listing_error = error
+                names = []
             for name in names:
-                agents_of.setdefault(name, []).append(agent)
-        if closed and not agents_of:
-            raise closed
-        for name, agents in agents_of.items():
+                scenario_agents.setdefault(name, []).append(agent)
+        if listing_error and not scenario_agents:
+            raise listing_error
+        for name, agents in scenario_agents.items():
             yield ScenarioFolder(root, folder, scenario_type, name, tuple(agents))
 
 
 def _subfolders(folder: ReleasePath, *, loops: bool = False) -> list[str]:
-    """The folders in a folder; none where a file is in the way, which `frame_numbers` reports for each scenario.
+    """Return the folders in a folder, none if a file has its name.
 
-    With `loops`, so are links to themselves, which `frame_numbers` reports, too.
+    `frame_numbers` reports such a file for each scenario. With `loops`, links to themselves count
+    as folders, which `frame_numbers` also reports.
     """
-    entries = _entries(folder, files=True)
-    return [
-        entry.name
-        for entry in entries
-        if not entry.name.startswith(".") and is_folder(entry, loops=loops)
-    ]
+    names = []
+    for entry in _entries(folder, files=True):
+        if not entry.name.startswith(".") and is_folder(entry, loops=loops):
+            names.append(entry.name)
+    return names
 
 
 def _entries(folder: ReleasePath, *, files: bool = False) -> list[FolderEntry]:
-    """What lies in a folder; nothing if there is no such folder, nor, with `files`, if a file is in its place."""
+    """Return the entries of a folder; none if it does not exist.
+
+    With `files`, there are also none if a file has its name. Raises DatarootError.
+    """
     try:
         return folder_entries(folder)
     except OSError as error:
-        if isinstance(error, FileNotFoundError) or (
-            files and isinstance(error, NotADirectoryError)
-        ):
+        if isinstance(error, FileNotFoundError):
+            return []
+        if files and isinstance(error, NotADirectoryError):
             return []
         raise DatarootError(
             f"{folder}: cannot be listed ({error.strerror}); {_UNLISTABLE_REMEDY}"
@@ -398,74 +432,75 @@ def _entries(folder: ReleasePath, *, files: bool = False) -> list[FolderEntry]:
 
 
 def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = False) -> list[str]:
-    """The scenarios of a split file, in its order, each once, as tokens `<scenario_type>/<scenario>`.
+    """Return the scenarios of a split file, in its order, as tokens `<scenario_type>/<scenario>`.
 
-    Blank lines, blanks at line ends and CRLF are read. A name that is not UTF-8 is as the system gives those of files.
+    Each scenario occurs once. Blank lines, blanks at line ends and CRLF are accepted. A name that
+    is not UTF-8 is decoded like the system's file names.
 
     Args:
-        path: the file.
-        raw: keep scenarios that stand in several lines as often.
-        unique: a scenario in two lines is an error; if not set, it counts once.
+        path: The file.
+        raw: Whether to repeat scenarios that are in several lines.
+        unique: Whether a scenario in two lines is an error; otherwise it counts once.
 
     Raises:
-        MissingFileError: there is no such file.
-        SplitFileError: a line has not two words, the file is no text, or a scenario stands twice and `unique` is set.
+        MissingFileError: There is no such file.
+        SplitFileError: A line does not have two words, the file is no text, or a scenario occurs
+            twice and `unique` is set.
     """
     remedy = "restore it from the release"
     lines = read_lines(path, "split", SplitFileError, remedy, errors="surrogateescape")
     if any("\0" in line for line in lines):
         raise SplitFileError(f"{path}: not a text file; {remedy}")
-    words = [
-        (number, tuple(line.split(maxsplit=2)))
-        for number, line in enumerate(lines, start=1)
-        if line.strip()
-    ]
-    for number, line_words in words:
-        if len(line_words) != 2:
+    numbered_words = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            numbered_words.append((number, tuple(line.split(maxsplit=2))))
+    for number, words in numbered_words:
+        if len(words) != 2:
             raise SplitFileError(
-                f"{path}:{number}: expected '<scenario_type> <scenario>', found {shortened(' '.join(line_words))!r}; "
-                "mend or remove the line"
+                f"{path}:{number}: expected '<scenario_type> <scenario>', "
+                f"found {shortened(' '.join(words))!r}; mend or remove the line"
             )
-    first_line: dict[tuple[str, ...], int] = {}
-    for number, line_words in words if unique else ():
-        if line_words in first_line:
+    first_lines: dict[tuple[str, ...], int] = {}
+    for number, words in numbered_words if unique else ():
+        if words in first_lines:
             raise SplitFileError(
-                f"{path}:{number}: {shortened(' '.join(line_words))!r} stands in line {first_line[line_words]} "
-                "already; remove one of the two lines"
+                f"{path}:{number}: {shortened(' '.join(words))!r} stands in line "
+                f"{first_lines[words]} already; remove one of the two lines"
             )
-        first_line[line_words] = number
-    tokens = ["/".join(line_words) for _, line_words in words]
+        first_lines[words] = number
+    tokens = ["/".join(words) for _, words in numbered_words]
     return tokens if raw else list(dict.fromkeys(tokens))
 
 
 def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:
     """Write scenario tokens, one line each."""
-    lines = [
-        f"{scenario_type} {name}\n"
-        for scenario_type, name in (token.split("/") for token in scenario_tokens)
-    ]
+    lines = []
+    for token in scenario_tokens:
+        scenario_type, name = token.split("/")
+        lines.append(f"{scenario_type} {name}\n")
     write_bytes(path, "".join(lines).encode())
 
 
 class MissingFiles:
-    """Asks for sensor files, and counts by channel those that are not there (`on_missing='skip'`)."""
+    """A check for sensor files, which counts missing ones by channel (`on_missing='skip'`)."""
 
     def __init__(self, root: ReleasePath, on_missing: OnError = "raise") -> None:
-        """Files below a release's folder; raises ChoiceError."""
+        """Prepare the check of files below a release's folder; raises ChoiceError."""
         self._root = root
         self._skips = choice("on_missing", on_missing, get_args(OnError)) == "skip"
-        self._asked: Counter[str] = Counter()
+        self._checked: Counter[str] = Counter()
         self._missing: Counter[str] = Counter()
 
     def has(self, path: ReleasePath, channel: str) -> bool:
-        """Whether a file is there, to be read; raises MissingFileError if it is not and nothing may be left out."""
-        self._asked[channel] += 1
+        """Return whether a file exists; raises MissingFileError if missing files are errors."""
+        self._checked[channel] += 1
         if path.exists():
             return True
         if not self._skips:
             raise MissingFileError(
-                f"{path}: no such file; unpack the archive that holds it, or leave out what is missing with "
-                "on_missing='skip'"
+                f"{path}: no such file; unpack the archive that holds it, or leave out what is "
+                "missing with on_missing='skip'"
             )
         self._missing[channel] += 1
         return False
@@ -474,18 +509,20 @@ class MissingFiles:
         """Log one warning with the number of files that were left out, if any."""
         if self._missing:
             counts = ", ".join(
-                f"{self._missing[name]} of {self._asked[name]} of {name}" for name in self._missing
+                f"{self._missing[name]} of {self._checked[name]} of {name}"
+                for name in self._missing
             )
             _logger.warning("left out files that are not in %s: %s", self._root, counts)
 
 
 def _split_files(root: ReleasePath) -> dict[str, ReleasePath]:
-    found: dict[str, ReleasePath] = {}
+    """Return split name → its file."""
+    paths: dict[str, ReleasePath] = {}
     for name in SPLIT_FILES:
         for folder in (root, root / SPLIT_FILE_FOLDER):
             path = folder / name
-            there = os.path.lexists(path) if isinstance(path, Path) else path.is_file()
-            if there and not path.is_dir():  # a pipe, or a link to itself, is the reader's error
-                found[path.stem] = path
+            exists = os.path.lexists(path) if isinstance(path, Path) else path.is_file()
+            if exists and not path.is_dir():  # reading a pipe, or a link to itself, is an error
+                paths[path.stem] = path
                 break
-    return found
+    return paths

@@ -1,4 +1,4 @@
-"""`meta/<scenario>.txt`: how a scenario was set up and how it ended (docs/format.md, Meta)."""
+"""Meta files `meta/<scenario>.txt`: setup and end of a scenario (docs/format.md, Meta)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,15 +25,16 @@ _SHORT_NAMES = {name: short for short, name in META_AGENTS.items()}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Collision:
-    """The collision that ended a scenario.
+    """Collision that ended a scenario.
 
     Attributes:
-        ids: actor ids of the pair.
-        classes: their category names (`pedestrian` is possible).
-        impact: the simulator's impulse of the contact.
-        spawn_relation: as meta names it, such as `same`.
-        contact_side: as meta names it, such as `front_side`.
-        agents: which agents the pair are, None for a road user that records nothing; None if meta does not say.
+        ids: Actor ids of the pair.
+        classes: Category names of the pair (`pedestrian` is possible).
+        impact: The simulator's impulse of the contact.
+        spawn_relation: Relation of the spawn points in the words of the file, such as `same`.
+        contact_side: Side of the contact in the words of the file, such as `front_side`.
+        agents: Agents of the pair, None for a road user that records nothing; None if the file
+            lacks them.
     """
 
     ids: tuple[int, int]
@@ -46,20 +47,21 @@ class Collision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meta(ShortRepr):
-    """What a meta file says; None where the file lacks the line.
+    """Content of a meta file; None where the file lacks the line.
 
     Attributes:
-        weather: such as `HardRain`.
-        time_of_day: `Noon`, `Sunset` or `Night`.
-        collision: None if the scenario ended without one.
-        simulated_frames: the recorded ones and 10 of warm-up.
-        agent_ids: actor ids of ego, ego_behind, other, other_behind.
-        road_type: `four-way junction` or `three-way junction`.
-        spawn_side: where the other vehicle comes from: `left`, `right` or `opposite…`.
-        ego_direction: `straight`, `left` or `right`.
-        other_direction: likewise.
-        planned_agents: of a scenario without a collision, the pair that `colliding agents:` names nevertheless: the
-            two that should have collided. None if it names nobody, or if there was a collision.
+        weather: Weather, such as `HardRain`.
+        time_of_day: Time of day, `Noon`, `Sunset` or `Night`.
+        collision: Collision at the end; None if the scenario ended without one.
+        simulated_frames: Number of the recorded frames and 10 of warm-up.
+        agent_ids: Actor ids of ego, ego_behind, other, other_behind.
+        road_type: Road type, `four-way junction` or `three-way junction`.
+        spawn_side: Side from which the other vehicle comes: `left`, `right` or `opposite…`.
+        ego_direction: Direction of the ego, `straight`, `left` or `right`.
+        other_direction: Direction of the other vehicle, `straight`, `left` or `right`.
+        planned_agents: Pair that `colliding agents:` names in a scenario without a collision: the
+            two agents that should have collided. None if it names no agents, or if there was a
+            collision.
     """
 
     weather: str
@@ -75,27 +77,32 @@ class Meta(ShortRepr):
 
     @property
     def recorded_frames(self) -> int:
-        """How many frames a whole recording has."""
+        """Number of frames of a complete recording."""
         return self.simulated_frames - WARM_UP_FRAMES
 
 
 def read_meta(path: ReleasePath) -> Meta:
-    """What a meta file says.
+    """Return the content of a meta file.
 
     Raises:
-        MissingFileError: there is no such file.
-        MetaError: the first line has not nine words or a word where a number belongs, or another line's ids are
-            no numbers.
+        MissingFileError: There is no such file.
+        MetaError: The first line does not have nine words, or has a word instead of a number, or
+            another line's ids are no numbers.
     """
-    lines = read_lines(path, "meta", MetaError)
-    filled = [(number, line.strip()) for number, line in enumerate(lines, start=1) if line.strip()]
-    if not filled:
+    numbered_lines = []
+    for number, line in enumerate(read_lines(path, "meta", MetaError), start=1):
+        if line.strip():
+            numbered_lines.append((number, line.strip()))
+    if not numbered_lines:
         raise MetaError(f"{path}:1: expected '{_FIRST_LINE}', found an empty file; {REMEDY}")
-    return _parse(path, filled[0], _entries(path, filled[1:]))
+    return _parse(path, numbered_lines[0], _entries(path, numbered_lines[1:]))
 
 
 def write_meta(path: Path, meta: Meta) -> None:
-    """Write a meta file as the release's generator does: lines 2 on begin with a blank, the last one has no end."""
+    """Write a meta file like the release's generator.
+
+    All lines after the first begin with a blank, and the last one has no line end.
+    """
     collision = meta.collision
     words: list[object] = [meta.weather + (meta.time_of_day or "")]
     if collision is None:
@@ -126,7 +133,7 @@ def write_meta(path: Path, meta: Meta) -> None:
 
 
 def _entries(path: ReleasePath, lines: Sequence[tuple[int, str]]) -> dict[str, tuple[int, str]]:
-    """Key → (line number, value) of the lines after the first."""
+    """Return key → (line number, value) of the lines after the first."""
     entries = {}
     for number, line in lines:
         key, colon, value = line.partition(":")
@@ -138,22 +145,26 @@ def _entries(path: ReleasePath, lines: Sequence[tuple[int, str]]) -> dict[str, t
     return entries
 
 
-def _parse(path: ReleasePath, first: tuple[int, str], entries: dict[str, tuple[int, str]]) -> Meta:
-    number, line = first
+def _parse(
+    path: ReleasePath, first_line: tuple[int, str], entries: dict[str, tuple[int, str]]
+) -> Meta:
+    """Return the content of a file from its first line and its entries, or raise MetaError."""
+    number, line = first_line
     words = line.split()
     if len(words) != 9:
         raise MetaError(
-            f"{path}:{number}: expected 9 words '{_FIRST_LINE}', found {len(words)}: {shortened(line)!r}; {REMEDY}"
+            f"{path}:{number}: expected 9 words '{_FIRST_LINE}', "
+            f"found {len(words)}: {shortened(line)!r}; {REMEDY}"
         )
-    where = f"{path}:{number}"
+    location = f"{path}:{number}"
     weather, time_of_day = _weather_and_time(words[0])
     agents = _colliding_agents(path, entries)
-    collision = _collision(where, words, agents)
+    collision = _collision(location, words, agents)
     return Meta(
         weather=weather,
         time_of_day=time_of_day,
         collision=collision,
-        simulated_frames=_integer(where, "simulated frames", words[8]),
+        simulated_frames=_integer(location, "simulated frames", words[8]),
         agent_ids=_agent_ids(path, entries),
         road_type=_text(entries, "road_type"),
         spawn_side=_text(entries, "another_vehicle_spawn_side"),
@@ -164,6 +175,7 @@ def _parse(path: ReleasePath, first: tuple[int, str], entries: dict[str, tuple[i
 
 
 def _weather_and_time(word: str) -> tuple[str, str | None]:
+    """Return the weather and the time of day in a word."""
     for time_of_day in TIMES_OF_DAY:
         if word.endswith(time_of_day) and word != time_of_day:
             return word.removesuffix(time_of_day), time_of_day
@@ -171,15 +183,16 @@ def _weather_and_time(word: str) -> tuple[str, str | None]:
 
 
 def _collision(
-    where: str, words: Sequence[str], agents: tuple[AgentName | None, AgentName | None] | None
+    location: str, words: Sequence[str], agents: tuple[AgentName | None, AgentName | None] | None
 ) -> Collision | None:
-    ids = (_integer(where, "first id", words[1]), _integer(where, "second id", words[3]))
+    """Return the collision in the words of the first line; None if there is none."""
+    ids = (_integer(location, "first id", words[1]), _integer(location, "second id", words[3]))
     if UNTRACKED_ID in ids:
         return None
     return Collision(
         ids=ids,
         classes=(words[2], words[4]),
-        impact=_finite(where, "impact", words[5]),
+        impact=_finite(location, "impact", words[5]),
         spawn_relation=words[6],
         contact_side=words[7],
         agents=agents,
@@ -189,6 +202,7 @@ def _collision(
 def _colliding_agents(
     path: ReleasePath, entries: dict[str, tuple[int, str]]
 ) -> tuple[AgentName | None, AgentName | None] | None:
+    """Return the agents of the entry `colliding agents`; None without it."""
     if "colliding agents" not in entries:
         return None
     number, value = entries["colliding agents"]
@@ -204,6 +218,7 @@ def _colliding_agents(
 def _agent_ids(
     path: ReleasePath, entries: dict[str, tuple[int, str]]
 ) -> tuple[int, int, int, int] | None:
+    """Return the ids of the entry `agents id`; None without it."""
     if "agents id" not in entries:
         return None
     number, value = entries["agents id"]
@@ -216,22 +231,25 @@ def _agent_ids(
 
 
 def _text(entries: dict[str, tuple[int, str]], key: str) -> str | None:
+    """Return the value of an entry; None if it is missing or empty."""
     _, value = entries.get(key, (0, ""))
     return value or None
 
 
-def _integer(where: str, what: str, word: str) -> int:
+def _integer(location: str, name: str, word: str) -> int:
+    """Return a word as an integer, or raise MetaError."""
     value = integer_of(word)
     if value is None:
         raise MetaError(
-            f"{where}: {what}: expected an integer, found {shortened(word)!r}; {REMEDY}"
+            f"{location}: {name}: expected an integer, found {shortened(word)!r}; {REMEDY}"
         )
     return value
 
 
-def _finite(where: str, what: str, word: str) -> float:
+def _finite(location: str, name: str, word: str) -> float:
+    """Return a word as a finite number, or raise MetaError."""
     value = number_of(word)
     if value is None or not in_range(value):
-        found = f"found {shortened(word)!r} (at most {LARGEST_NUMBER:.0e} counts)"
-        raise MetaError(f"{where}: {what}: expected a finite number, {found}; {REMEDY}")
+        fault = f"found {shortened(word)!r} (at most {LARGEST_NUMBER:.0e} counts)"
+        raise MetaError(f"{location}: {name}: expected a finite number, {fault}; {REMEDY}")
     return value

@@ -1,4 +1,4 @@
-"""Arrays in npz files: point clouds, and the pictures of BEV cameras."""
+"""Arrays in npz files: point clouds, and images of BEV cameras."""
 
 import io
 import zipfile
@@ -33,20 +33,25 @@ from deepaccident_devkit.support.reading import (
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 KEY = "data"
-_ENDING = ".npy"
-# How a `.npy` file begins.
-_BARE_ARRAY = b"\x93NUMPY"
-_FAST = 1
-"""Level of compression: a BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30, for a quarter of it.
+_NPY_SUFFIX = ".npy"
+# First bytes of a `.npy` file.
+_NPY_SIGNATURE = b"\x93NUMPY"
+_COMPRESSION_LEVEL = 1
+"""Level of zlib's compression.
 
-Of a cloud's numbers, of single precision, half of each is zeros; a higher level saves little more.
+A BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30 ms, for a quarter of the
+size. Half the bytes of a cloud's numbers are zeros, since they have single precision; a higher
+level saves little more.
 """
-# The CARLA semantic tags that the reference renderer uses.
+# CARLA's semantic tags that the reference renderer uses.
 TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
 
 
 def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
-    """The array of numbers under `data`, or the only one in the file; raises MissingFileError and SensorFileError."""
+    """Return the array of numbers under `data`, or the only array in the file.
+
+    Raises MissingFileError and SensorFileError.
+    """
     content = read_content(path, kind, SensorFileError)
     try:
         with open_zip(content) as archive:
@@ -54,34 +59,42 @@ def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
     except DAMAGED_ARCHIVE as error:
         if isinstance(error, SensorFileError):
             raise
-        detail = (
-            "expected an npz archive, found a bare array" if content.startswith(_BARE_ARRAY) else ""
-        )
-        detail = detail or f"not a readable npz archive ({shortened(fault_text(error), MOST_TOLD)})"
-        raise SensorFileError(f"{path}: {detail}; {REMEDY}") from error
+        if content.startswith(_NPY_SIGNATURE):
+            fault = "expected an npz archive, found a bare array"
+        else:
+            fault = f"not a readable npz archive ({shortened(fault_text(error), MOST_TOLD)})"
+        raise SensorFileError(f"{path}: {fault}; {REMEDY}") from error
 
 
-def write_npz(path: Path, array: AnyArray, *, level: int = _FAST) -> None:
-    """Write `array` under `data`, compressed by zlib's `level`, 0 to 9; the same array gives the same bytes."""
+def write_npz(path: Path, array: AnyArray, *, level: int = _COMPRESSION_LEVEL) -> None:
+    """Write `array` under `data`; the same array gives the same bytes.
+
+    Args:
+        path: The file.
+        array: The array.
+        level: Level of zlib's compression, 0 to 9.
+    """
     member = io.BytesIO()
     np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
     archive = io.BytesIO()
+    entry = zipfile.ZipInfo(f"{KEY}{_NPY_SUFFIX}")
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=level) as file:
-        file.writestr(
-            zipfile.ZipInfo(f"{KEY}{_ENDING}"), member.getvalue(), zipfile.ZIP_DEFLATED, level
-        )
+        file.writestr(entry, member.getvalue(), zipfile.ZIP_DEFLATED, level)
     write_bytes(path, archive.getvalue())
 
 
 def _array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
-    entries = [entry for entry in archive.infolist() if entry.filename.endswith(_ENDING)]
-    named = [entry for entry in entries if entry.filename == f"{KEY}{_ENDING}"] or entries
-    if len(named) != 1:
-        found = ", ".join(entry.filename.removesuffix(_ENDING) for entry in entries) or "no array"
-        raise SensorFileError(
-            f"{path}: expected an array named '{KEY}', found {shortened(found)}; {REMEDY}"
+    """Return the entry of the array under `data`, or of the only array; raises SensorFileError."""
+    entries = [entry for entry in archive.infolist() if entry.filename.endswith(_NPY_SUFFIX)]
+    candidates = [entry for entry in entries if entry.filename == f"{KEY}{_NPY_SUFFIX}"] or entries
+    if len(candidates) != 1:
+        names = (
+            ", ".join(entry.filename.removesuffix(_NPY_SUFFIX) for entry in entries) or "no array"
         )
-    return named[0]
+        raise SensorFileError(
+            f"{path}: expected an array named '{KEY}', found {shortened(names)}; {REMEDY}"
+        )
+    return candidates[0]
 
 
 @overload
@@ -89,20 +102,24 @@ def read_lidar(path: ReleasePath, *, raw: Literal[False] = False) -> LidarPointC
 @overload
 def read_lidar(path: ReleasePath, *, raw: Literal[True]) -> AnyArray: ...
 def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | AnyArray:
-    """A point cloud in its LiDAR frame, right-handed, metres; NaN where the file has infinity or a number beyond 1e9.
+    """Return a point cloud in its LiDAR frame, right-handed, metres.
+
+    NaN where the file has infinity or a number beyond 1e9.
 
     Args:
-        path: the file.
-        raw: return the file's own array (N, 4) instead: x, y **right**, z, intensity, in the file's float type.
+        path: The file.
+        raw: Whether to return the file's own array (N, 4): x, y **right**, z, intensity, in the
+            file's float type.
 
     Raises:
-        MissingFileError: there is no such file.
-        SensorFileError: the archive cannot be read or its array is not (N, 4) of floats.
+        MissingFileError: There is no such file.
+        SensorFileError: The archive cannot be read or its array is not (N, 4) of floats.
     """
     data = read_npz(path, "lidar")
     if data.ndim != 2 or data.shape[1] != 4 or data.dtype.kind != "f":
         raise SensorFileError(
-            f"{path}: expected points (N, 4) of floats, found shape {data.shape} of {data.dtype}; {REMEDY}"
+            f"{path}: expected points (N, 4) of floats, "
+            f"found shape {data.shape} of {data.dtype}; {REMEDY}"
         )
     if raw:
         return data
@@ -113,7 +130,7 @@ def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | Any
 def write_lidar(path: Path, xyz: ArrayLike, intensity: ArrayLike) -> None:
     """Write points (N, 3) of the right-handed LiDAR frame, metres, and their intensity (N,).
 
-    As in the release: numbers of single precision, stored as float64.
+    As in the release, numbers have single precision and are stored as float64.
     """
     points = flip_points(checked("xyz", xyz, (None, 3)))
     values = checked("intensity", intensity, (len(points),))
@@ -122,14 +139,16 @@ def write_lidar(path: Path, xyz: ArrayLike, intensity: ArrayLike) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BevImage(ShortRepr):
-    """What lies around an agent, seen from above; as stored, forward is up and left is left.
+    """Image of a BEV camera above an agent; forward is up and left is left, as stored.
 
-    A point x forward, y left of the agent, metres, is at row 599.5 − x / resolution, column 599.5 − y / resolution.
+    A point x forward, y left of the agent, metres, is at row 599.5 − x / resolution, column 599.5 −
+    y / resolution.
 
     Attributes:
-        semantic: (1200, 1200) uint8, CARLA's semantic tag (`TAGS`), read-only.
-        instance: (1200, 1200) uint16, the simulator's own object id (not the label's actor id), read-only.
-        resolution: metres a pixel.
+        semantic: CARLA's semantic tags (`TAGS`), shape (1200, 1200), uint8, read-only.
+        instance: The simulator's own object ids (not the labels' actor ids), shape (1200, 1200),
+            uint16, read-only.
+        resolution: Size of a pixel, metres.
     """
 
     semantic: ByteArray
@@ -147,21 +166,22 @@ def read_bev(path: ReleasePath, *, raw: Literal[False] = False) -> BevImage: ...
 @overload
 def read_bev(path: ReleasePath, *, raw: Literal[True]) -> ByteArray: ...
 def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
-    """The BEV camera's array.
+    """Return the image of a BEV camera.
 
     Args:
-        path: the file.
-        raw: return the file's own array (1200, 1200, 3) uint8 instead; channel 2 is the tag, 1 and 0 the id's low
-            and high byte.
+        path: The file.
+        raw: Whether to return the file's own array, shape (1200, 1200, 3), uint8; channel 2 is the
+            tag, 1 and 0 the id's low and high byte.
 
     Raises:
-        MissingFileError: there is no such file.
-        SensorFileError: the archive cannot be read or its array has another shape or type.
+        MissingFileError: There is no such file.
+        SensorFileError: The archive cannot be read or its array has another shape or type.
     """
     data = read_npz(path, "bev")
     if data.shape != (*BEV_SHAPE, 3) or data.dtype != np.uint8:
         raise SensorFileError(
-            f"{path}: expected shape {(*BEV_SHAPE, 3)} of uint8, found {data.shape} of {data.dtype}; {REMEDY}"
+            f"{path}: expected shape {(*BEV_SHAPE, 3)} of uint8, "
+            f"found {data.shape} of {data.dtype}; {REMEDY}"
         )
     if raw:
         return data
@@ -170,10 +190,16 @@ def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
 
 
 def write_bev(
-    path: Path, semantic: ByteArray, instance: NDArray[np.uint16], *, level: int = _FAST
+    path: Path,
+    semantic: ByteArray,
+    instance: NDArray[np.uint16],
+    *,
+    level: int = _COMPRESSION_LEVEL,
 ) -> None:
-    """Write tags and object ids, both (1200, 1200), forward up; `level` is that of `write_npz`."""
+    """Write tags and object ids, both (1200, 1200), forward up; `level` is as in `write_npz`."""
     import cv2
 
-    high, low = (instance >> 8).astype(np.uint8), instance.astype(np.uint8)
-    write_npz(path, np.asarray(cv2.merge([high, low, np.ascontiguousarray(semantic)])), level=level)
+    high = (instance >> 8).astype(np.uint8)
+    low = instance.astype(np.uint8)
+    channels = cv2.merge([high, low, np.ascontiguousarray(semantic)])
+    write_npz(path, np.asarray(channels), level=level)

@@ -1,8 +1,8 @@
-"""Pickles of arrays: read without running anything of them, and written so that old readers open them.
+"""Pickles of arrays: read without running anything of them, and written for old readers, too.
 
-Old ones are Python 3.7 and numpy 1.16. Protocol 3 names globals in plain text. numpy 2 writes its private path there,
-which numpy 1 does not have; numpy 2 reads the old one. (`reducer_override` cannot give a function another name: it must
-lead to that very function.)
+The oldest readers are Python 3.7 and numpy 1.16. Protocol 3 names globals in plain text. Numpy 2
+writes its private path, which numpy 1 does not have; numpy 2 reads the old path.
+(`reducer_override` cannot give a function another name: it must lead to that very function.)
 """
 
 import pickle
@@ -22,22 +22,24 @@ _PROTOCOL: Final = 3
 _BEGIN: Final = pickle.PROTO + bytes([_PROTOCOL])
 _OLD_NAME: Final = b"cnumpy.core.multiarray\n"
 _NEW_NAME: Final = b"cnumpy._core.multiarray\n"
-# A calib file has 263 to 543.
-MOST_OPCODES: Final = 10_000
-# Containers within each other; a calib file has 1.
-_DEEPEST: Final = 20
-# Bytes that values may take beyond those of the pickle, which may hold an array twice and store it once.
-_ROOM: Final = 1 << 20
-# Bytes of a value, at least.
-_A_VALUE: Final = 64
-# Layouts that are remembered; the calib files of a release have few, which differ in what is in their arrays.
-_MOST_LAYOUTS: Final = 16
-_LONGEST_SENTENCE: Final = 200
-# The only dtypes allowed: numpy itself would evaluate other strings.
+# A calib file has 263 to 543 opcodes.
+MAX_OPCODES: Final = 10_000
+# Depth of nested containers; a calib file has depth 1.
+_MAX_DEPTH: Final = 20
+# Values may take this many bytes more than the pickle, which may hold an array twice and store it
+# once.
+_EXTRA_BYTES: Final = 1 << 20
+_MIN_BYTES_PER_VALUE: Final = 64
+# The calib files of a release have few layouts, which differ in the content of their arrays.
+_MAX_LAYOUTS: Final = 16
+_MAX_MESSAGE_LENGTH: Final = 200
+# The only allowed dtypes: numpy itself would evaluate other strings.
 _PLAIN_NUMBER: Final = re.compile(r"[<>=|]?[fiub][1-9][0-9]?", re.ASCII)
-# What numpy's pickles of a number's dtype say after version and byte order: no fields, no size of its own.
+# State of a number's dtype in numpy's pickles after version and byte order: no fields, no size of
+# its own.
 _NUMBER_STATE: Final = (None, None, None, -1, -1, 0)
-# What damaged or hostile bytes can raise.
+_PLAIN_TYPES: Final = (type(None), bool, int, float, str)
+# Errors that damaged or hostile bytes can raise.
 _FAULTS: Final = (
     pickle.UnpicklingError,
     AttributeError,
@@ -51,51 +53,58 @@ _FAULTS: Final = (
 
 
 def load_arrays(content: bytes) -> Any:
-    """The value of a pickle: a dict of numeric numpy arrays, beside which other plain values stay what they are.
+    """Return the value of a pickle: a dictionary of numeric numpy arrays and other plain values.
 
-    It may name only what numpy's own pickles of arrays name (numpy 1 and 2, protocols 0 to 5). What stands for those
-    names notes what an array is made of; the arrays are made from the notes. Anything else raises
-    pickle.UnpicklingError, and nothing of it has run.
+    It may only contain the names of numpy's own pickles of arrays (numpy 1 and 2, protocols 0 to
+    5). Stand-ins for these names record the content of arrays, from which the arrays are made.
+    Anything else raises pickle.UnpicklingError, and nothing of it has run.
     """
     try:
-        layout = next((each for each in layouts if each.fits(content)), None)
+        layout = next((layout for layout in layouts if layout.fits(content)), None)
         if layout is not None:
-            return _Values(content).made(layout.value)
-        machine = Machine(content, _NAMES, MOST_OPCODES)
-        value = _Values(content).made(machine.value)
+            return _Values(content).converted(layout.value)
+        machine = Machine(content, _NAMES, MAX_OPCODES)
+        value = _Values(content).converted(machine.value)
     except _FAULTS as error:
-        said = shortened(
-            fault_text(error), _LONGEST_SENTENCE
-        )  # a pickle's own text may be no text for a screen
-        raise pickle.UnpicklingError(said if said.isprintable() else ascii(said)[1:-1]) from error
+        message = shortened(fault_text(error), _MAX_MESSAGE_LENGTH)
+        if not message.isprintable():  # a pickle's own text may hold control characters
+            message = ascii(message)[1:-1]
+        raise pickle.UnpicklingError(message) from error
     if machine.slices:
-        starts, ends = (
-            [0, *(each.stop for each in machine.slices)],
-            [*(each.start for each in machine.slices), None],
-        )
-        parts = [(start, content[start:end]) for start, end in zip(starts, ends, strict=True)]
-        layouts[:] = [_Layout(len(content), parts, machine.value), *layouts[: _MOST_LAYOUTS - 1]]
+        parts = []
+        start = 0
+        for part in machine.slices:
+            parts.append((start, content[start : part.start]))
+            start = part.stop
+        parts.append((start, content[start:]))
+        new_layout = _Layout(len(content), parts, machine.value)
+        layouts[:] = [new_layout, *layouts[: _MAX_LAYOUTS - 1]]
     return value
 
 
 def load_stacked(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
-    """The arrays of several pickles of one layout, by key: (N, …) of N pickles, in their own dtypes.
+    """Return the arrays of N pickles of one layout by key, shape (N, …), in their own dtypes.
 
-    None if one of them is of no layout that `load_arrays` has read, or another's, or more than a dict of C-ordered
-    arrays: then each is to be loaded by itself.
+    Return None if one of them has another layout, or one that `load_arrays` has not read, or holds
+    more than a dictionary of C-ordered arrays: each pickle must then be loaded separately.
     """
-    return next((found for each in layouts if (found := each.stacked(contents)) is not None), None)
+    for layout in layouts:
+        arrays = layout.stacked(contents)
+        if arrays is not None:
+            return arrays
+    return None
 
 
 def pickled(value: object) -> bytes:
-    """A value as a pickle."""
+    """Return a value as a pickle."""
     return _with_old_names(pickle.dumps(value, protocol=_PROTOCOL))
 
 
 def pickled_items(items: Iterable[object]) -> bytes:
-    """Items as a piece for `write_joined`; their bytes depend on their values alone, not on which objects are shared.
+    """Return items as a piece for `write_joined`.
 
-    Items are plain values and arrays of numbers or text.
+    The bytes depend only on the values of the items, not on objects that they share. Items are
+    plain values and arrays of numbers or text.
     """
     stream = BytesIO()
     for item in items:
@@ -104,53 +113,62 @@ def pickled_items(items: Iterable[object]) -> bytes:
 
 
 def write_joined(
-    file: BinaryIO, name: str, pieces: Iterable[bytes], beside: Mapping[str, object]
+    file: BinaryIO, name: str, pieces: Iterable[bytes], other_items: Mapping[str, object]
 ) -> None:
-    """Write the pickle of `{name: [items of all pieces], **beside}`; one piece at a time is in memory."""
+    """Write the pickle of `{name: [items of all pieces], **other_items}`.
+
+    Only one piece at a time is in memory.
+    """
     file.write(_BEGIN + pickle.EMPTY_DICT + pickle.MARK + _opcodes(name) + pickle.EMPTY_LIST)
     file.writelines(pickle.MARK + piece + pickle.APPENDS for piece in pieces)
-    file.write(pickled_items(part for item in beside.items() for part in item))
+    file.write(pickled_items(part for item in other_items.items() for part in item))
     file.write(pickle.SETITEMS + pickle.STOP)
 
 
 class _Pickler(pickle.Pickler):
-    """Notes nothing of what it wrote, so that pieces can follow each other; a dtype is no more than its code."""
+    """A writer of pickles without a memo, so that pieces can follow each other.
+
+    A dtype is written as its code.
+    """
 
     def __init__(self, stream: BytesIO) -> None:
+        """Write to a stream."""
         super().__init__(stream, protocol=_PROTOCOL)
         self.fast = True
 
     def reducer_override(self, obj: Any) -> Any:
-        """How an array or a dtype is written; anything else as usual."""
+        """Return the form of an array or a dtype; other objects have their usual form."""
         if isinstance(obj, np.ndarray):
             array: AnyArray = np.ascontiguousarray(obj)
-            make, arguments, (version, _, *rest) = cast(
-                "tuple[Any, Any, tuple[Any, ...]]", array.__reduce__()
-            )
-            return make, arguments, (version, obj.shape, *rest)
+            reduced = cast("tuple[Any, Any, tuple[Any, ...]]", array.__reduce__())
+            constructor, arguments, (version, _, *state) = reduced
+            return constructor, arguments, (version, obj.shape, *state)
         if isinstance(obj, np.dtype):
             return np.dtype, (obj.str,)
         return NotImplemented
 
 
 def _opcodes(value: object) -> bytes:
-    """What pushes a value on the stack."""
+    """Return the opcodes that push a value on the stack."""
     stream = BytesIO()
     _Pickler(stream).dump(value)
     return _with_old_names(stream.getvalue()[len(_BEGIN) : -len(pickle.STOP)])
 
 
 def _with_old_names(content: bytes) -> bytes:
+    """Return a pickle with the path of numpy 1."""
     return content.replace(_NEW_NAME, _OLD_NAME)
 
 
 class _Layout(NamedTuple):
-    """A pickle that was read, without the bytes in it, which decide nothing: one that is the same else has its value.
+    """The layout of a pickle that was read: everything except the contents of its byte strings.
+
+    The contents decide nothing, so that a pickle with the same layout has the same value.
 
     Attributes:
-        size: bytes.
-        parts: what is between the bytes in it, and where each part begins.
-        value: of the machine, with slices in the place of bytes.
+        size: Size of the pickle, bytes.
+        parts: Begin and content of each part between the byte strings.
+        value: Value of the machine, with slices instead of byte strings.
     """
 
     size: int
@@ -158,42 +176,48 @@ class _Layout(NamedTuple):
     value: Any
 
     def fits(self, content: bytes) -> bool:
-        return len(content) == self.size and all(
-            content.startswith(part, start) for start, part in self.parts
-        )
+        """Return whether a pickle has this layout."""
+        if len(content) != self.size:
+            return False
+        return all(content.startswith(part, start) for start, part in self.parts)
 
     def stacked(self, contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
-        """The arrays of all contents if they fit, and the value is a dict of arrays with bytes of their own."""
+        """Return the stacked arrays of pickles with this layout, or None.
+
+        The value must be a dictionary of arrays with bytes of their own.
+        """
         arrays = self.value if isinstance(self.value, dict) else {}
-        plain = all(
-            isinstance(each, _Array) and isinstance(each.content, slice) and each.order == "C"
-            for each in arrays.values()
+        are_plain = all(
+            isinstance(array, _Array) and isinstance(array.content, slice) and array.order == "C"
+            for array in arrays.values()
         )
-        if not arrays or not plain or {self.size} != set(map(len, contents)):
+        if not arrays or not are_plain or {self.size} != set(map(len, contents)):
             return None
         rows = np.frombuffer(b"".join(contents), np.uint8).reshape(-1, self.size)
         for start, part in self.parts:
             if (rows[:, start : start + len(part)] != np.frombuffer(part, np.uint8)).any():
                 return None
-        return {
-            key: rows[:, each.content].copy().view(each.dtype).reshape(-1, *each.shape)
-            for key, each in arrays.items()
-        }
+        stacked = {}
+        for key, array in arrays.items():
+            columns = rows[:, array.content].copy()
+            stacked[key] = columns.view(array.dtype).reshape(-1, *array.shape)
+        return stacked
 
 
-# The latest first.
+# The newest layout comes first.
 layouts: list[_Layout] = []
 
 
 class _Kind:
-    """Stands for `numpy.dtype`: plain numbers only, no objects, no records."""
+    """A stand-in for `numpy.dtype`: only plain numbers, no objects, no records."""
 
     __slots__ = ("dtype",)
 
     def __init__(self, code: object, *_flags: object) -> None:
+        """Take the dtype of a code; raises pickle.UnpicklingError."""
         if not isinstance(code, str) or not _PLAIN_NUMBER.fullmatch(code):
-            found = repr(code) if isinstance(code, str) else "what is no text"
-            raise pickle.UnpicklingError(f"an array of {found} is not allowed")
+            kind = repr(code) if isinstance(code, str) else "what is no text"
+            raise pickle.UnpicklingError(f"an array of {kind} is not allowed")
         self.dtype: np.dtype[Any] = np.dtype(code)
 
     def __setstate__(self, state: Any) -> None:
@@ -206,22 +230,23 @@ class _Kind:
 
 
 class _Encoded(NamedTuple):
-    """Stands for `_codecs.encode`, by which protocols 0 to 2 write bytes: the text that has them in latin1."""
+    """A stand-in for `_codecs.encode`, by which protocols 0 to 2 write bytes as latin1 text."""
 
     text: str
     encoding: str = "latin1"
 
 
 class _Array:
-    """What a pickle says of a `numpy.ndarray`."""
+    """Record of a `numpy.ndarray` in a pickle."""
 
     __slots__ = ("content", "dtype", "order", "shape")
 
     def __init__(self, *_class_shape_and_code: object) -> None:
+        """Begin without content."""
         self.content: object = None
 
     def __setstate__(self, state: Any) -> None:
-        """Take down version, shape, dtype, Fortran order and content, as numpy writes them."""
+        """Record version, shape, dtype, Fortran order and content, as numpy writes them."""
         version, shape, kind, fortran, content = state
         if version != 1 or not isinstance(kind, _Kind):
             raise pickle.UnpicklingError("not the pickle of a plain numpy array")
@@ -230,7 +255,7 @@ class _Array:
 
 
 def _from_buffer(content: object, kind: object, shape: Sequence[int], order: str = "C") -> _Array:
-    """Stands for `numpy.core.numeric._frombuffer`, by which protocol 5 writes arrays."""
+    """Stand in for `numpy.core.numeric._frombuffer`, by which protocol 5 writes arrays."""
     if order not in ("C", "F"):
         raise pickle.UnpicklingError("an array of another order than C or F is not allowed")
     array = _Array()
@@ -245,23 +270,27 @@ _NAMES: Final[Mapping[str, object]] = {
     **{f"numpy.{core}.multiarray _reconstruct": _Array for core in ("core", "_core")},
     **{f"numpy.{core}.numeric _frombuffer": _from_buffer for core in ("core", "_core")},
 }
-_PLAIN: Final = (type(None), bool, int, float, str)
 
 
 class _Values:
-    """Makes the values that a machine noted, up to so many bytes: one may be in many places, or in itself."""
+    """Conversion of a machine's value, with a limit on its size.
 
-    __slots__ = ("_content", "_room")
+    A part of the value may be in many places, or in itself.
+    """
+
+    __slots__ = ("_content", "_remaining_bytes")
 
     def __init__(self, content: bytes) -> None:
+        """Convert values of a pickle with this content."""
         self._content = memoryview(content)
-        self._room = len(content) + _ROOM
+        self._remaining_bytes = len(content) + _EXTRA_BYTES
 
-    def made(self, value: Any, depth: int = 0) -> Any:
-        self._take(_A_VALUE)
-        if depth > _DEEPEST:
+    def converted(self, value: Any, depth: int = 0) -> Any:
+        """Return a value with arrays instead of records; raises pickle.UnpicklingError."""
+        self._use_bytes(_MIN_BYTES_PER_VALUE)
+        if depth > _MAX_DEPTH:
             raise pickle.UnpicklingError(
-                f"more than {_DEEPEST} containers within each other are not allowed"
+                f"more than {_MAX_DEPTH} containers within each other are not allowed"
             )
         kind = type(value)
         if kind is _Array:
@@ -271,43 +300,46 @@ class _Values:
                 raise pickle.UnpicklingError(
                     "a key that is no text, or cannot be printed, is not allowed"
                 )
-            self._take(sum(map(len, value)))
-            return {key: self.made(item, depth + 1) for key, item in value.items()}
+            self._use_bytes(sum(map(len, value)))
+            return {key: self.converted(item, depth + 1) for key, item in value.items()}
         if kind is list or kind is tuple:
-            return kind([self.made(item, depth + 1) for item in value])
+            return kind([self.converted(item, depth + 1) for item in value])
         if kind is slice or kind is _Encoded:
             return bytes(self._bytes(value))
-        if kind not in _PLAIN:
+        if kind not in _PLAIN_TYPES:
             raise pickle.UnpicklingError("a part of numpy in place of a value is not allowed")
         return value
 
-    def _array(self, notes: _Array) -> AnyArray:
-        if notes.content is None:
+    def _array(self, record: _Array) -> AnyArray:
+        """Return the array of a record."""
+        if record.content is None:
             raise pickle.UnpicklingError("an array without its numbers is not allowed")
-        flat: AnyArray = np.frombuffer(self._bytes(notes.content), dtype=notes.dtype)
-        array = flat.reshape(notes.shape, order=notes.order)
-        if array.shape != notes.shape:  # reshape itself would fill in a negative length
+        flat: AnyArray = np.frombuffer(self._bytes(record.content), dtype=record.dtype)
+        array = flat.reshape(record.shape, order=record.order)
+        if array.shape != record.shape:  # reshape itself would replace a negative length
             raise pickle.UnpicklingError(
                 "an array whose shape is not what its bytes have is not allowed"
             )
-        return array.astype(notes.dtype.newbyteorder("="))
+        return array.astype(record.dtype.newbyteorder("="))
 
-    def _bytes(self, noted: object) -> bytes | memoryview:
-        if isinstance(noted, str):  # of Python 2
-            noted = _Encoded(noted)
-        if isinstance(noted, slice):
-            self._take(noted.stop - noted.start)
-            return self._content[noted]
-        if not isinstance(noted, _Encoded) or not isinstance(noted.text, str):
+    def _bytes(self, content: object) -> bytes | memoryview:
+        """Return the bytes of a recorded byte string."""
+        if isinstance(content, str):  # of Python 2
+            content = _Encoded(content)
+        if isinstance(content, slice):
+            self._use_bytes(content.stop - content.start)
+            return self._content[content]
+        if not isinstance(content, _Encoded) or not isinstance(content.text, str):
             raise pickle.UnpicklingError("not the pickle of a plain numpy array")
-        if noted.encoding not in ("latin1", "latin-1"):
+        if content.encoding not in ("latin1", "latin-1"):
             raise pickle.UnpicklingError("_codecs.encode is allowed for latin1 text only")
-        self._take(len(noted.text))
-        return noted.text.encode("latin1")
+        self._use_bytes(len(content.text))
+        return content.text.encode("latin1")
 
-    def _take(self, size: int) -> None:
-        self._room -= size
-        if self._room < 0:
+    def _use_bytes(self, size: int) -> None:
+        """Subtract bytes from the limit, or raise pickle.UnpicklingError."""
+        self._remaining_bytes -= size
+        if self._remaining_bytes < 0:
             raise pickle.UnpicklingError(
                 "values that are far larger than their pickle are not allowed"
             )

@@ -1,12 +1,13 @@
-"""Small rigid matrices, and where a warp samples its raster, in float32 as the released code's torch computes them.
+"""Small rigid matrices and sampling points of warps, with the float32 of the released code's torch.
 
-A nearest warp decides by rounding which cell a sample point lies in. For points close to a border between cells the
-last bit of the matrix decides. So the labels' warps repeat each rounding: products summed in order of the inner index,
-without fused multiply-add, the inverse by elimination as LAPACK's getrf and getrs do it, and sine and cosine by a
-polynomial. Checked against torch 2.13 on random poses: all bits are equal.
+A nearest warp rounds a sample point to a cell. For points close to a border between cells the last
+bit of the matrix decides. The labels' warps therefore repeat each rounding: products summed in
+order of the inner index, without fused multiply-add, the inverse by elimination as LAPACK's getrf
+and getrs do it, and sine and cosine by a polynomial. Checked against torch 2.13 on random poses:
+all bits are equal.
 
-Where target cells sample comes from a protocol's rule (`motion.warping` has their story): `stretched_lines`,
-`exact_lines` or `fiery_lines`.
+The sampling points of target cells follow a protocol's rule, which `motion.warping` explains:
+`stretched_lines`, `exact_lines` or `fiery_lines`.
 """
 
 import functools
@@ -22,7 +23,7 @@ from deepaccident_devkit.support.arrays import AnyArray, Float32Array, FloatArra
 _Axis = tuple[float, float, float]
 CellIndices = NDArray[np.intp]
 OUTSIDE: Final = -1
-"""In indices of cells: the sample point is outside the grid and has no value."""
+"""Index of a cell for a sample point outside the grid, which has no value."""
 
 _SINE: Final = (
     2.605780704850265e-06,
@@ -31,20 +32,25 @@ _SINE: Final = (
     -0.16666659550431576,
     1.0,
 )
-"""sin t / t as a polynomial of t², the highest power first.
+"""Coefficients of sin t / t as a polynomial of t², the highest power first.
 
-torch rounds 2–5 % of all sines and cosines to the neighbour of the nearest float32, because it uses a polynomial of
-ninth degree. The coefficients were found only from its results, so that they give the same results: of 24 million
-angles in [−π, π] very few differ.
+torch rounds 2–5 % of all sines and cosines to the neighbour of the nearest float32, because it uses
+a polynomial of ninth degree. The coefficients were fitted to its results, so that they give the
+same results: of 24 million angles in [−π, π] very few differ.
 """
 
 
-def pose_matrices(six: ArrayLike) -> Float32Array:
-    """6-vectors (…, 6) → matrices (…, 4, 4): (Rx · Ry) · Rz, what the devkit does in float64."""
-    vector = np.asarray(six, dtype=np.float32)
+def pose_matrices(vectors: ArrayLike) -> Float32Array:
+    """Return the matrices (…, 4, 4) of 6-vectors (…, 6): (Rx · Ry) · Rz.
+
+    The devkit's own matrices are the same in float64.
+    """
+    vector = np.asarray(vectors, dtype=np.float32)
     sines, cosines = sines_and_cosines(vector[..., 3:])
-    (cx, cy, cz), (sx, sy, sz) = np.moveaxis(cosines, -1, 0), np.moveaxis(sines, -1, 0)
-    xy, yx = sx * sy, cx * sy
+    cx, cy, cz = np.moveaxis(cosines, -1, 0)
+    sx, sy, sz = np.moveaxis(sines, -1, 0)
+    xy = sx * sy
+    yx = cx * sy
     rows = (
         (cy * cz, -cy * sz, sy),
         (xy * cz + cx * sz, cx * cz - xy * sz, -sx * cy),
@@ -58,25 +64,28 @@ def pose_matrices(six: ArrayLike) -> Float32Array:
 
 
 def sines_and_cosines(angle: ArrayLike) -> Float32Array:
-    """(2, …) sines and cosines of float32 angles (…), radians; cosines are sines of the angles plus a quarter turn."""
+    """Return sines and cosines of float32 angles (…), radians, shape (2, …).
+
+    Cosines are sines of the angles plus a quarter turn.
+    """
     radians = np.asarray(angle, dtype=np.float32).astype(np.float64)
     turns = radians / np.pi
     half_turns = np.rint(np.array([turns, turns + 0.5]))
-    within = np.array(
-        [radians - half_turns[0] * np.pi, radians - (half_turns[1] - 0.5) * np.pi]
-    )  # [−π/2, π/2]
-    square = within * within
+    sine_angle = radians - half_turns[0] * np.pi
+    cosine_angle = radians - (half_turns[1] - 0.5) * np.pi
+    reduced = np.array([sine_angle, cosine_angle])  # in [−π/2, π/2]
+    square = reduced * reduced
     ratio = square * _SINE[0] + _SINE[1]
     for factor in _SINE[2:]:
         ratio *= square
         ratio += factor
-    ratio *= within
+    ratio *= reduced
     result: Float32Array = np.where(half_turns % 2 == 0, ratio, -ratio).astype(np.float32)
     return result
 
 
 def product(first: Float32Array, second: Float32Array) -> Float32Array:
-    """Matrix products (…, I, K) · (…, K, J), summed from the first inner index to the last."""
+    """Return matrix products (…, I, K) · (…, K, J), summed in the order of the inner index."""
     total: Float32Array = first[..., :, 0, None] * second[..., None, 0, :]
     for inner in range(1, first.shape[-1]):
         total = total + first[..., :, inner, None] * second[..., None, inner, :]
@@ -84,54 +93,59 @@ def product(first: Float32Array, second: Float32Array) -> Float32Array:
 
 
 def fused_product(first: Float32Array, second: Float32Array) -> Float32Array:
-    """`product` with fused multiply-add, which numpy's own products of two matrices use on today's processors."""
+    """Return `product` with fused multiply-add.
+
+    Numpy's own products of two matrices use it on today's processors.
+    """
     total = np.zeros((*first.shape[:-1], second.shape[-1]), dtype=np.float32)
     for inner in range(first.shape[-1]):
-        exact = np.multiply(
-            first[..., :, inner, None], second[..., None, inner, :], dtype=np.float64
-        )
+        column = first[..., :, inner, None]
+        row = second[..., None, inner, :]
+        exact = np.multiply(column, row, dtype=np.float64)
         total = (exact + total).astype(np.float32)
     return total
 
 
 def rigid_inverse(matrix: Float32Array) -> Float32Array:
-    """The inverses of rigid transforms (…, 4, 4), by transposing their rotations."""
-    turned_back = np.swapaxes(matrix[..., :3, :3], -1, -2)
-    return _rigid(turned_back, -product(turned_back, matrix[..., :3, 3:])[..., 0])
+    """Return the inverses of rigid transforms (…, 4, 4), by transposing their rotations."""
+    rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    translation = -product(rotation, matrix[..., :3, 3:])[..., 0]
+    return _rigid(rotation, translation)
 
 
 def inverse(matrix: Float32Array) -> Float32Array:
-    """The inverses of transforms (N, 4, 4) whose last row is (0, 0, 0, 1), by elimination with row exchanges.
+    """Return the inverses of transforms with a last row of (0, 0, 0, 1), shape (N, 4, 4).
 
-    Of the last row all products are zero, and its own number is one: its steps are left out.
+    The method is elimination with row exchanges. All products with the last row are zero, and its
+    diagonal is one: its steps are left out.
     """
-    mixed = matrix.copy()  # the lower and the upper factor in one array
-    count = np.arange(len(mixed))
-    order = np.tile(np.arange(4), (len(mixed), 1))
+    factors = matrix.copy()  # the lower and the upper factor in one array
+    index = np.arange(len(factors))
+    order = np.tile(np.arange(4), (len(factors), 1))
     for step in range(2):
-        pivot = step + np.abs(mixed[:, step:3, step]).argmax(axis=1)
+        pivot = step + np.abs(factors[:, step:3, step]).argmax(axis=1)
         if (pivot != step).any():
-            for rows in (mixed, order):
-                rows[count, step], rows[count, pivot] = rows[count, pivot], rows[count, step]
-        below = slice(step + 1, 3)
-        # getrf multiplies by the reciprocal of the pivot
-        mixed[:, below, step] *= np.float32(1) / mixed[:, step, step, None]
-        mixed[:, below, step + 1 :] -= (
-            mixed[:, below, step, None] * mixed[:, step, None, step + 1 :]
-        )
-    solved = np.zeros_like(matrix)
-    solved[count[:, None], np.arange(4), order] = 1
-    for row, others in ((1, (0,)), (2, (0, 1)), (2, (3,)), (1, (3, 2)), (0, (3, 2, 1))):
-        total = mixed[:, row, others[0], None] * solved[:, others[0]]
-        for other in others[1:]:
-            total += mixed[:, row, other, None] * solved[:, other]
-        solved[:, row] -= total
-        if others[0] == 3:
-            solved[:, row] *= np.float32(1) / mixed[:, row, row, None]
-    return solved
+            for rows in (factors, order):
+                rows[index, step], rows[index, pivot] = rows[index, pivot], rows[index, step]
+        lower = slice(step + 1, 3)
+        # getrf multiplies by the reciprocal of the pivot.
+        factors[:, lower, step] *= np.float32(1) / factors[:, step, step, None]
+        change = factors[:, lower, step, None] * factors[:, step, None, step + 1 :]
+        factors[:, lower, step + 1 :] -= change
+    solution = np.zeros_like(matrix)
+    solution[index[:, None], np.arange(4), order] = 1
+    for row, solved_rows in ((1, (0,)), (2, (0, 1)), (2, (3,)), (1, (3, 2)), (0, (3, 2, 1))):
+        total = factors[:, row, solved_rows[0], None] * solution[:, solved_rows[0]]
+        for solved_row in solved_rows[1:]:
+            total += factors[:, row, solved_row, None] * solution[:, solved_row]
+        solution[:, row] -= total
+        if solved_rows[0] == 3:
+            solution[:, row] *= np.float32(1) / factors[:, row, row, None]
+    return solution
 
 
 def _rigid(rotation: NDArray[Any] | np.float32, translation: NDArray[Any]) -> Float32Array:
+    """Return rigid transforms (…, 4, 4) of rotations (…, 3, 3) and translations (…, 3)."""
     result = np.zeros((*translation.shape[:-1], 4, 4), dtype=np.float32)
     result[..., :3, :3] = rotation
     result[..., :3, 3] = translation
@@ -140,13 +154,16 @@ def _rigid(rotation: NDArray[Any] | np.float32, translation: NDArray[Any]) -> Fl
 
 
 class SamplingLine(NamedTuple):
-    """The rows, or the columns, at which target cells sample with N matrices: `finish(of_row + of_column + shift)`.
+    """Rows, or columns, at which target cells sample with N matrices.
+
+    They are `finish(of_row + of_column + shift)`.
 
     Attributes:
-        of_row: (N, H) what a target cell's row adds.
-        of_column: (N, W) what its column adds.
-        shift: (N,) what every cell adds.
-        finish: from sums to cells of the source, 0 the first cell's centre; may write into its argument.
+        of_row: Contribution of a target cell's row, shape (N, H).
+        of_column: Contribution of a target cell's column, shape (N, W).
+        shift: Contribution to every cell, shape (N,).
+        finish: Function from sums to cells of the source, 0 the first cell's centre; may write into
+            its argument.
     """
 
     of_row: AnyArray
@@ -155,7 +172,7 @@ class SamplingLine(NamedTuple):
     finish: Callable[[AnyArray], AnyArray]
 
     def points(self, matrix: int) -> AnyArray:
-        """(H, W), of all target cells with one of the matrices."""
+        """Return the sampling points of all target cells with one of the matrices, shape (H, W)."""
         point = np.add.outer(self.of_row[matrix], self.of_column[matrix])
         point += self.shift[matrix]
         return self.finish(point)
@@ -163,9 +180,13 @@ class SamplingLine(NamedTuple):
     def points_of(
         self, matrix: IntArray, row: IntArray, column: IntArray, run: IntArray
     ) -> AnyArray:
-        """(P,), bit by bit those of `points`, of the target cells in `column` (P,) of `run` (P,).
+        """Return the sampling points of some target cells, shape (P,), with the bits of `points`.
 
-        `matrix` and `row` (R,) are those of the runs; the columns of matrix m count from m · W.
+        Args:
+            matrix: Matrices of the runs, shape (R,).
+            row: Rows of the runs, shape (R,).
+            column: Columns of the cells, shape (P,); the columns of matrix m count from m · W.
+            run: Runs of the cells, shape (P,).
         """
         point = self.of_row[matrix, row].take(run)
         point += self.of_column.reshape(-1).take(column)
@@ -176,22 +197,29 @@ class SamplingLine(NamedTuple):
 def stretched_lines(
     planes: Float32Array, axes: tuple[_Axis, _Axis]
 ) -> tuple[SamplingLine, SamplingLine]:
-    """Rows and columns at which the released warp samples a raster with these axes of rows and columns.
+    """Return the rows and columns at which the released warp samples a raster.
 
-    `planes` (N, 2, 3) are, for rows and for columns, factors of the target's metres along both, and a shift.
+    Args:
+        planes: Factors of the target's metres along rows and along columns, and a shift, for rows
+            and for columns, shape (N, 2, 3).
+        axes: Axes of the raster's rows and columns.
     """
-    rows, columns = _released_coordinates(axes[0]), _released_coordinates(axes[1])
+    rows = _released_coordinates(axes[0])
+    columns = _released_coordinates(axes[1])
     lines = []
     for axis, plane in zip(axes, planes.swapaxes(0, 1), strict=True):
+        of_row = plane[:, :1] * rows
+        of_column = plane[:, 1:2] * columns
         finish = functools.partial(_stretched, axis)
-        lines.append(
-            SamplingLine(plane[:, :1] * rows, plane[:, 1:2] * columns, plane[:, 2], finish)
-        )
+        lines.append(SamplingLine(of_row, of_column, plane[:, 2], finish))
     return lines[0], lines[1]
 
 
 def _stretched(axis: _Axis, point: AnyArray) -> AnyArray:
-    """Sums of metres (…) as cells along an axis, in place, as BEVerse's grid_sample takes the outermost points."""
+    """Convert sums of metres (…) to cells along an axis, in place.
+
+    The outermost points are as in BEVerse's grid_sample.
+    """
     low, high, size = axis
     middle = (low + high) / 2
     if middle:
@@ -203,110 +231,126 @@ def _stretched(axis: _Axis, point: AnyArray) -> AnyArray:
 
 
 def exact_lines(planes: FloatArray, axes: tuple[_Axis, _Axis]) -> tuple[SamplingLine, SamplingLine]:
-    """`stretched_lines` by the cells' own centres, in float64."""
-    rows, columns = (_centers(each) for each in axes)
-    first, second = (
-        SamplingLine(
-            plane[:, :1] / size * rows,
-            plane[:, 1:2] / size * columns,
-            (plane[:, 2] - low) / size - 0.5,
-            lambda point: point,
-        )
-        for plane, (low, _, size) in zip(planes.swapaxes(0, 1), axes, strict=True)
-    )
-    return first, second
+    """Return `stretched_lines` by the cells' own centres, in float64."""
+    rows = _centers(axes[0])
+    columns = _centers(axes[1])
+    lines = []
+    for plane, (low, _, size) in zip(planes.swapaxes(0, 1), axes, strict=True):
+        of_row = plane[:, :1] / size * rows
+        of_column = plane[:, 1:2] / size * columns
+        shift = (plane[:, 2] - low) / size - 0.5
+        lines.append(SamplingLine(of_row, of_column, shift, lambda point: point))
+    return lines[0], lines[1]
 
 
 def fiery_lines(
     tx: Float32Array, ty: Float32Array, yaw: Float32Array, x: _Axis, y: _Axis
 ) -> tuple[SamplingLine, SamplingLine]:
-    """Rows and columns at which FIERY's warp samples, by the three numbers (N, 1) of its 6-vectors that count."""
+    """Return the rows and columns at which FIERY's warp samples.
+
+    Args:
+        tx: First component of the 6-vectors, shape (N, 1).
+        ty: Second component of the 6-vectors, shape (N, 1).
+        yaw: Last component of the 6-vectors, shape (N, 1).
+        x: Axis of the grid's rows.
+        y: Axis of the grid's columns.
+    """
     sine, cosine = sines_and_cosines(yaw)
     half = np.float32((x[1] - x[0]) / 2)
-    ahead, beside = (_fiery_coordinates(axis, float(half)) for axis in (x, y))
+    forward = _fiery_coordinates(x, float(half))
+    sideways = _fiery_coordinates(y, float(half))
 
     def finish(axis: _Axis, point: AnyArray) -> AnyArray:
         point -= np.float32(axis[0] / half)
         # torch fuses these two steps: one rounding
         return (point.astype(np.float64) * float(half / axis[2]) - 0.5).astype(np.float32)
 
+    finish_row = functools.partial(finish, x)
+    finish_column = functools.partial(finish, y)
     return (
-        SamplingLine(cosine * ahead, sine * beside, -tx[:, 0] / half, functools.partial(finish, x)),
-        SamplingLine(-sine * ahead, cosine * beside, ty[:, 0] / half, functools.partial(finish, y)),
+        SamplingLine(cosine * forward, sine * sideways, -tx[:, 0] / half, finish_row),
+        SamplingLine(-sine * forward, cosine * sideways, ty[:, 0] / half, finish_column),
     )
 
 
 def take_cells(cells: AnyArray, indices: CellIndices, fill: float = 0) -> AnyArray:
-    """The cells (…, H·W) at these indices, `fill` where there is `OUTSIDE`."""
+    """Return the cells (…, H·W) at indices, `fill` where the index is `OUTSIDE`."""
     padded = np.empty((*cells.shape[:-1], cells.shape[-1] + 1), dtype=cells.dtype)
     padded[..., :-1] = cells
     padded[..., OUTSIDE] = fill
-    taken: AnyArray = padded.take(indices, axis=-1)
-    return taken
+    values: AnyArray = padded.take(indices, axis=-1)
+    return values
 
 
 def blend_cells(
     raster: AnyArray, points: tuple[AnyArray, AnyArray], fill: float = 0
 ) -> Float32Array:
-    """The values (…, H, W) of a raster at sample points, each the weighted mean of the four cells around.
+    """Return the values of a raster at sample points, shape (…, H, W).
 
-    Nearly all is done in the memory of the points, whose numbers are lost.
+    Each value is the weighted mean of the four cells around the point. The computation overwrites
+    the points.
     """
     rows, columns = raster.shape[-2:]
-    wide = columns + 3
-    padded = np.full((*raster.shape[:-2], rows + 3, wide), fill, dtype=np.float32)
+    stride = columns + 3
+    padded = np.full((*raster.shape[:-2], rows + 3, stride), fill, dtype=np.float32)
     padded[..., 1:-2, 1:-2] = raster
     cells = padded.reshape(*raster.shape[:-2], -1)
-    above, down = _parted(points[0], rows)
-    left, right = _parted(points[1], columns)
-    above *= wide
-    above += left
-    above += wide + 1
-    index = above.astype(np.int32).astype(np.intp)  # in two steps: three times as fast
-    up, back = 1 - down, 1 - right
-    result: Float32Array = cells.take(
-        index, axis=-1, mode="wrap"
-    )  # all are inside; the fastest mode
-    result *= up * back
-    up *= right
-    back *= down
-    down *= right
+    row_before, row_share = _split_points(points[0], rows)
+    column_before, column_share = _split_points(points[1], columns)
+    row_before *= stride
+    row_before += column_before
+    row_before += stride + 1
+    index = row_before.astype(np.int32).astype(np.intp)  # in two steps: three times as fast
+    upper_share = 1 - row_share
+    left_share = 1 - column_share
+    # All indices are valid; this mode is the fastest.
+    result: Float32Array = cells.take(index, axis=-1, mode="wrap")
+    result *= upper_share * left_share
+    # The memory of the shares is reused for the weights of the other three cells.
+    upper_share *= column_share
+    left_share *= row_share
+    row_share *= column_share
     value = np.empty_like(result)
-    for shift, weight in ((1, up), (wide, back), (wide + 1, down)):
+    for shift, weight in ((1, upper_share), (stride, left_share), (stride + 1, row_share)):
         cells[..., shift:].take(index, axis=-1, mode="wrap", out=value)
         value *= weight
         result += value
     return result
 
 
-def _parted(points: AnyArray, count: int) -> tuple[AnyArray, Float32Array]:
-    """The cell before each point, from −1 (padding) to `count` (padding), and how far beyond it the point is."""
+def _split_points(points: AnyArray, count: int) -> tuple[AnyArray, Float32Array]:
+    """Return the cell before each point, and the distance of the point from it.
+
+    The cells go from −1 (padding) to `count` (padding).
+    """
     np.clip(points, -1, count, out=points)
-    before = np.floor(points)
-    points -= before
-    return before, points.astype(np.float32, copy=False)
+    cell_before = np.floor(points)
+    points -= cell_before
+    return cell_before, points.astype(np.float32, copy=False)
 
 
 @functools.lru_cache(maxsize=64)
 def _released_coordinates(axis: _Axis) -> Float32Array:
-    """(n,) metres: from the first cell's centre to the last one's *end*, evenly."""
+    """Return metres from the first cell's centre to the last cell's *end*, evenly, shape (n,)."""
     low, high, size = axis
     return _linspace(low + size / 2, high, round((high - low) / size))
 
 
 @functools.lru_cache(maxsize=64)
 def _centers(axis: _Axis) -> FloatArray:
-    """(n,) metres: the cells' centres."""
+    """Return the cells' centres, shape (n,), metres."""
     low, high, size = axis
-    centers: FloatArray = (
-        low + (np.arange(round((high - low) / size), dtype=np.float64) + 0.5) * size
-    )
+    numbers = np.arange(round((high - low) / size), dtype=np.float64)
+    centers: FloatArray = low + (numbers + 0.5) * size
     return centers
 
 
 @functools.lru_cache(maxsize=64)
 def _fiery_coordinates(axis: _Axis, half: float) -> Float32Array:
-    """(n,) the cells' centres in units of `half` metres; from −half to half as torch's affine_grid, in float32."""
+    """Return the cells' centres in units of `half` metres, shape (n,), float32.
+
+    On an axis from −half to half they equal torch's affine_grid.
+    """
     low, high, size = axis
     count = round((high - low) / size)
     if (low, high) != (-half, half):
@@ -315,9 +359,14 @@ def _fiery_coordinates(axis: _Axis, half: float) -> Float32Array:
 
 
 def _linspace(start: float, end: float, count: int) -> Float32Array:
-    """(count,) as torch makes it in float32: a rounded step, from either end to the middle with one rounding each."""
-    first, last = np.float32(start), np.float32(end)
-    step = np.float64((last - first) / np.float32(max(count - 1, 1)))
+    """Return torch's linspace in float32, shape (count,).
+
+    It has a rounded step, and goes from both ends to the middle with one rounding for each value.
+    """
+    start_value = np.float32(start)
+    end_value = np.float32(end)
+    step = np.float64((end_value - start_value) / np.float32(max(count - 1, 1)))
     index = np.arange(count)
-    rising, falling = first + index * step, last - (count - 1 - index) * step
+    rising = start_value + index * step
+    falling = end_value - (count - 1 - index) * step
     return np.where(index < max(count // 2, 1), rising, falling).astype(np.float32)

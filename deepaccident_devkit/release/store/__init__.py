@@ -1,4 +1,7 @@
-"""Where a release's files are read: real folders, zip archives, or URLs. Nothing above `release` knows which."""
+"""Sources of a release's files: real folders, zip archives, or URLs.
+
+Only `release` knows the kind of the source.
+"""
 
 from deepaccident_devkit.release.store.opening import (
     INDEX_FOLDER,

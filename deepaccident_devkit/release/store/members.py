@@ -1,8 +1,8 @@
-"""Which files are of a release, by the folders that lead to them, and the list of a store's files.
+"""Files that belong to a release, by the folders that lead to them, and lists of a store's files.
 
-The list says where each lies in which archive; it is a memory-mapped Arrow file beside the index. Opening it takes
-milliseconds for millions of files: only folders are looked at, and a file is found among those of its folder, which are
-sorted, when it is asked for.
+The list holds the archive and the position of each file; it is a memory-mapped Arrow file beside
+the index. Opening it takes milliseconds for millions of files: only folders are read, and a file is
+searched on request among the sorted files of its folder.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ SPLIT_FILE_FOLDER: Final = "split_txt_files"
 SCENARIO_TYPE: Final = re.compile(r"type\d+_subtype\d+_(?:accident|normal)")
 SPLIT_FILES: Final = tuple(f"{split}.txt" for split in (*SPLITS, *MINI_SPLITS))
 # The folder that macOS adds to its archives.
-_FROM_MACOS: Final = "__MACOSX"
-# Counts up whenever the file's form or its meaning changes.
+_MACOS_FOLDER: Final = "__MACOSX"
+# The form increases whenever the file's form or its meaning changes.
 FORM: Final = 3
-_HEAD: Final = b"deepaccident_members"
-# How a `Member` is stored.
-_NUMBERS: Final = np.dtype(
+_METADATA_KEY: Final = b"deepaccident_members"
+# Stored form of a `Member`.
+_MEMBER_TYPE: Final = np.dtype(
     [
         ("archive", "<i4"),
         ("offset", "<i8"),
@@ -45,31 +45,36 @@ _NUMBERS: Final = np.dtype(
         ("deflated", "u1"),
     ]
 )
-# Where the name of a frame's file has its number.
-_FRAME: Final = slice(-7, -4)
+# Position of the number in the name of a frame's file.
+_FRAME_NUMBER: Final = slice(-7, -4)
 _REMEDY: Final = "remove it with: deepaccident index DATAROOT --clear"
 
 
 def release_folder(parts: Sequence[str]) -> str | None:
-    """The folder of a release that a folder stands for: from its scenario type on, below its split folder if any.
+    """Return the folder of a release that a folder stands for.
 
-    `DeepAccident/train/type1_subtype1_accident/meta` stands for `train/type1_subtype1_accident/meta`. What leads there
-    does not matter, so that an archive may hold any part of a release, below any folders. Empty for the release's own
-    folder; None for one that holds files of no release.
+    It begins with the scenario type, or with the split folder if there is one.
+    `DeepAccident/train/type1_subtype1_accident/meta` stands for
+    `train/type1_subtype1_accident/meta`. The folders that lead to it do not matter, so that an
+    archive may hold any part of a release, below any folders. Empty for the release's own folder;
+    None for a folder that holds files of no release.
     """
-    if any(
-        name.startswith(".") or name == _FROM_MACOS for name in parts
-    ):  # hidden, or leading out of an archive
+    # Hidden folders, or folders that lead out of an archive.
+    if any(name.startswith(".") or name == _MACOS_FOLDER for name in parts):
         return None
-    types = [place for place, name in enumerate(parts) if SCENARIO_TYPE.fullmatch(name)]
-    if not types:
+    type_positions = [index for index, name in enumerate(parts) if SCENARIO_TYPE.fullmatch(name)]
+    if not type_positions:
         return ""
-    above = [name for name in parts[: types[-1]] if name in (*SPLIT_FOLDERS, MINI_FOLDER)]
-    return "/".join([*above[-1:], *parts[types[-1] :]])
+    last_type = type_positions[-1]
+    splits = [name for name in parts[:last_type] if name in (*SPLIT_FOLDERS, MINI_FOLDER)]
+    return "/".join([*splits[-1:], *parts[last_type:]])
 
 
 def is_release_file(folder: str, name: str) -> bool:
-    """Whether a file is of a release: below a scenario type, or a split file in the release's own folder."""
+    """Return whether a file belongs to a release.
+
+    It lies below a scenario type, or is a split file in the release's own folder.
+    """
     return bool(folder) or name in SPLIT_FILES
 
 
@@ -77,12 +82,12 @@ class Member(NamedTuple):
     """One file of a store.
 
     Attributes:
-        archive: position in `Members.archives`.
-        offset: where its head begins in the archive; −1 where the archive is the folder that it lies in.
-        stored: bytes in the archive.
-        size: bytes of the file.
-        version: its CRC-32 in a zip; another number that changes with the file elsewhere.
-        deflated: whether it is compressed.
+        archive: Position in `Members.archives`.
+        offset: Position of its head in the archive; −1 where the archive is the file's folder.
+        stored: Size in the archive, bytes.
+        size: Size of the file, bytes.
+        version: CRC-32 in a zip; elsewhere another number that changes with the file.
+        deflated: Whether the file is compressed.
     """
 
     archive: int
@@ -95,14 +100,14 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Listing:
-    """The files of one archive that are of a release; N of them.
+    """N files of one archive that belong to a release.
 
     Attributes:
-        archive: its path from the store's place.
-        folders: of the release, each once.
-        folder: (N,) positions in `folders`.
-        names: N names of files.
-        numbers: the columns of `Member` but `archive`, (N,) each.
+        archive: Path of the archive from the store's base.
+        folders: Folders of the release, each once.
+        folder: Positions in `folders`, shape (N,).
+        names: Names of the N files.
+        numbers: Columns of `Member` except `archive`, each of shape (N,).
     """
 
     archive: str
@@ -113,36 +118,38 @@ class Listing:
 
 
 class Members:
-    """The files of a store, by folder and name.
+    """Files of a store, by folder and name.
 
     Attributes:
-        archives: their paths from the store's base.
-        states: of all archives that were there, bytes and a text that changes with them.
-        lacking: those that could not be listed.
+        archives: Paths of the archives from the store's base.
+        states: States of all existing archives: size in bytes, and a text that changes with the
+            archive.
+        lacking: Archives that could not be listed.
     """
 
     def __init__(self, path: Path) -> None:
-        """Map the file that `write_members` wrote; raises IndexStoreError if it cannot be read."""
+        """Map the file of `write_members`; raises IndexStoreError if it cannot be read."""
         import pyarrow as pa
 
         try:
             batch = pa.ipc.open_file(mapped_file(path)).get_batch(0)
-            head = json.loads(batch.schema.metadata[_HEAD])
+            head = json.loads(batch.schema.metadata[_METADATA_KEY])
             if head["form"] != FORM:
                 raise ValueError("of another version of the devkit")
             names = batch.column("name")
             _, offsets, content = names.buffers()
             self.archives: tuple[str, ...] = tuple(map(str, head["archives"]))
-            self.states = {
-                str(name): (int(size), str(text)) for name, (size, text) in head["states"].items()
-            }
+            self.states: dict[str, tuple[int, str]] = {}
+            for name, (size, text) in head["states"].items():
+                self.states[str(name)] = (int(size), str(text))
             self.lacking = [archive for archive in self.states if archive not in self.archives]
-            self._rows = {
-                str(folder): (int(first), int(last)) for folder, first, last in head["folders"]
-            }
+            self._rows: dict[str, tuple[int, int]] = {}
+            for folder, begin, end in head["folders"]:
+                self._rows[str(folder)] = (int(begin), int(end))
             self._starts = np.frombuffer(offsets, np.int64) if offsets else np.zeros(1, np.int64)
             self._content = memoryview(content) if content else memoryview(b"")
-            self._numbers = np.frombuffer(batch.column("member").buffers()[1] or b"", _NUMBERS)
+            member_buffer = batch.column("member").buffers()[1] or b""
+            self._numbers = np.frombuffer(member_buffer, _MEMBER_TYPE)
             if len(self._numbers) < len(names) or self._starts[-1] > len(self._content):
                 raise ValueError("its columns do not fit together")
         except (
@@ -161,50 +168,54 @@ class Members:
             self._add_folder(folder)
 
     def __len__(self) -> int:
-        """How many files there are."""
+        """Return the number of files."""
         return len(self._starts) - 1
 
     def find(self, name: str) -> Member | None:
-        """A file by its path in the release; None if it is not there."""
-        folder, _, last = name.rpartition("/")
+        """Return a file by its path in the release; None if it does not exist."""
+        folder, _, last_name = name.rpartition("/")
         low, high = self._rows.get(folder, (0, 0))
-        base = last.encode(errors="surrogateescape")
-        frame = base[_FRAME]
-        row = low + int(frame) - 1 if frame.isdigit() else high  # of a whole recording
-        if not (low <= row < high and self._name(row) == base):
-            row = bisect_left(range(high), base, low, high, key=self._name)
-            if row == high or self._name(row) != base:
+        file_name = last_name.encode(errors="surrogateescape")
+        frame = file_name[_FRAME_NUMBER]
+        # In a complete recording the rows follow the frame numbers.
+        row = low + int(frame) - 1 if frame.isdigit() else high
+        if not (low <= row < high and self._name(row) == file_name):
+            row = bisect_left(range(high), file_name, low, high, key=self._name)
+            if row == high or self._name(row) != file_name:
                 return None
         return self._member(row)
 
     def has_folder(self, folder: str) -> bool:
-        """Whether a folder of the release has anything in it."""
+        """Return whether a folder of the release has any content."""
         return folder in self._children
 
     def folders_in(self, folder: str) -> list[str]:
-        """The names of a folder's folders."""
+        """Return the names of the folders in a folder."""
         return [*self._children.get(folder, ())]
 
     def files_in(self, folder: str) -> list[tuple[str, Member]]:
-        """The names of a folder's files in order, and where they are."""
-        low, high = self._rows.get(folder, (0, 0))
-        return [
-            (self._name(row).decode(errors="surrogateescape"), self._member(row))
-            for row in range(low, high)
-        ]
+        """Return the names and positions of a folder's files, in order."""
+        files = []
+        for row in range(*self._rows.get(folder, (0, 0))):
+            name = self._name(row).decode(errors="surrogateescape")
+            files.append((name, self._member(row)))
+        return files
 
     def number_of(self, member: Member) -> int:
-        """Return a number that changes with a file, and with the archive that it is in."""
+        """Return a number that changes with a file, and with its archive."""
         state = self.states.get(self.archives[member.archive])
         return member.version << 32 | zlib.crc32(repr(state).encode())
 
     def _name(self, row: int) -> bytes:
+        """Return the name of the file in a row."""
         return bytes(self._content[self._starts.item(row) : self._starts.item(row + 1)])
 
     def _member(self, row: int) -> Member:
+        """Return the file in a row."""
         return Member._make(self._numbers.item(row))
 
     def _add_folder(self, folder: str) -> None:
+        """Add a folder, and the folders that lead to it, to the tree."""
         self._children.setdefault(folder, {})
         while folder:
             folder, _, name = folder.rpartition("/")
@@ -217,80 +228,81 @@ class Members:
 def write_members(
     path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]
 ) -> None:
-    """Write the list of some archives' files, as `Members` has it; raises DatarootError for a file that is twice."""
+    """Write the list of some archives' files, which `Members` reads.
+
+    Raises DatarootError for a file that occurs twice.
+    """
     import pyarrow as pa
 
     folders = sorted({folder for listing in listings for folder in listing.folders})
-    number_of = {folder: number for number, folder in enumerate(folders)}
+    folder_numbers = {folder: number for number, folder in enumerate(folders)}
     parts = []
     for archive, listing in enumerate(listings):
-        numbers = np.zeros(len(listing.names), _NUMBERS)
-        for name, values in {**listing.numbers, "archive": archive}.items():
-            numbers[name] = values
-        parts.append(
-            pa.table(
-                {
-                    "folder": np.array([number_of[name] for name in listing.folders], np.int32)[
-                        listing.folder
-                    ],
-                    "name": pa.array(
-                        [name.encode(errors="surrogateescape") for name in listing.names],
-                        pa.large_binary(),
-                    ),
-                    "member": pa.FixedSizeBinaryArray.from_buffers(
-                        pa.binary(_NUMBERS.itemsize),
-                        len(numbers),
-                        [None, pa.py_buffer(numbers.tobytes())],
-                    ),
-                }
-            )
-        )
-    table = (
-        pa.concat_tables(parts)
-        .sort_by([("folder", "ascending"), ("name", "ascending")])
-        .combine_chunks()
-    )
+        parts.append(_listing_table(listing, archive, folder_numbers))
+    order = [("folder", "ascending"), ("name", "ascending")]
+    table = pa.concat_tables(parts).sort_by(order).combine_chunks()
     archives = [listing.archive for listing in listings]
     folder = table["folder"].to_numpy()
-    _check_once(table, folder, folders, archives)
-    last = np.cumsum(np.bincount(folder, minlength=len(folders)))
-    rows = zip(folders, [0, *last.tolist()], last.tolist(), strict=False)
-    head = json.dumps({"form": FORM, "archives": archives, "folders": list(rows), "states": states})
-    table = table.select(["name", "member"]).replace_schema_metadata({_HEAD: head.encode()})
+    _check_unique(table, folder, folders, archives)
+    ends = np.cumsum(np.bincount(folder, minlength=len(folders))).tolist()
+    rows = list(zip(folders, [0, *ends], ends, strict=False))
+    head = json.dumps({"form": FORM, "archives": archives, "folders": rows, "states": states})
+    table = table.select(["name", "member"]).replace_schema_metadata({_METADATA_KEY: head.encode()})
     with replacing(path) as temporary, pa.ipc.new_file(str(temporary), table.schema) as writer:
-        writer.write_batch(
-            pa.RecordBatch.from_arrays(
-                [_one(column) for column in table.columns], schema=table.schema
-            )
-        )
+        columns = [_single_chunk(column) for column in table.columns]
+        writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=table.schema))
 
 
-def _one(column: Any) -> Any:
-    """A column's only piece; an empty one has none."""
+def _listing_table(listing: Listing, archive: int, folder_numbers: Mapping[str, int]) -> Any:
+    """Return a table of an archive's files, with the number of the archive and of the folders."""
+    import pyarrow as pa
+
+    members = np.zeros(len(listing.names), _MEMBER_TYPE)
+    for field, values in {**listing.numbers, "archive": archive}.items():
+        members[field] = values
+    listing_folders = np.array([folder_numbers[name] for name in listing.folders], np.int32)
+    names = [name.encode(errors="surrogateescape") for name in listing.names]
+    return pa.table(
+        {
+            "folder": listing_folders[listing.folder],
+            "name": pa.array(names, pa.large_binary()),
+            "member": pa.FixedSizeBinaryArray.from_buffers(
+                pa.binary(_MEMBER_TYPE.itemsize),
+                len(members),
+                [None, pa.py_buffer(members.tobytes())],
+            ),
+        }
+    )
+
+
+def _single_chunk(column: Any) -> Any:
+    """Return a column's only chunk; an empty column has none."""
     import pyarrow as pa
 
     return column.chunk(0) if column.num_chunks else pa.array([], column.type)
 
 
-def _check_once(
+def _check_unique(
     table: Any, folder: AnyArray, folders: Sequence[str], archives: Sequence[str]
 ) -> None:
-    """Raise DatarootError if two rows, which are neighbours as they are sorted, are of the same file."""
+    """Raise DatarootError if two rows have the same file; sorted rows of a file are neighbours."""
     import pyarrow.compute as pc
 
     if len(folder) < 2:
         return
     names = table["name"]
-    same = (folder[1:] == folder[:-1]) & pc.equal(names[1:], names[:-1]).to_numpy()
-    if same.any():
-        row = int(np.flatnonzero(same)[0])
+    is_repeated = (folder[1:] == folder[:-1]) & pc.equal(names[1:], names[:-1]).to_numpy()
+    if is_repeated.any():
+        row = int(np.flatnonzero(is_repeated)[0])
         name = names[row].as_py().decode(errors="backslashreplace")
-        members = (
-            np.frombuffer(table["member"][each].as_py(), _NUMBERS) for each in (row, row + 1)
-        )
-        first, second = (archives[int(member["archive"][0])] for member in members)
-        where = f"in {first} and in {second}" if first != second else f"twice in {first}"
-        more = f", and so are {same.sum() - 1:,} more" if same.sum() > 1 else ""
+        archive_names = []
+        for number in (row, row + 1):
+            member = np.frombuffer(table["member"][number].as_py(), _MEMBER_TYPE)
+            archive_names.append(archives[int(member["archive"][0])])
+        first, second = archive_names
+        location = f"in {first} and in {second}" if first != second else f"twice in {first}"
+        num_repeated = is_repeated.sum()
+        more = f", and so are {num_repeated - 1:,} more" if num_repeated > 1 else ""
         raise DatarootError(
-            f"{folders[folder[row]]}/{name}: is {where}{more}; keep one of them in this folder"
+            f"{folders[folder[row]]}/{name}: is {location}{more}; keep one of them in this folder"
         )

@@ -1,4 +1,4 @@
-"""A dataroot, as a caller names it → where its files are read: a real folder, archives, or a URL."""
+"""Opening a dataroot by the caller's name for it: a real folder, archives, or a URL."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from deepaccident_devkit.release.store.paths import (
     folder_entries,
     is_folder,
 )
-from deepaccident_devkit.release.store.sources import UrlSource, asked, list_zip
+from deepaccident_devkit.release.store.sources import UrlSource, call_library, list_zip
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.support.files import is_writable_folder
 from deepaccident_devkit.support.reading import fault_text, open_file
@@ -49,15 +49,18 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.support.parallel import Engine, Failure
 
-# File → its bytes, and a text that changes with it.
+# File → its size in bytes, and a text that changes with it.
 _States: TypeAlias = Mapping[str, tuple[int, str]]
 INDEX_FOLDER: Final = ".deepaccident"
-_ENDING: Final = ".zip"
-# Folders below a dataroot in which archives are looked for.
-_DEEPEST: Final = 3
-# How the name of a list of a store's files begins.
-_LIST: Final = "files-"
-_WITHOUT_THEM: Final = "\nThe others can be read without them: move them out of the folder, or pass on_error='skip' (--on-error skip)."
+_ARCHIVE_ENDING: Final = ".zip"
+# Archives may lie in folders of this depth below a dataroot.
+_MAX_DEPTH: Final = 3
+# Begin of the name of a list of a store's files.
+_LIST_PREFIX: Final = "files-"
+_SKIP_REMEDY: Final = (
+    "\nThe others can be read without them: move them out of the folder, "
+    "or pass on_error='skip' (--on-error skip)."
+)
 _logger = logging.getLogger(__name__)
 
 
@@ -68,81 +71,83 @@ def open_dataroot(
     refresh: bool = False,
     outside: bool = False,
     on_error: OnError = "raise",
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> ReleasePath:
-    """Where the files of a release are read.
+    """Return the path at which the files of a release are read.
 
-    A folder that holds a release is read as it is. Of a zip, a folder of zips and a URL, the files are listed once,
-    beside the index; archives are listed again when they change or are replaced, a URL's files when `refresh` is set.
+    A folder that holds a release is read directly. The files of a zip, a folder of zips or a URL
+    are listed once, beside the index; archives are listed again when they change or are replaced, a
+    URL's files when `refresh` is set.
 
     Args:
-        dataroot: a folder, a zip, a folder with zips (of any part of a release each), or a URL that fsspec can list.
-        index_dir: where lists and indexes are kept; by default in the dataroot, or in the user's cache.
-        refresh: list the files of a URL again.
-        outside: keep a new list in the user's cache, not beside the archives.
-        on_error: what to do if archives cannot be listed: `raise` names all of them, `skip` leaves them out and logs
-            them, even if no other archive is there.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says; for the lists of archives.
+        dataroot: A folder, a zip, a folder with zips (each of any part of a release), or a URL that
+            fsspec can list.
+        index_dir: Folder for lists and indexes; by default in the dataroot, or in the user's cache.
+        refresh: Whether to list the files of a URL again.
+        outside: Whether to store a new list in the user's cache instead of beside the archives.
+        on_error: What to do if archives cannot be listed: `raise` names all of them, `skip` leaves
+            them out and logs them, even if there is no other archive.
+        **engine: `workers`, `executor` and `progress` for the lists of archives, see
+            `parallel.Engine`.
 
     Returns:
-        The folder's absolute path, which need not be there; or the release's folder in a store.
+        The folder's absolute path, which need not exist; or the release's folder in a store.
 
     Raises:
-        DatarootError: archives cannot be read, two hold the same file, or the URL cannot be listed.
-        IndexStoreError: the list cannot be kept or read.
-        MissingExtraError: the URL needs fsspec, or one of its file systems.
+        DatarootError: Archives cannot be read, two hold the same file, or the URL cannot be listed.
+        IndexStoreError: The list cannot be written or read.
+        MissingExtraError: The URL needs fsspec, or one of its file systems.
     """
     if isinstance(dataroot, StorePath):
         if not (refresh and dataroot.store.is_remote):
             return dataroot
         dataroot = dataroot.store.place
-    located = _located(dataroot)
-    places = list(index_places(located, index_dir))
+    location = _location(dataroot)
+    folders = list(index_places(location, index_dir))
     if outside:
-        places.reverse()
-    if isinstance(located, str):
-        return _opened_url(UrlSource(located), places, on_error, refresh=refresh)
-    archives = _archives(located)
-    return _opened_archives(located, archives, places, on_error, **how) if archives else located
+        folders.reverse()
+    if isinstance(location, str):
+        return _opened_url(UrlSource(location), folders, on_error, refresh=refresh)
+    archives = _archives(location)
+    if not archives:
+        return location
+    return _opened_archives(location, archives, folders, on_error, **engine)
 
 
 def refused_archives(root: ReleasePath) -> list[str]:
-    """Return a sentence for each archive that was left out of a store: which one, what is wrong with it, a remedy."""
-    results = (
-        [] if isinstance(root, Path) else _listings(root.store.base, root.store.members.lacking)
-    )
+    """Return a sentence for each archive left out of a store: its name, fault and remedy."""
+    if isinstance(root, Path):
+        return []
+    results = _listings(root.store.base, root.store.members.lacking)
     return [result.message for result in results if not isinstance(result, Listing)]
 
 
 def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[Path]:
-    """The folders in which a dataroot's index may be kept, the first choice first."""
+    """Yield the folders that may hold a dataroot's index, the preferred one first."""
     if index_dir is not None:
         yield index_dir
         return
-    located = _located(dataroot.store.place if isinstance(dataroot, StorePath) else dataroot)
-    identity = os.fsencode(located)
-    if isinstance(located, Path):
-        yield (
-            located.parent / INDEX_FOLDER / located.name
-            if located.is_file()
-            else located / INDEX_FOLDER
-        )
-        identity = os.fsencode(os.path.realpath(located))  # `resolve` raises for a link to itself
+    location = _location(dataroot.store.place if isinstance(dataroot, StorePath) else dataroot)
+    identity = os.fsencode(location)
+    if isinstance(location, Path):
+        if location.is_file():
+            yield location.parent / INDEX_FOLDER / location.name
+        else:
+            yield location / INDEX_FOLDER
+        identity = os.fsencode(os.path.realpath(location))  # `resolve` raises for a link to itself
     from platformdirs import user_cache_path
 
-    yield (
-        user_cache_path("deepaccident_devkit")
-        / hashlib.blake2b(identity, digest_size=8).hexdigest()
-    )
+    digest = hashlib.blake2b(identity, digest_size=8).hexdigest()
+    yield user_cache_path("deepaccident_devkit") / digest
 
 
-def list_files_in(place: Path) -> list[Path]:
-    """The lists of stores' files in a folder of indexes, with what they were made from."""
-    return sorted(place.glob(f"{_LIST}*"))
+def list_files_in(folder: Path) -> list[Path]:
+    """Return the lists of stores' files in a folder of indexes."""
+    return sorted(folder.glob(f"{_LIST_PREFIX}*"))
 
 
-def _located(dataroot: str | os.PathLike[str]) -> Path | str:
-    """The absolute path of what a caller names, symbolic links as they are; or the URL."""
+def _location(dataroot: str | os.PathLike[str]) -> Path | str:
+    """Return the absolute path of a dataroot with its symbolic links; or the URL."""
     text = path_text(dataroot, "dataroot: expected a path or a URL", error=DatarootError)
     if "://" in text:
         parts = urlsplit(text)
@@ -153,257 +158,306 @@ def _located(dataroot: str | os.PathLike[str]) -> Path | str:
 
 
 def _archives(path: Path) -> list[Path]:
-    """The archives that a path stands for: itself, or those in a folder that holds no release; none for others."""
-    if path.suffix.lower() == _ENDING and path.is_file():
+    """Return the archives of a path: itself, or the archives in a folder that holds no release.
+
+    Other paths have none.
+    """
+    if path.suffix.lower() == _ARCHIVE_ENDING and path.is_file():
         return [path]
-    if any(
-        _has_scenarios(folder)
-        for folder in (path, *(path / name for name in (*SPLIT_FOLDERS, MINI_FOLDER)))
-    ):
+    release_folders = [path, *(path / name for name in (*SPLIT_FOLDERS, MINI_FOLDER))]
+    if any(_has_scenarios(folder) for folder in release_folders):
         return []
-    found: list[Path] = []
+    archives: list[Path] = []
     folders = [(path, 0)]
     while folders:
         folder, depth = folders.pop()
         with suppress(OSError):
             for entry in folder_entries(folder):
-                inside = folder / entry.name
-                if is_folder(entry) and depth < _DEEPEST and not entry.name.startswith("."):
-                    folders.append((inside, depth + 1))
-                elif (
-                    entry.name.lower().endswith(_ENDING)
-                    and inside.is_file()
-                    and not entry.name.startswith(".")
-                ):
-                    found.append(inside)
-    return sorted(found)
+                entry_path = folder / entry.name
+                is_hidden = entry.name.startswith(".")
+                if is_folder(entry) and depth < _MAX_DEPTH and not is_hidden:
+                    folders.append((entry_path, depth + 1))
+                elif _is_archive(entry.name) and entry_path.is_file() and not is_hidden:
+                    archives.append(entry_path)
+    return sorted(archives)
+
+
+def _is_archive(name: str) -> bool:
+    """Return whether a file name or URL is that of an archive."""
+    return name.lower().endswith(_ARCHIVE_ENDING)
 
 
 def _has_scenarios(folder: Path) -> bool:
+    """Return whether a folder holds scenario types."""
     with suppress(OSError):
-        return any(
-            SCENARIO_TYPE.fullmatch(entry.name) and is_folder(entry)
-            for entry in folder_entries(folder)
-        )
+        for entry in folder_entries(folder):
+            if SCENARIO_TYPE.fullmatch(entry.name) and is_folder(entry):
+                return True
     return False
 
 
 def _opened_archives(
     path: Path,
     archives: Sequence[Path],
-    places: Sequence[Path],
+    folders: Sequence[Path],
     on_error: OnError,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> StorePath:
+    """Return the release in archives at or below a path; `folders` may hold its list of files."""
     base = path.parent if archives == [path] else path
-    split_files = (path / below / name for below in ("", SPLIT_FILE_FOLDER) for name in SPLIT_FILES)
-    states, beside = _states(base, archives), _states(base, filter(Path.is_file, split_files))
-    found = sorted({**states, **beside}.items())
-    name = list_name(found)
-    for known in (place / name for place in places if (place / name).is_file()):
-        with suppress(IndexStoreError):  # a damaged list is made again
-            return StorePath(opened_store(str(path), str(base), known))
-    listings = _accepted(str(path), _listings(str(base), states, (base,), **how), on_error)
-    written = _written(places, found, _with_loose(listings, beside), states)
-    return StorePath(opened_store(str(path), str(base), written))
+    split_files = []
+    for split_folder in (path, path / SPLIT_FILE_FOLDER):
+        split_files += [split_folder / name for name in SPLIT_FILES]
+    states = _states(base, archives)
+    split_states = _states(base, filter(Path.is_file, split_files))
+    all_states = sorted({**states, **split_states}.items())
+    name = list_name(all_states)
+    for folder in folders:
+        list_file = folder / name
+        if list_file.is_file():
+            with suppress(IndexStoreError):  # a damaged list is made again
+                return StorePath(opened_store(str(path), str(base), list_file))
+    results = _listings(str(base), states, (base,), **engine)
+    listings = _with_loose_files(_accepted(str(path), results, on_error), split_states)
+    list_file = _write_list(folders, all_states, listings, states)
+    return StorePath(opened_store(str(path), str(base), list_file))
 
 
 def _states(base: Path, files: Iterable[Path]) -> _States:
+    """Return the states of files by their paths below a base folder."""
     return {file.relative_to(base).as_posix(): state_of(file) for file in files}
 
 
 def state_of(file: Path) -> tuple[int, str]:
-    """A file's bytes, and a text that changes with it, also if its time is put back."""
+    """Return a file's size in bytes, and a text that changes with it.
+
+    The text also changes if the file's time is reset.
+    """
     status = file.stat()
     return status.st_size, f"{status.st_mtime_ns} {status.st_ctime_ns}"
 
 
 def _opened_url(
-    source: UrlSource, places: Sequence[Path], on_error: OnError, *, refresh: bool
+    source: UrlSource, folders: Sequence[Path], on_error: OnError, *, refresh: bool
 ) -> StorePath:
+    """Return the release at a URL; `folders` may hold its list of files."""
     url = source.url
-    base = UrlSource(url.rpartition("/")[0]) if url.lower().endswith(_ENDING) else source
-    with _told(url):
-        known = None if refresh else _known_list(base, places)
-        if known is None:
-            archives, others = _files_at(base, url)
-            listings = _accepted(url, _listings(base.url, archives, workers=1), on_error)
-            listings = _with_loose(listings, others)
+    base = UrlSource(url.rpartition("/")[0]) if _is_archive(url) else source
+    with _dataroot_errors(url):
+        list_file = None if refresh else _known_list(base, folders)
+        if list_file is None:
+            archives, loose_files = _files_at(base, url)
+            results = _listings(base.url, archives, workers=1)
+            listings = _with_loose_files(_accepted(url, results, on_error), loose_files)
             if on_error == "raise" and not any(listing.names for listing in listings):
                 raise DatarootError(
                     f"{url}: no file of a release found; give the URL that the release lies below"
                 )
-            known = _written(places, [*archives.items(), *others.items()], listings, archives)
-    return StorePath(opened_store(url, base.url, known))
+            states = [*archives.items(), *loose_files.items()]
+            list_file = _write_list(folders, states, listings, archives)
+    return StorePath(opened_store(url, base.url, list_file))
 
 
 def _listings(
-    base: str, archives: Iterable[str], places: tuple[Path, ...] = (), **how: Unpack[Engine]
+    base: str, archives: Iterable[str], read_paths: tuple[Path, ...] = (), **engine: Unpack[Engine]
 ) -> list[Listing | Failure]:
-    """List archives by their paths from the base, a folder or a URL; a Failure says why one cannot be listed."""
-    from deepaccident_devkit.support.parallel import (
-        Places,
-        Tried,
-        run_batch,
-    )  # here: few dataroots are archives
+    """List archives by their paths from the base, a folder or a URL.
+
+    A Failure has the reason why an archive cannot be listed.
+    """
+    # Imported late, since few dataroots are archives.
+    from deepaccident_devkit.support.parallel import Places, Tried, run_batch
 
     work = Tried(partial(_listing_of, base))
-    return run_batch(
-        work, list(archives), label="listing archives", places=Places(reads=places), **how
-    )
+    places = Places(reads=read_paths)
+    return run_batch(work, list(archives), label="listing archives", places=places, **engine)
 
 
 def _listing_of(base: str, name: str) -> Listing:
-    shown = f"{base}/{name}"
+    """Return the listing of an archive, or raise DatarootError."""
+    path = f"{base}/{name}"
 
     def listing() -> Listing:
-        with UrlSource(base).opened(name) if "://" in base else open_file(Path(shown)) as file:
-            return list_zip(file, name, shown)
+        with UrlSource(base).opened(name) if "://" in base else open_file(Path(path)) as file:
+            return list_zip(file, name, path)
 
     try:
-        return asked(listing)
+        return call_library(listing)
     except OSError as error:
         if isinstance(error, DatarootError):
             raise
         raise DatarootError(
-            f"{shown}: {fault_text(error)}; make it readable, or fetch it again"
+            f"{path}: {fault_text(error)}; make it readable, or fetch it again"
         ) from error
 
 
-def _accepted(place: str, results: Sequence[Listing | Failure], on_error: OnError) -> list[Listing]:
-    """Return the listings of archives; those that cannot be listed are logged, or DatarootError names all of them."""
+def _accepted(
+    location: str, results: Sequence[Listing | Failure], on_error: OnError
+) -> list[Listing]:
+    """Return the listings of archives.
+
+    Archives that cannot be listed are logged, or DatarootError names all of them.
+    """
     refused = [result.message for result in results if not isinstance(result, Listing)]
-    text = "\n  ".join(
-        [f"{place}: {len(refused)} of {len(results)} archives cannot be read:", *refused]
-    )
+    title = f"{location}: {len(refused)} of {len(results)} archives cannot be read:"
+    text = "\n  ".join([title, *refused])
     if refused and on_error == "raise":
-        raise DatarootError(text + _WITHOUT_THEM * (len(refused) < len(results)))
+        raise DatarootError(text + _SKIP_REMEDY * (len(refused) < len(results)))
     if refused:
         _logger.warning("left out: %s", escaped(text))
     return [result for result in results if isinstance(result, Listing)]
 
 
-def _known_list(base: UrlSource, places: Sequence[Path]) -> Path | None:
-    """The list of all of a URL's files, if its archives have not changed since; others are not asked."""
-    for path in (path for place in places for path in list_files_in(place)):
-        with suppress(IndexStoreError):
-            members = Members(path)
-            if not members.lacking and all(
-                base.state_of(name) == state for name, state in members.states.items()
-            ):
-                return path
+def _known_list(base: UrlSource, folders: Sequence[Path]) -> Path | None:
+    """Return the list of all of a URL's files, if its archives have not changed since.
+
+    The states of other files are not requested.
+    """
+    for folder in folders:
+        for path in list_files_in(folder):
+            with suppress(IndexStoreError):
+                members = Members(path)
+                if not members.lacking and _has_states(base, members.states):
+                    return path
     return None
 
 
-def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
-    """The archives at a URL, and the other files that are read: split files beside archives, all where there are none.
+def _has_states(base: UrlSource, states: _States) -> bool:
+    """Return whether files at a URL have these states."""
+    return all(base.state_of(name) == state for name, state in states.items())
 
-    Path from the base → bytes, and a text that changes with the file.
+
+def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
+    """Return the states of the archives at a URL, and of the other files that are read.
+
+    The other files are split files beside archives, or all files if there are no archives. The
+    states are by the paths from the base.
     """
     if base.url != url:
         name = PurePosixPath(url).name
         return {name: base.state_of(name)}, {}
     files = dict(sorted(base.list_files().items()))
-    archives = {name: state for name, state in files.items() if name.lower().endswith(_ENDING)}
-    if not archives or any(
-        release_folder(folder.split("/")) for folder in {each.rpartition("/")[0] for each in files}
-    ):
+    archives = {name: state for name, state in files.items() if _is_archive(name)}
+    folders = {path.rpartition("/")[0] for path in files}
+    if not archives or any(release_folder(folder.split("/")) for folder in folders):
         return {}, files
-    return archives, {name: state for name, state in files.items() if _is_split(name)}
+    return archives, {name: state for name, state in files.items() if _is_split_file(name)}
 
 
-def _is_split(path: str) -> bool:
-    """Whether a file beside archives is a split file, by its path from the place."""
+def _is_split_file(path: str) -> bool:
+    """Return whether a file beside archives is a split file, by its path from the base."""
     folder, _, name = path.rpartition("/")
     return name in SPLIT_FILES and folder in ("", SPLIT_FILE_FOLDER)
 
 
-def _with_loose(listings: Sequence[Listing], files: _States) -> list[Listing]:
-    """The listings of archives, and of files beside them; a split file that an archive holds counts more than those."""
-    packed = {name for listing in listings for name in listing.names if name in SPLIT_FILES}
-    return [
-        *listings,
-        *_loose({path: files[path] for path in files if path.rpartition("/")[2] not in packed}),
-    ]
+def _with_loose_files(listings: Sequence[Listing], files: _States) -> list[Listing]:
+    """Return the listings of archives, and of files beside them.
+
+    A split file in an archive takes precedence over one beside the archives.
+    """
+    packed: set[str] = set()
+    for listing in listings:
+        packed.update(name for name in listing.names if name in SPLIT_FILES)
+    loose_files = {}
+    for path, state in files.items():
+        if path.rpartition("/")[2] not in packed:
+            loose_files[path] = state
+    return [*listings, *_loose_listings(loose_files)]
 
 
-def _loose(files: _States) -> list[Listing]:
-    """Files that are in no archive, a listing for each folder; for the place itself also if it has none."""
+def _loose_listings(files: _States) -> list[Listing]:
+    """Return a listing for each folder of files that are in no archive.
+
+    The base folder has one even if it has no files.
+    """
     folders: dict[str, list[str]] = {"": []}
     for path in files:
         folders.setdefault(path.rpartition("/")[0], []).append(path)
     listings = []
     for folder, paths in folders.items():
-        found = release_folder(folder.split("/"))
-        if found is None:
+        release_name = release_folder(folder.split("/"))
+        if release_name is None:
             continue
-        paths = [path for path in paths if is_release_file(found, path.rpartition("/")[2])]  # noqa: PLW2901
-        sizes = np.array([files[path][0] for path in paths], np.int64)
+        names = []
+        states = []
+        for path in paths:
+            name = path.rpartition("/")[2]
+            if is_release_file(release_name, name):
+                names.append(name)
+                states.append(files[path])
+        sizes = np.array([size for size, _ in states], np.int64)
+        versions = [zlib.crc32(text.encode()) for _, text in states]
         numbers = {
-            "offset": np.full(len(paths), -1),
+            "offset": np.full(len(names), -1),
             "stored": sizes,
             "size": sizes,
-            "version": np.array([zlib.crc32(files[path][1].encode()) for path in paths], np.uint32),
-            "deflated": np.zeros(len(paths), np.uint8),
+            "version": np.array(versions, np.uint32),
+            "deflated": np.zeros(len(names), np.uint8),
         }
-        names = [path.rpartition("/")[2] for path in paths]
-        zeros = np.zeros(len(paths), int)
-        listings.append(
-            Listing(archive=folder, folders=[found], folder=zeros, names=names, numbers=numbers)
+        listing = Listing(
+            archive=folder,
+            folders=[release_name],
+            folder=np.zeros(len(names), int),
+            names=names,
+            numbers=numbers,
         )
+        listings.append(listing)
     return listings
 
 
 def list_name(states: Sequence[Any]) -> str:
-    """The name of the list of what is made from files of these states."""
-    digest = hashlib.blake2b(json.dumps([FORM, states]).encode(), digest_size=8).hexdigest()
-    return f"{_LIST}{digest}.arrow"
+    """Return the name of the list of a store with files of these states."""
+    content = json.dumps([FORM, states]).encode()
+    digest = hashlib.blake2b(content, digest_size=8).hexdigest()
+    return f"{_LIST_PREFIX}{digest}.arrow"
 
 
-def _written(
-    places: Sequence[Path],
-    found: Sequence[Any],
+def _write_list(
+    folders: Sequence[Path],
+    all_states: Sequence[Any],
     listings: Sequence[Listing],
     states: _States,
 ) -> Path:
-    """Write the list of a store's files into the first place that can be written, and remove older ones there.
+    """Write the list of a store's files into the first writable folder, and remove older lists.
 
-    Its name is that of what was found, unless archives could not be listed: these are looked at each time.
+    The name follows from the states of all files, unless archives could not be listed: they are
+    tried each time.
     """
-    name = list_name([*found, *sorted(states.keys() - {listing.archive for listing in listings})])
-    place = next((place for place in places if is_writable_folder(place)), None)
-    if place is None:
-        told = " or ".join(map(str, places))
+    refused = states.keys() - {listing.archive for listing in listings}
+    name = list_name([*all_states, *sorted(refused)])
+    folder = next((folder for folder in folders if is_writable_folder(folder)), None)
+    if folder is None:
+        names = " or ".join(map(str, folders))
         raise IndexStoreError(
-            f"{told}: no place to write the index; give a writable folder with index_dir="
+            f"{names}: no place to write the index; give a writable folder with index_dir="
         )
+    list_file = folder / name
     try:
-        write_members(place / name, listings, states)
-        for path in list_files_in(place):
+        write_members(list_file, listings, states)
+        for path in list_files_in(folder):
             if path.name != name:
                 path.unlink(missing_ok=True)
     except OSError as error:
         if isinstance(error, DeepAccidentError):
             raise
         raise IndexStoreError(
-            f"{place / name}: cannot be written ({fault_text(error)}); make room there"
+            f"{list_file}: cannot be written ({fault_text(error)}); make room there"
         ) from error
-    return place / name
+    return list_file
 
 
 @contextmanager
-def _told(url: str) -> Iterator[None]:
-    """Turn what a URL's files raise into DatarootError."""
+def _dataroot_errors(url: str) -> Iterator[None]:
+    """Turn errors of a URL's files into DatarootError."""
     try:
         yield
     except OSError as error:
         if isinstance(error, DeepAccidentError):
             raise
-        what = (
-            "does not exist, or may not be listed"
-            if isinstance(error, FileNotFoundError)
-            else fault_text(error)
-        )
+        if isinstance(error, FileNotFoundError):
+            fault = "does not exist, or may not be listed"
+        else:
+            fault = fault_text(error)
         raise DatarootError(
-            f"{url}: {what}; check the URL, and the credentials in the environment"
+            f"{url}: {fault}; check the URL, and the credentials in the environment"
         ) from None

@@ -1,4 +1,4 @@
-"""`StorePath`: a file or folder of a release that lies in archives or at a URL, with the part of Path that is used."""
+"""`StorePath`: a path of a release in archives or at a URL, with the part of Path that is used."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ REMEDY: Final = "restore the file from its archive"
 
 @dataclass(frozen=True, slots=True)
 class StoreStatus:
-    """What `stat` says of a file in a store, by the names of `os.stat_result`."""
+    """Status of a file in a store, with the names of `os.stat_result`."""
 
     st_mode: int
     st_size: int
     st_mtime_ns: int
-    """A number that changes with the file, and with its archive."""
+    """Number that changes with the file, and with its archive."""
 
 
 @total_ordering
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
 class StorePath:
-    """A path in a store; equal to another one of the same text.
+    """A path in a store; equal to another one with the same text.
 
     Attributes:
-        store: where it is read.
-        inside: the path in the release, with `/` between names; empty for the release's folder.
+        store: Store of the path.
+        inside: Path in the release, with `/` between names; empty for the release's folder.
     """
 
     store: ReleaseStore
     inside: str = ""
 
-    def __truediv__(self, below: str | PurePath) -> StorePath:
-        """A path below this one."""
-        text = below if isinstance(below, str) else below.as_posix()
+    def __truediv__(self, relative: str | PurePath) -> StorePath:
+        """Return a path below this one."""
+        text = relative if isinstance(relative, str) else relative.as_posix()
         return StorePath(self.store, f"{self.inside}/{text}".strip("/") if text else self.inside)
 
     def __str__(self) -> str:
-        """The store's place and the path in it."""
+        """Return the store's location and the path in it."""
         return f"{self.store.place}/{self.inside}" if self.inside else self.store.place
 
     def __repr__(self) -> str:
@@ -69,37 +69,37 @@ class StorePath:
 
     @property
     def name(self) -> str:
-        """The last name; of the release's folder that of the archive or of the URL's end."""
+        """Last name; for the release's folder the name of the archive or the end of the URL."""
         return PurePosixPath(str(self)).name
 
     @property
     def stem(self) -> str:
-        """The last name without its ending."""
+        """Last name without its ending."""
         return PurePosixPath(self.name).stem
 
     @property
     def parent(self) -> StorePath:
-        """The folder above; the release's folder is its own."""
+        """Parent folder; the release's folder is its own."""
         return StorePath(self.store, self.inside.rpartition("/")[0])
 
     def resolve(self) -> StorePath:
-        """Itself: there are no links."""
+        """Return the path itself: there are no links."""
         return self
 
     def exists(self) -> bool:
-        """Whether there is such a file or folder."""
+        """Return whether there is such a file or folder."""
         return self.is_file() or self.is_dir()
 
     def is_file(self) -> bool:
-        """Whether there is such a file."""
+        """Return whether there is such a file."""
         return self.store.members.find(self.inside) is not None
 
     def is_dir(self) -> bool:
-        """Whether there is such a folder."""
+        """Return whether there is such a folder."""
         return self.store.members.has_folder(self.inside)
 
     def stat(self) -> StoreStatus:
-        """Size and kind; raises FileNotFoundError."""
+        """Return size and kind; raises FileNotFoundError."""
         members = self.store.members
         member = members.find(self.inside)
         if member is not None:
@@ -109,27 +109,32 @@ class StorePath:
         raise FileNotFoundError(str(self))
 
     def local_path(self) -> Path:
-        """A real path with its content; raises as `ReleaseStore.local_path` does."""
+        """Return a real path with the file's content; raises as `ReleaseStore.local_path` does."""
         return self.store.local_path(self.inside)
 
     def content(self, kind: FileKind) -> bytes:
-        """The file's bytes, as `support.reading.read_bytes` gives them; raises OSError."""
+        """Return the file's bytes like `support.reading.read_bytes`; raises OSError."""
         return self.store.read(self.inside, kind)
 
 
-# Where something of a release lies: a real path, or one in a store.
+# A path of a release: a real path, or a path in a store.
 ReleasePath: TypeAlias = Path | StorePath
+# A caller's name for a release: its folder, an archive, a folder of archives, a URL.
+Dataroot: TypeAlias = str | os.PathLike[str] | ReleasePath
 
 
 def places_of(root: ReleasePath) -> tuple[Path, ...]:
-    """What workers must see to read a release."""
+    """Return the paths that workers must be able to read for a release."""
     return (root,) if isinstance(root, Path) else root.store.places
 
 
 def read_content(
     path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY
 ) -> bytes:
-    """A file's bytes; raises MissingFileError, and `fault` if it cannot be read or is too large for its kind."""
+    """Return a file's bytes.
+
+    Raises MissingFileError, and `fault` if it cannot be read or is too large for its kind.
+    """
     try:
         return read_bytes(path, kind)
     except FileNotFoundError:
@@ -146,20 +151,30 @@ def read_lines(
     *,
     errors: str = "strict",
 ) -> list[str]:
-    """The lines of a UTF-8 file, without line ends; raises as `read_content` does, and `fault` if it is no text.
+    """Return the lines of a UTF-8 file, without line ends.
 
-    `errors` says what to do with bytes that are not UTF-8, as of `bytes.decode`.
+    Args:
+        path: The file.
+        kind: Kind of the file, which limits its size.
+        fault: Error for a file that cannot be read or is no text.
+        remedy: Remedy in the error.
+        errors: What to do with bytes that are not UTF-8, as in `bytes.decode`.
+
+    Raises:
+        ReleaseError: As in `read_content`, and `fault` if the file is no text.
     """
+    content = read_content(path, kind, fault, remedy)
     try:
-        return (
-            read_content(path, kind, fault, remedy).decode("utf-8-sig", errors=errors).splitlines()
-        )
+        return content.decode("utf-8-sig", errors=errors).splitlines()
     except UnicodeDecodeError as error:
         raise fault(f"{path}: not a text file ({error.reason}); {remedy}") from error
 
 
 def real_path(path: ReleasePath) -> Path:
-    """A path that other programs can write to; raises NotAvailableError if this has no path of the system."""
+    """Return a path of the file system, which other programs can write to.
+
+    Raises NotAvailableError for a path in a store.
+    """
     if isinstance(path, Path):
         return path
     raise NotAvailableError(
@@ -169,31 +184,32 @@ def real_path(path: ReleasePath) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class StoreEntry:
-    """What lies in a folder of a store, as `os.DirEntry`."""
+    """An entry of a folder in a store, like `os.DirEntry`."""
 
     name: str
     status: StoreStatus
 
     def is_dir(self) -> bool:
-        """Whether it is a folder."""
+        """Return whether the entry is a folder."""
         return stat.S_ISDIR(self.status.st_mode)
 
     def is_file(self) -> bool:
-        """Whether it is a file."""
+        """Return whether the entry is a file."""
         return not self.is_dir()
 
     def stat(self) -> StoreStatus:
-        """Its size and kind."""
+        """Return the entry's size and kind."""
         return self.status
 
 
-# How a caller names a release: its folder, an archive, a folder of archives, a URL.
-Dataroot: TypeAlias = str | os.PathLike[str] | ReleasePath
 FolderEntry: TypeAlias = os.DirEntry[str] | StoreEntry
 
 
 def folder_entries(folder: ReleasePath) -> list[FolderEntry]:
-    """What lies in a folder, in no order; raises OSError, FileNotFoundError and NotADirectoryError among them."""
+    """Return the entries of a folder, in no order.
+
+    Raises OSError, which may be a FileNotFoundError or a NotADirectoryError.
+    """
     if isinstance(folder, Path):
         with os.scandir(folder) as entries:
             return list(entries)
@@ -202,21 +218,20 @@ def folder_entries(folder: ReleasePath) -> list[FolderEntry]:
         if folder.is_file():
             raise NotADirectoryError(str(folder))
         raise FileNotFoundError(str(folder))
-    folders = [
-        StoreEntry(name, StoreStatus(stat.S_IFDIR, 0, 0))
-        for name in members.folders_in(folder.inside)
-    ]
-    files = [
-        StoreEntry(name, StoreStatus(stat.S_IFREG, member.size, members.number_of(member)))
-        for name, member in members.files_in(folder.inside)
-    ]
-    return [*folders, *files]
+    store_entries: list[FolderEntry] = []
+    for name in members.folders_in(folder.inside):
+        store_entries.append(StoreEntry(name, StoreStatus(stat.S_IFDIR, 0, 0)))
+    for name, member in members.files_in(folder.inside):
+        status = StoreStatus(stat.S_IFREG, member.size, members.number_of(member))
+        store_entries.append(StoreEntry(name, status))
+    return store_entries
 
 
 def is_folder(entry: FolderEntry, *, loops: bool = False) -> bool:
-    """Whether an entry is a folder, or a link whose end cannot be looked at; listing that one tells why.
+    """Return whether an entry is a folder, or a link with a target that cannot be accessed.
 
-    Links that lead back (`leads_back`) are none, unless `loops`.
+    Listing such a link raises the reason. Links that lead back (`leads_back`) are no folders,
+    unless `loops`.
     """
     try:
         return (loops or not leads_back(entry)) and entry.is_dir()
@@ -225,20 +240,27 @@ def is_folder(entry: FolderEntry, *, loops: bool = False) -> bool:
 
 
 def leads_back(entry: FolderEntry) -> bool:
-    """Whether an entry is a link that leads nowhere: its end is not there, is itself, or a folder that it lies in."""
+    """Return whether an entry is a link that leads nowhere.
+
+    Its target does not exist, or is the link itself or a folder that holds the link.
+    """
     if isinstance(entry, StoreEntry) or not entry.is_symlink():
         return False
-    folder = Path(os.path.realpath(os.path.dirname(entry.path)))  # noqa: PTH120 - `Path.resolve` raises for links to themselves
-    return not os.path.exists(entry.path) or folder.is_relative_to(os.path.realpath(entry.path))  # noqa: PTH110
+    if not os.path.exists(entry.path):  # noqa: PTH110
+        return True
+    # `Path.resolve` raises for links to themselves.
+    folder = Path(os.path.realpath(os.path.dirname(entry.path)))  # noqa: PTH120
+    return folder.is_relative_to(os.path.realpath(entry.path))
 
 
 def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
+    """Read small files together; return None if there are none, or one is missing."""
     if not paths:
         return None
     store = paths[0].store
     try:
         return store.fetch(path.inside for path in paths)
-    except FileNotFoundError:  # one after the other they say which one is gone
+    except FileNotFoundError:  # separate reads raise the error of the missing file
         return None
     except OSError as error:
         raise DatarootError(
@@ -248,7 +270,10 @@ def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
 
 @contextmanager
 def fetched(paths: Iterable[ReleasePath]) -> Iterator[None]:
-    """Have small files at a URL read together, and from memory in the block and thread; raises DatarootError."""
+    """Read small files at a URL together, and use their bytes within the block.
+
+    This holds for the current thread. Raises DatarootError.
+    """
     remote = [path for path in paths if isinstance(path, StorePath) and path.store.is_remote]
     token = READ_BEFORE.set(_fetched(remote))
     try:
@@ -259,7 +284,7 @@ def fetched(paths: Iterable[ReleasePath]) -> Iterator[None]:
 
 @contextmanager
 def checksums_compared() -> Iterator[None]:
-    """Have what is read from archives in the block, in this thread, compared with the archives' checksums."""
+    """Compare bytes from archives with their checksums within the block, in this thread."""
     token = COMPARES.set(True)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Where archives lie, a folder of this machine or a URL, and how a part of one is read: zips are read in place."""
+"""Sources of archives, a local folder or a URL: parts of zips are read in place."""
 
 from __future__ import annotations
 
@@ -36,18 +36,19 @@ from deepaccident_devkit.support.reading import (
 )
 
 _Result = TypeVar("_Result")
-# Parts of a URL in a library's message that may be secret: what is asked for, and who asks.
+# Parts of a URL in a library's message that may be secret: the query and the user.
 _SECRETS: Final = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")
-_LARGEST_GAP: Final = 1 << 16
-# Bytes between two members that are fetched with them, and that are fetched at once.
-_LARGEST_RANGE: Final = 64 << 20
-# Archives that are open at once in a process; a system allows some 1,000 files.
-MOST_OPEN: Final = 256
-# An archive, and the first byte and the one after the last.
+# Members with a gap of at most this many bytes are fetched together with the gap.
+_MAX_GAP_BYTES: Final = 1 << 16
+_MAX_RANGE_BYTES: Final = 64 << 20
+# Archives that are open at once in a process; a system allows about 1,000 files.
+MAX_OPEN_ARCHIVES: Final = 256
+# An archive, its first byte and the byte after the last.
 ByteRange = tuple[str, int, int]
 # Bytes of a member's head before its name.
 HEAD_LENGTH: Final = 30
-# Bytes that are read at once in place of a head's true length: a name, and more fields than any program adds.
+# Bytes that are read at once for a head of unknown length: a name, and more fields than any program
+# adds.
 LONGEST_HEAD: Final = HEAD_LENGTH + 512
 _HEAD: Final = struct.Struct("<4s22xHH")
 _SIGNATURE: Final = b"PK\x03\x04"
@@ -57,21 +58,25 @@ _REMEDY: Final = "fetch the archive again"
 
 
 class Source(ABC):
-    """Reads parts of the archives below one place."""
+    """A reader of parts of the archives below a folder or URL."""
 
     @abstractmethod
     def read(self, archive: str, start: int, stop: int) -> bytes:
-        """Bytes of an archive, as many as are there; raises OSError, of a file that is gone FileNotFoundError."""
+        """Return bytes of an archive, fewer if it ends before `stop`.
+
+        Raises OSError, or FileNotFoundError for a missing file.
+        """
 
     def read_all(self, ranges: Sequence[ByteRange]) -> list[bytes]:
-        """Several parts; raises OSError."""
-        return [self.read(*each) for each in ranges]
+        """Return several parts; raises OSError."""
+        return [self.read(*byte_range) for byte_range in ranges]
 
 
 class _Archive:
-    """An open archive, which is closed when nobody reads it any more."""
+    """An open archive, which is closed when it is no longer used."""
 
     def __init__(self, descriptor: int) -> None:
+        """Take over an open descriptor."""
         self.descriptor = descriptor
 
     def __del__(self) -> None:
@@ -79,7 +84,7 @@ class _Archive:
 
 
 class LocalSource(Source):
-    """A folder of this machine. An open archive is read by several threads and forked processes at once."""
+    """A local folder. Several threads and forked processes read an open archive at once."""
 
     def __init__(self, folder: Path) -> None:
         """Read below this folder."""
@@ -87,35 +92,39 @@ class LocalSource(Source):
         self._opened: dict[str, _Archive] = {}
 
     def read(self, archive: str, start: int, stop: int) -> bytes:
-        """Bytes of an archive."""
+        """Return bytes of an archive."""
         opened = self._opened.get(archive) or self._open(archive)
         descriptor = opened.descriptor
         content = os.pread(descriptor, stop - start, start)
-        return (
-            content
-            if len(content) == stop - start
-            else self._rest(descriptor, content, start, stop)
-        )
+        if len(content) == stop - start:
+            return content
+        return self._completed(descriptor, content, start, stop)
 
     def _open(self, archive: str) -> _Archive:
+        """Open an archive, and close the oldest one if too many are open."""
         with open_file(self._folder / archive) as file:
             opened = self._opened[archive] = _Archive(os.dup(file.fileno()))
-        if len(self._opened) > MOST_OPEN:
+        if len(self._opened) > MAX_OPEN_ARCHIVES:
             self._opened.pop(next(iter(self._opened)), None)
         return opened
 
     @staticmethod
-    def _rest(descriptor: int, content: bytes, start: int, stop: int) -> bytes:
-        """The bytes after `content`, which one call did not give: the system gives at most 2 GiB at once."""
-        while len(content) < stop - start and (
-            more := os.pread(descriptor, stop - start - len(content), start + len(content))
-        ):
-            content += more
+    def _completed(descriptor: int, content: bytes, start: int, stop: int) -> bytes:
+        """Return `content` with the bytes after it, since a call returns at most 2 GiB."""
+        while len(content) < stop - start:
+            missing = stop - start - len(content)
+            part = os.pread(descriptor, missing, start + len(content))
+            if not part:
+                break
+            content += part
         return content
 
 
 class UrlSource(Source):
-    """A URL that fsspec can list and read. Its credentials are fsspec's business: its settings, the environment."""
+    """A URL that fsspec can list and read.
+
+    Fsspec takes credentials from its settings and the environment.
+    """
 
     def __init__(self, url: str) -> None:
         """Read below this URL; raises DatarootError if it holds a password or another secret."""
@@ -123,79 +132,85 @@ class UrlSource(Source):
         self._opened: tuple[int, Any, str] | None = None
 
     def read(self, archive: str, start: int, stop: int) -> bytes:
-        """Bytes of an archive, or of a file."""
+        """Return bytes of an archive, or of a file."""
         files, root = self._files()
-        return cast(
-            "bytes", asked(lambda: files.cat_file(f"{root}/{archive}", start=start, end=stop))
-        )
+        path = f"{root}/{archive}"
+        return cast("bytes", call_library(lambda: files.cat_file(path, start=start, end=stop)))
 
     def read_all(self, ranges: Sequence[ByteRange]) -> list[bytes]:
-        """Several parts, together: what lies close together comes as one."""
+        """Return several parts, read together: adjacent parts are read as one block."""
         from fsspec.utils import merge_offset_ranges
 
         files, root = self._files()
-        names, starts, stops = (list(each) for each in zip(*ranges, strict=True))
-        merged = merge_offset_ranges(
-            names, starts, stops, max_gap=_LARGEST_GAP, max_block=_LARGEST_RANGE, sort=True
+        names, starts, stops = (list(column) for column in zip(*ranges, strict=True))
+        names, starts, stops = merge_offset_ranges(
+            names, starts, stops, max_gap=_MAX_GAP_BYTES, max_block=_MAX_RANGE_BYTES, sort=True
         )
-        names, starts, stops = merged
         paths = [f"{root}/{name}" for name in names]
-        blocks = asked(lambda: files.cat_ranges(paths, starts, stops, on_error="raise"))
-        found = {
-            (name, start): block for name, start, block in zip(names, starts, blocks, strict=True)
-        }
-        firsts: dict[str, list[int]] = {}
-        for name, start in sorted(found):
-            firsts.setdefault(name, []).append(start)
-        result = []
+        contents = call_library(lambda: files.cat_ranges(paths, starts, stops, on_error="raise"))
+        blocks = {}
+        for name, start, content in zip(names, starts, contents, strict=True):
+            blocks[name, start] = content
+        block_starts: dict[str, list[int]] = {}
+        for name, start in sorted(blocks):
+            block_starts.setdefault(name, []).append(start)
+        parts = []
         for name, start, stop in ranges:
-            first = max(each for each in firsts[name] if each <= start)
-            result.append(found[name, first][start - first : stop - first])
-        return result
+            block_start = max(begin for begin in block_starts[name] if begin <= start)
+            parts.append(blocks[name, block_start][start - block_start : stop - block_start])
+        return parts
 
     def list_files(self) -> dict[str, tuple[int, str]]:
-        """The files below the URL: path from there → bytes, and a text that changes with the file; raises OSError."""
+        """Return the files below the URL; raises OSError.
+
+        They are path from the URL → size in bytes, and a text that changes with the file.
+        """
         files, root = self._files()
-        found = asked(lambda: files.find(root, detail=True))
-        return {
-            path.removeprefix(f"{root}/"): _state(detail)
-            for path, detail in found.items()
-            if path != root
-        }
+        details = call_library(lambda: files.find(root, detail=True))
+        states = {}
+        for path, detail in details.items():
+            if path != root:
+                states[path.removeprefix(f"{root}/")] = _state(detail)
+        return states
 
     def state_of(self, archive: str) -> tuple[int, str]:
-        """An archive's bytes, and a text that changes with it; raises OSError."""
+        """Return an archive's size in bytes, and a text that changes with it; raises OSError."""
         files, root = self._files()
-        return _state(asked(lambda: files.info(f"{root}/{archive}")))
+        return _state(call_library(lambda: files.info(f"{root}/{archive}")))
 
     @contextmanager
     def opened(self, archive: str) -> Iterator[Any]:
-        """An archive as a file in which one can move; raises OSError."""
+        """Open an archive as a file with random access; raises OSError."""
         files, root = self._files()
-        with asked(lambda: files.open(f"{root}/{archive}", "rb")) as file:
+        with call_library(lambda: files.open(f"{root}/{archive}", "rb")) as file:
             yield file
 
     def _files(self) -> tuple[Any, str]:
-        """Fsspec's file system, made again in a forked process, and the path of the URL in it."""
+        """Return fsspec's file system, made again in a forked process, and the URL's path in it."""
         if self._opened is None or self._opened[0] != os.getpid():
             fsspec = _fsspec(self.url)
-            files, root = asked(lambda: fsspec.core.url_to_fs(self.url))
+            files, root = call_library(lambda: fsspec.core.url_to_fs(self.url))
             self._opened = (os.getpid(), files, root.rstrip("/"))
         return self._opened[1:]
 
 
 def checked_url(url: str) -> str:
-    """A URL without a slash at its end; raises DatarootError, which does not show the secret, if it holds one."""
+    """Return a URL without a slash at its end.
+
+    Raises DatarootError if the URL holds a secret, which the message does not show.
+    """
     parts = urlsplit(url)
     if parts.query or parts.password is not None or "@" in parts.netloc:
         raise DatarootError(
-            f"{parts.scheme}://{parts.hostname or ''}…: holds a name, a password or a signature, which the index and "
-            "messages would show; give it by fsspec's settings or the environment (docs/reading.md)"
+            f"{parts.scheme}://{parts.hostname or ''}…: holds a name, a password or a signature, "
+            "which the index and messages would show; give it by fsspec's settings or the "
+            "environment (docs/reading.md)"
         )
     return url.rstrip("/")
 
 
 def _fsspec(url: str) -> Any:
+    """Return the fsspec module, or raise MissingExtraError."""
     try:
         import fsspec.core
     except ModuleNotFoundError as error:
@@ -206,8 +221,11 @@ def _fsspec(url: str) -> Any:
     return fsspec
 
 
-def asked(call: Callable[[], _Result]) -> _Result:
-    """What a call of fsspec returns; whatever a library below raises becomes an OSError whose words hold no secret."""
+def call_library(call: Callable[[], _Result]) -> _Result:
+    """Return the result of a call of fsspec.
+
+    Any error of an underlying library becomes an OSError with a message that holds no secret.
+    """
     try:
         return call()
     except FileNotFoundError:
@@ -215,13 +233,17 @@ def asked(call: Callable[[], _Result]) -> _Result:
     except ImportError as error:
         raise MissingExtraError(f"{error}; in a checkout: pip install '.[cloud]'") from error
     except Exception as error:  # noqa: BLE001 - each file system has errors of its own
-        said = str(error.strerror) if isinstance(error, OSError) and error.strerror else str(error)
-        said = shortened(_SECRETS.sub("", said) or type(error).__name__, MOST_TOLD)
-        number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
-        raise RefusedFileError(number, f"cannot be read ({said})") from None
+        message = str(error)
+        number = errno.EIO
+        if isinstance(error, OSError):
+            message = str(error.strerror) if error.strerror else message
+            number = error.errno or number
+        message = shortened(_SECRETS.sub("", message) or type(error).__name__, MOST_TOLD)
+        raise RefusedFileError(number, f"cannot be read ({message})") from None
 
 
 def _state(detail: Any) -> tuple[int, str]:
+    """Return the size of a file, and a text that changes with it, from fsspec's details."""
     for name in ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created"):
         if detail.get(name) is not None:
             return int(detail.get("size") or 0), str(detail[name])
@@ -229,15 +251,22 @@ def _state(detail: Any) -> tuple[int, str]:
 
 
 def source_of(base: str) -> Source:
-    """The source of a URL or of a folder's absolute path."""
+    """Return the source of a URL or of a folder's absolute path."""
     return UrlSource(base) if "://" in base else LocalSource(Path(base))
 
 
-def list_zip(file: BinaryIO, archive: str, shown: str) -> Listing:
-    """The files of a release in an archive, which errors show as `shown`; only its directory is read.
+def list_zip(file: BinaryIO, archive: str, location: str) -> Listing:
+    """Return the files of a release in an archive; only its directory is read.
 
-    `archive` is its path from the store's place: the folders on it and its name without `.zip` count as folders that
-    lead to the members. Raises DatarootError, also for a member that is encrypted or compressed by an unknown method.
+    Args:
+        file: The open archive.
+        archive: Path of the archive from the store's base: the folders on it and its name without
+            `.zip` count as folders that lead to the members.
+        location: Name of the archive in messages.
+
+    Raises:
+        DatarootError: The archive cannot be read, or a member is encrypted or compressed by an
+            unknown method.
     """
     size = file.seek(0, os.SEEK_END)
     try:
@@ -245,44 +274,42 @@ def list_zip(file: BinaryIO, archive: str, shown: str) -> Listing:
         with zipfile.ZipFile(file) as opened:
             entries = opened.infolist()
     except RefusedFileError as error:  # by the gate, or by a URL
-        sound = (
-            f"; if the archive is sound, set {LIMITS_VARIABLE}=archive=4G"
-            if error.errno == errno.EFBIG
-            else ""
-        )
-        raise DatarootError(f"{shown}: {fault_text(error)}{sound}") from error
+        remedy = ""
+        if error.errno == errno.EFBIG:
+            remedy = f"; if the archive is sound, set {LIMITS_VARIABLE}=archive=4G"
+        raise DatarootError(f"{location}: {fault_text(error)}{remedy}") from error
     except DAMAGED_ARCHIVE as error:
-        told = shortened(fault_text(error), MOST_TOLD)
+        fault = shortened(fault_text(error), MOST_TOLD)
         raise DatarootError(
-            f"{shown}: not a readable zip archive ({told}; {size:,} bytes); {_REMEDY}"
+            f"{location}: not a readable zip archive ({fault}; {size:,} bytes); {_REMEDY}"
         ) from error
-    leading = PurePosixPath(archive).with_suffix("").parts
-    folder_of: dict[str, str | None] = {}
-    number_of: dict[str, int] = {}
+    leading_folders = PurePosixPath(archive).with_suffix("").parts
+    release_folders: dict[str, str | None] = {}
+    folder_numbers: dict[str, int] = {}
     folder, names, rows = [], [], []
     for entry in entries:
-        above, _, name = entry.filename.replace("\\", "/").rpartition(
-            "/"
-        )  # old tools of Windows write backslashes
-        if above not in folder_of:
-            folder_of[above] = release_folder((*leading, *PurePosixPath(above).parts))
-        found = folder_of[above]
-        if found is None or not name or not is_release_file(found, name):
+        # Old tools of Windows write backslashes.
+        zip_folder, _, name = entry.filename.replace("\\", "/").rpartition("/")
+        if zip_folder not in release_folders:
+            parts = (*leading_folders, *PurePosixPath(zip_folder).parts)
+            release_folders[zip_folder] = release_folder(parts)
+        release_name = release_folders[zip_folder]
+        if release_name is None or not name or not is_release_file(release_name, name):
             continue
-        _check_entry(entry, shown, size)
-        folder.append(number_of.setdefault(found, len(number_of)))
+        _check_entry(entry, location, size)
+        folder.append(folder_numbers.setdefault(release_name, len(folder_numbers)))
         names.append(name)
         deflated = entry.compress_type == zipfile.ZIP_DEFLATED
         rows.append(
             (entry.header_offset, entry.compress_size, entry.file_size, entry.CRC, deflated)
         )
     columns = zip(*rows, strict=True) if rows else ((),) * 5
-    numbers = {
-        name: np.array(column) for name, column in zip(Member._fields[1:], columns, strict=True)
-    }
+    numbers = {}
+    for field, column in zip(Member._fields[1:], columns, strict=True):
+        numbers[field] = np.array(column)
     return Listing(
         archive=archive,
-        folders=[*number_of],
+        folders=[*folder_numbers],
         folder=np.array(folder, int),
         names=names,
         numbers=numbers,
@@ -290,7 +317,10 @@ def list_zip(file: BinaryIO, archive: str, shown: str) -> Listing:
 
 
 def member_bytes(content: bytes, member: Member) -> bytes:
-    """The bytes of a member, from those that are stored; checksums are not compared. Raises RefusedFileError."""
+    """Return the bytes of a member from its stored bytes; checksums are not compared.
+
+    Raises RefusedFileError.
+    """
     if member.deflated:
         decoder = zlib.decompressobj(-zlib.MAX_WBITS)
         try:
@@ -303,7 +333,10 @@ def member_bytes(content: bytes, member: Member) -> bytes:
 
 
 def head_length(head: bytes) -> int:
-    """Bytes before a member's content, by the beginning of its head; raises RefusedFileError if there is no head."""
+    """Return the number of bytes before a member's content, from the beginning of its head.
+
+    Raises RefusedFileError if there is no head.
+    """
     if len(head) < HEAD_LENGTH:
         raise damaged_member_error("the archive ends before it")
     signature, name, extra = _HEAD.unpack_from(head)
@@ -312,21 +345,24 @@ def head_length(head: bytes) -> int:
     return HEAD_LENGTH + int(name) + int(extra)
 
 
-def damaged_member_error(what: str) -> RefusedFileError:
-    """The error of a member that cannot be read, whose clause says why."""
-    return RefusedFileError(errno.EIO, f"damaged in its archive ({what})")
+def damaged_member_error(fault: str) -> RefusedFileError:
+    """Return the error of a member that cannot be read because of a fault."""
+    return RefusedFileError(errno.EIO, f"damaged in its archive ({fault})")
 
 
-def _check_entry(entry: zipfile.ZipInfo, shown: str, size: int) -> None:
+def _check_entry(entry: zipfile.ZipInfo, location: str, size: int) -> None:
     """Raise DatarootError if a member cannot be read in place."""
     fault = ""
     if entry.flag_bits & _ENCRYPTED:
         fault = "encrypted; unpack the archive with its password"
     elif entry.compress_type not in _METHODS:
-        fault = f"compressed by method {entry.compress_type}; unpack the archive, or pack it again as an ordinary zip"
+        fault = (
+            f"compressed by method {entry.compress_type}; unpack the archive, "
+            "or pack it again as an ordinary zip"
+        )
     elif not 0 <= entry.header_offset <= size - HEAD_LENGTH - entry.compress_size:
         fault = f"said to lie beyond the archive; {_REMEDY}"
     elif entry.compress_type == zipfile.ZIP_STORED and entry.compress_size != entry.file_size:
         fault = f"stored with two sizes; {_REMEDY}"
     if fault:
-        raise DatarootError(f"{shown}: its member {shortened(entry.filename)} is {fault}")
+        raise DatarootError(f"{location}: its member {shortened(entry.filename)} is {fault}")

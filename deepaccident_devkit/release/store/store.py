@@ -1,7 +1,8 @@
-"""`ReleaseStore` reads the files of a release in archives or at a URL by their path; `FileCache` keeps copies of them.
+"""Stores of a release's files in archives or at a URL, and a cache of copies of them.
 
-The cache is a folder of bounded size; who was not used the longest goes first. Several processes use it at once: each
-file appears whole, and one that is removed while it is read stays readable.
+`ReleaseStore` reads files by their path, `FileCache` stores copies in a folder of bounded size; the
+least recently used copy is evicted first. Several processes use it at once: each file appears
+complete, and a file that is removed while it is read stays readable.
 """
 
 from __future__ import annotations
@@ -40,52 +41,60 @@ from deepaccident_devkit.support.reading import (
 FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
 SIZE_VARIABLE: Final = "DEEPACCIDENT_CACHE_SIZE"
 _DEFAULT_SIZE: Final = "20G"
-# Part of the size that a process may add before it looks at the whole folder again.
-_LOOKED_AFTER: Final = 0.05
-# Part of the size that is left when something had to go.
-_KEPT: Final = 0.9
+# A process may add this share of the size before it checks the full folder again.
+_RECHECK_SHARE: Final = 0.05
+# An eviction reduces the folder to this share of the size.
+_EVICTION_SHARE: Final = 0.9
 _SENSOR_KINDS: Final[tuple[FileKind, ...]] = ("image", "lidar", "bev")
-# Whether the bytes of archives' members are compared with their checksums; `paths.checksums_compared` sets it.
+# Whether the bytes of archives' members are compared with their checksums; set by
+# `paths.checksums_compared`.
 COMPARES: ContextVar[bool] = ContextVar("compares", default=False)
-# Files by name that were read together; `paths.fetched` sets it.
+# Files by name that were read together; set by `paths.fetched`.
 READ_BEFORE: ContextVar[dict[str, bytes] | None] = ContextVar("fetched", default=None)
 
 
 class FileCache:
-    """A folder of copies."""
+    """A folder of copies of files.
 
-    def __init__(self, folder: Path, most: int) -> None:
-        """Keep at most so many bytes in a folder, or a little more while several processes write."""
-        self.folder, self.most = folder, most
-        self._added = most  # so that the first one looks
+    Attributes:
+        folder: The folder.
+        max_bytes: Largest size of the folder, bytes.
+    """
+
+    def __init__(self, folder: Path, max_bytes: int) -> None:
+        """Limit a folder to a size; it may be a little larger while several processes write."""
+        self.folder = folder
+        self.max_bytes = max_bytes
+        self._added = max_bytes  # so that the first copy causes a check
 
     @classmethod
     def of_user(cls) -> FileCache:
-        """The one that the environment names, else in the user's cache folder; raises ConfigError for a wrong size."""
+        """Return the cache of the environment, or the one in the user's cache folder.
+
+        Raises ConfigError for a wrong size.
+        """
         from platformdirs import user_cache_path
 
-        most = bytes_of(os.environ.get(SIZE_VARIABLE) or _DEFAULT_SIZE)
-        if most is None:
+        max_bytes = bytes_of(os.environ.get(SIZE_VARIABLE) or _DEFAULT_SIZE)
+        if max_bytes is None:
             raise ConfigError(
                 f"{SIZE_VARIABLE}: expected bytes with K, M, G or T, such as {_DEFAULT_SIZE}"
             )
-        folder = os.environ.get(FOLDER_VARIABLE)
-        place = (
-            Path(folder).expanduser()
-            if folder
-            else user_cache_path("deepaccident_devkit") / "files"
-        )
-        return cls(place.absolute(), most)
+        variable = os.environ.get(FOLDER_VARIABLE)
+        if variable:
+            folder = Path(variable).expanduser()
+        else:
+            folder = user_cache_path("deepaccident_devkit") / "files"
+        return cls(folder.absolute(), max_bytes)
 
     def path_of(self, identity: str, name: str) -> Path:
-        """Where the copy of a file would lie, of which `identity` is the only one; raises OutputFolderError."""
-        digest = hashlib.blake2b(
-            identity.encode(errors="surrogateescape"), digest_size=16
-        ).hexdigest()
+        """Return the path for the copy of a file with an identity; raises OutputFolderError."""
+        content = identity.encode(errors="surrogateescape")
+        digest = hashlib.blake2b(content, digest_size=16).hexdigest()
         return place_in(self.folder, f"{digest[:2]}/{digest[2:]}/{name}", opened=True)
 
-    def found(self, path: Path, size: int) -> bool:
-        """Whether a copy is there, whole; it counts as used now."""
+    def has_copy(self, path: Path, size: int) -> bool:
+        """Return whether a complete copy exists; it then counts as used now."""
         try:
             if path.stat().st_size != size:
                 return False
@@ -95,61 +104,66 @@ class FileCache:
         return True
 
     def put(self, path: Path, content: bytes) -> None:
-        """Keep a copy; raises OSError if there is no room, which names the folder and the remedy."""
+        """Store a copy; if there is no room, raises OSError with the folder and the remedy."""
         try:
             self._make_room(len(content))
             write_bytes(path, content)
         except OSError as error:
             raise OSError(
                 error.errno,
-                f"cannot be kept in {self.folder}: {fault_text(error)}; make room there, or name another folder by "
-                f"{FOLDER_VARIABLE} or fewer bytes by {SIZE_VARIABLE}",
+                f"cannot be kept in {self.folder}: {fault_text(error)}; make room there, or name "
+                f"another folder by {FOLDER_VARIABLE} or fewer bytes by {SIZE_VARIABLE}",
             ) from error
 
     def _make_room(self, size: int) -> None:
+        """Evict copies if the folder would get too large by another file."""
         self._added += size
-        if self._added <= _LOOKED_AFTER * self.most:
+        if self._added <= _RECHECK_SHARE * self.max_bytes:
             return
         self._added = size
-        there = self._there()
-        total = sum(bytes_ for _, bytes_, _ in there) + size
-        if total <= self.most:
+        copies = self._copies()
+        total = sum(copy_bytes for _, copy_bytes, _ in copies) + size
+        if total <= self.max_bytes:
             return
-        for _, bytes_, path in sorted(there):
-            if total <= _KEPT * self.most:
+        for _, copy_bytes, path in sorted(copies):
+            if total <= _EVICTION_SHARE * self.max_bytes:
                 break
-            with suppress(OSError):  # another process removes it too
+            with suppress(OSError):  # another process also removes it
                 remove_in(self.folder, path.relative_to(self.folder))
                 path.parent.rmdir()
-            total -= bytes_
+            total -= copy_bytes
 
-    def _there(self) -> list[tuple[int, int, Path]]:
-        """When each copy was used, its bytes, and where it is; none that is being written."""
-        found = []
+    def _copies(self) -> list[tuple[int, int, Path]]:
+        """Return the time of use, size and path of each copy that is not being written."""
+        copies = []
         for path in self.folder.glob("??/*/*"):
             with suppress(OSError):
                 if temporary_of(path.name) is None:
                     status = path.stat()
-                    found.append((status.st_mtime_ns, status.st_size, path))
-        return found
+                    copies.append((status.st_mtime_ns, status.st_size, path))
+        return copies
 
 
 class ReleaseStore:
-    """The files of one release that have no paths of their own. Cheap to pickle; safe in forks and threads.
+    """Files of one release that have no paths of their own.
+
+    Cheap to pickle; safe in forks and threads.
 
     Attributes:
-        place: the archive, the folder of archives or the URL, as messages name it.
-        base: what the archives' names are relative to.
-        list_file: the list of the files.
+        place: The archive, the folder of archives or the URL, as in messages.
+        base: Folder or URL that the archives' names are relative to.
+        list_file: List of the files.
     """
 
-    def __init__(self, place: str, base: str, list_file: Path) -> None:
-        """Open the list of a store's files, which is there; raises IndexStoreError if it cannot be read."""
-        self.place, self.base, self.list_file = place, base, list_file
+    def __init__(self, location: str, base: str, list_file: Path) -> None:
+        """Open an existing list of a store's files; raises IndexStoreError for a damaged one."""
+        self.place = location
+        self.base = base
+        self.list_file = list_file
         self.members = Members(list_file)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle places; a process opens each store once."""
+        """Return a form that only holds paths; a process opens each store once."""
         return opened_store, (self.place, self.base, self.list_file)
 
     def __repr__(self) -> str:
@@ -157,40 +171,44 @@ class ReleaseStore:
 
     @property
     def is_remote(self) -> bool:
-        """Whether it is at a URL."""
+        """Whether the store is at a URL."""
         return "://" in self.base
 
     @property
     def state(self) -> str:
-        """A text that changes with the archives."""
+        """Text that changes with the archives."""
         return self.list_file.name
 
     @property
     def places(self) -> tuple[Path, ...]:
-        """What workers must see to read it."""
+        """Paths that workers must be able to read."""
         return (self.list_file,) if self.is_remote else (Path(self.place), self.list_file)
 
     def read(self, name: str, kind: FileKind) -> bytes:
-        """A file's bytes; of a URL, sensor files are kept in the user's cache (`FileCache`).
+        """Return a file's bytes.
 
-        Raises FileNotFoundError, RefusedFileError if it is too large for its kind or damaged, or any other OSError.
+        Copies of sensor files at a URL are stored in the user's cache (`FileCache`). Raises
+        FileNotFoundError, RefusedFileError if it is too large for its kind or damaged, or any other
+        OSError.
         """
-        if (known := READ_BEFORE.get()) is not None and name in known:
-            return known[name]
+        contents = READ_BEFORE.get()
+        if contents is not None and name in contents:
+            return contents[name]
         member = self._member(name)
         check_size(member.size, kind)
         if self.is_remote and kind in _SENSOR_KINDS:
-            with suppress(FileNotFoundError):  # another process has just made room
-                return self._kept(name, member).read_bytes()
+            with suppress(FileNotFoundError):  # another process has just evicted it
+                return self._cached_path(name, member).read_bytes()
         return self._bytes(name, member)
 
     def local_path(self, name: str) -> Path:
-        """A real path of a file's bytes, in the user's cache; it may be gone when that is full of newer ones.
+        """Return a real path of a file's bytes, in the user's cache, from which it may be evicted.
 
-        Raises MissingFileError, SensorFileError, or ConfigError if the environment names a wrong size of the cache.
+        Raises MissingFileError, SensorFileError, or ConfigError if the environment names a wrong
+        size of the cache.
         """
         try:
-            return self._kept(name, self._member(name))
+            return self._cached_path(name, self._member(name))
         except FileNotFoundError:
             raise MissingFileError(
                 f"{self.place}/{name}: no such file; add the archive that holds it"
@@ -199,64 +217,77 @@ class ReleaseStore:
             raise SensorFileError(f"{self.place}/{name}: {fault_text(error)}") from error
 
     def fetch(self, names: Iterable[str]) -> dict[str, bytes]:
-        """Small files by name, read together, without those that are not there or damaged; raises OSError."""
-        wanted = [
-            (name, member) for name in names if (member := self.members.find(name)) is not None
-        ]
-        if not wanted:
+        """Return small files by name, read together; raises OSError.
+
+        Missing and damaged files are left out.
+        """
+        members = []
+        for name in names:
+            member = self.members.find(name)
+            if member is not None:
+                members.append((name, member))
+        if not members:
             return {}
-        contents = self._source.read_all([self._range(name, member) for name, member in wanted])
-        found = {}
-        for (name, member), content in zip(wanted, contents, strict=True):
-            with suppress(RefusedFileError):  # read by itself it says why
-                found[name] = content if member.offset < 0 else _cut_out(content, member)
-        return found
+        parts = self._source.read_all([self._range(name, member) for name, member in members])
+        contents = {}
+        for (name, member), part in zip(members, parts, strict=True):
+            with suppress(RefusedFileError):  # a separate read raises the error
+                contents[name] = part if member.offset < 0 else _cut_out(part, member)
+        return contents
 
     @cached_property
     def _source(self) -> Source:
+        """Source of the archives."""
         return source_of(self.base)
 
     @cached_property
     def _cache(self) -> FileCache:
+        """Cache for files at a URL."""
         return FileCache.of_user()
 
     def _member(self, name: str) -> Member:
+        """Return a file of the store, or raise FileNotFoundError."""
         member = self.members.find(name)
         if member is None:
             raise FileNotFoundError(f"{self.place}/{name}")
         return member
 
-    def _kept(self, name: str, member: Member) -> Path:
-        path = self._cache.path_of(
-            f"{self.place}\n{name}\n{self.members.number_of(member)}", name.rpartition("/")[2]
-        )
-        if not self._cache.found(path, member.size):
+    def _cached_path(self, name: str, member: Member) -> Path:
+        """Return the path of a copy in the cache, which is made if it does not exist."""
+        identity = f"{self.place}\n{name}\n{self.members.number_of(member)}"
+        path = self._cache.path_of(identity, name.rpartition("/")[2])
+        if not self._cache.has_copy(path, member.size):
             self._cache.put(path, self._bytes(name, member))
         return path
 
     def _range(self, name: str, member: Member) -> ByteRange:
+        """Return the part of an archive that surely holds a file."""
         archive = self.members.archives[member.archive]
         if member.offset < 0:
             return f"{archive}/{name.rpartition('/')[2]}".lstrip("/"), 0, member.size
         return archive, member.offset, member.offset + LONGEST_HEAD + member.stored
 
     def _bytes(self, name: str, member: Member) -> bytes:
-        archive, first, last = self._range(name, member)
+        """Read the bytes of a file."""
+        archive, start, stop = self._range(name, member)
         if member.offset < 0:
-            return self._source.read(archive, first, last)
-        if self.is_remote:  # one question costs more than the bytes that are too many
-            return _cut_out(self._source.read(archive, first, last), member)
-        start = member.offset + head_length(self._source.read(archive, first, first + HEAD_LENGTH))
-        return _decoded(self._source.read(archive, start, start + member.stored), member)
+            return self._source.read(archive, start, stop)
+        if self.is_remote:  # a second request would cost more than the superfluous bytes
+            return _cut_out(self._source.read(archive, start, stop), member)
+        head = self._source.read(archive, start, start + HEAD_LENGTH)
+        content_start = member.offset + head_length(head)
+        content = self._source.read(archive, content_start, content_start + member.stored)
+        return _decoded(content, member)
 
 
 def _cut_out(content: bytes, member: Member) -> bytes:
-    """A member's bytes, from those of an archive from its head on."""
+    """Return a member's bytes from the bytes of an archive, which begin with the member's head."""
     start = head_length(content[:HEAD_LENGTH])
     return _decoded(content[start : start + member.stored], member)
 
 
 def _decoded(content: bytes, member: Member) -> bytes:
+    """Return a member's bytes from its stored bytes; raises RefusedFileError."""
     if len(content) < member.stored:
         raise damaged_member_error("the archive ends before it")
     content = member_bytes(content, member)
@@ -266,6 +297,6 @@ def _decoded(content: bytes, member: Member) -> bytes:
 
 
 @lru_cache(maxsize=4)
-def opened_store(place: str, base: str, list_file: Path) -> ReleaseStore:
-    """The store of a list of files, opened once a process."""
-    return ReleaseStore(place, base, list_file)
+def opened_store(location: str, base: str, list_file: Path) -> ReleaseStore:
+    """Return the store of a list of files, opened once in each process."""
+    return ReleaseStore(location, base, list_file)

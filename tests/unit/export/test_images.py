@@ -67,13 +67,13 @@ def test_a_jpeg_is_decoded_no_smaller(
     tmp_path: Path, least: tuple[int, int], shape: tuple[int, int]
 ) -> None:
     write_image(tmp_path / "image.jpg", picture(66, 120))
-    assert read_image(tmp_path / "image.jpg", least=least).shape == (*shape, 3)
+    assert read_image(tmp_path / "image.jpg", min_size=least).shape == (*shape, 3)
 
 
 def test_a_png_is_decoded_whole(tmp_path: Path) -> None:
     Image.fromarray(picture(64, 120)).save(tmp_path / "image.jpg", format="PNG")
     np.testing.assert_array_equal(
-        read_image(tmp_path / "image.jpg", least=(8, 8)), picture(64, 120)
+        read_image(tmp_path / "image.jpg", min_size=(8, 8)), picture(64, 120)
     )
 
 
@@ -84,7 +84,7 @@ def test_a_truncated_jpeg_is_no_half_grey_picture(tmp_path: Path, share: float) 
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
     assert_refused(
         (
-            lambda: read_image(path, least=(16, 16)),
+            lambda: read_image(path, min_size=(16, 16)),
             SensorFileError,
             r"image\.jpg: not a readable image",
         )

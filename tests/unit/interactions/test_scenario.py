@@ -87,7 +87,7 @@ def test_a_file_that_is_no_good_is_made_again(
     own: DeepAccident, computed: list[str], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     token = own.scenario[0]["token"]
-    path = scenario.kept_path(own, token)
+    path = scenario.interactions_path(own, token)
     with monkeypatch.context() as patch:
         patch.setattr(scenario, "VERSION", "0" if fault == "older" else scenario.VERSION)
         first = own.interactions(token)
@@ -100,7 +100,7 @@ def test_a_file_that_is_no_good_is_made_again(
 def test_it_goes_with_the_tables_and_with_the_index(own_release: Path, own: DeepAccident) -> None:
     token = own.scenario[0]["token"]
     own.interactions(token)
-    kept, meta = scenario.kept_path(own, token), next(own_release.glob("*/*/meta/*.txt"))
+    kept, meta = scenario.interactions_path(own, token), next(own_release.glob("*/*/meta/*.txt"))
     meta.write_text(meta.read_text().replace("four-way", "three-way"))
     again = DeepAccident("v1", own_release, verbose=False)
     assert again.tables_folder != own.tables_folder

@@ -148,7 +148,7 @@ def test_a_new_archive_is_noticed(release_root: Path, tmp_path: Path) -> None:
 def test_as_many_archives_are_open_as_the_system_allows(
     places: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deepaccident_devkit.release.store.sources.MOST_OPEN", 2)
+    monkeypatch.setattr("deepaccident_devkit.release.store.sources.MAX_OPEN_ARCHIVES", 2)
     folder = shutil.copytree(places["zips"], tmp_path / "zips")
     source, names = (
         LocalSource(folder),
@@ -176,7 +176,7 @@ def test_the_least_used_copies_go_first(tmp_path: Path) -> None:
     for number, path in enumerate(paths[:9]):
         cache.put(path, bytes(100))
         os.utime(path, ns=(number, number))
-    assert cache.found(paths[0], 100)
+    assert cache.has_copy(paths[0], 100)
     for path in paths[9:]:
         cache.put(path, bytes(100))
     there = [path.exists() for path in paths]
