@@ -1,7 +1,7 @@
-"""The command line: `deepaccident <verb>`, one module for each verb; plug-ins add theirs.
+"""The command line: `deepaccident <verb>`, one module for each verb; plug-ins add further verbs.
 
-A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error; 130 after Ctrl-C, 143 after
-SIGTERM, 141 if the reader of the output went away.
+A verb parses, makes one library call and prints. Exit status: 0 good, 1 findings, 2 error; 130
+after Ctrl-C, 143 after SIGTERM, 141 if the reader of the output went away.
 """
 
 import logging
@@ -23,11 +23,11 @@ from deepaccident_devkit.support.version import __version__
 
 _ERROR_STATUS = 2
 _FINDINGS_STATUS = 1
-# Loggers of its parts.
-_OF_DASK = ("distributed", "tornado", "asyncio")
+# Loggers of dask's packages.
+_DASK_LOGGERS = ("distributed", "tornado", "asyncio")
 # Requirements for work on the devkit itself.
-_DEVELOPERS: Final = re.compile(r"extra == .(test|lint|docs)\b")
-# Verb of the core, each in a module of its name → its line in the list of verbs.
+_DEVELOPER_EXTRA: Final = re.compile(r"extra == .(test|lint|docs)\b")
+# Verb of the core, with a module of the same name → its line in the list of verbs.
 _SUMMARIES: Final = {
     "check": "Check a release, an index, results, an evaluation, splits or a reader.",
     "cache": "Write resized images for training.",
@@ -49,7 +49,7 @@ def _core_verb(name: str) -> click.Command:
 
 
 def _plugin_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
-    """Return the verbs that a plug-in offers, except those of groups, such as `check splits`."""
+    """Return the verbs that a plug-in offers, except verbs of groups, such as `check splits`."""
     return {name: verb for name, verb in plugin.verbs.items() if " " not in name}
 
 
@@ -69,27 +69,27 @@ _VERBS: Final = {
 @click.option("--version", is_flag=True, help="Show the version and exit.")
 @click.option(
     "--all",
-    "every",
+    "all_versions",
     is_flag=True,
     help="With --version: also the versions of Python and all libraries.",
 )
 @click.pass_context
-def deepaccident(context: click.Context, version: bool, every: bool) -> None:
+def deepaccident(context: click.Context, version: bool, all_versions: bool) -> None:
     """Tools for the DeepAccident V2X accident dataset."""
     if version:
-        click.echo(_versions() if every else f"deepaccident, version {__version__}")
+        click.echo(_versions() if all_versions else f"deepaccident, version {__version__}")
         context.exit()
-    if every:
+    if all_versions:
         raise click.UsageError("--all needs --version")
 
 
 def _versions() -> str:
-    """What a report of a bug needs: the versions of the devkit, Python, the system and each library of any extra."""
-    from importlib.metadata import (
-        PackageNotFoundError,
-        requires,
-        version,
-    )  # here: it takes longer than all the rest
+    """Return the versions that a bug report needs.
+
+    They are the versions of the devkit, Python, the system and each library of any extra.
+    """
+    # here, since it takes longer to import than everything else
+    from importlib.metadata import PackageNotFoundError, requires, version
 
     from deepaccident_devkit.support.text import columns_text
 
@@ -99,45 +99,42 @@ def _versions() -> str:
         except PackageNotFoundError:
             return "not installed"
 
-    users = [each for each in requires("deepaccident_devkit") or () if not _DEVELOPERS.search(each)]
-    names = sorted(
-        {match.group().lower() for each in users if (match := re.match(r"[\w.-]+", each))}
-    )
+    names = set()
+    for requirement in requires("deepaccident_devkit") or ():
+        match = re.match(r"[\w.-]+", requirement)
+        if match and not _DEVELOPER_EXTRA.search(requirement):
+            names.add(match.group().lower())
     rows = [
         ("deepaccident", __version__),
         ("Python", platform.python_version()),
         ("system", platform.platform()),
     ]
-    return columns_text([*rows, *((name, installed(name)) for name in names)])
+    rows += [(name, installed(name)) for name in sorted(names)]
+    return columns_text(rows)
 
 
 def main() -> None:
-    """Run the command line; errors that the user can mend become one message and exit status 2."""
-    # no window, and no file of the user changes a picture; in worker processes too
+    """Run the command line; errors that the user can fix become one message and exit status 2."""
+    # figures open no window and no file of the user changes them, in worker processes too
     os.environ |= {"MPLBACKEND": "Agg", "MATPLOTLIBRC": os.devnull}
     with lasting_streams():
         _run()
 
 
 def _run() -> None:
-    shown = logging.StreamHandler()
-    shown.addFilter(
-        lambda record: record.name.partition(".")[0] not in _OF_DASK
-    )  # its errors come as exceptions too
+    handler = logging.StreamHandler()
+    # errors of dask also come as exceptions
+    handler.addFilter(lambda record: record.name.partition(".")[0] not in _DASK_LOGGERS)
     logging.basicConfig(
-        level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[shown]
+        level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[handler]
     )
     try:
         run_interruptibly(deepaccident)
-    except (
-        DeepAccidentError,
-        OSError,
-        MemoryError,
-    ) as error:  # OSErrors: a full disk, a folder without permission
-        *_, told = str(error).rpartition(
-            f".{type(error).__name__}: "
-        )  # a loader's worker puts its traceback before it
+    except (DeepAccidentError, OSError, MemoryError) as error:
+        # an OSError is a full disk, or a folder without permission; a loader's worker puts its
+        # traceback before the message
+        *_, message = str(error).rpartition(f".{type(error).__name__}: ")
         if isinstance(error, MemoryError):
-            told = "memory ran out; use fewer workers (--workers), or a machine with more memory"
-        click.echo(f"error: {told}", err=True)
+            message = "memory ran out; use fewer workers (--workers), or a machine with more memory"
+        click.echo(f"error: {message}", err=True)
         sys.exit(_FINDINGS_STATUS if isinstance(error, SomeFailedError) else _ERROR_STATUS)

@@ -1,4 +1,4 @@
-"""Options that say which agents are meant, which of them cooperate, and what their links do to what is sent."""
+"""Options that select agents and cooperating agents, and the links between them."""
 
 from collections.abc import Callable, Sequence
 
@@ -19,38 +19,46 @@ agents_parameter = click.option(
 )
 
 
-def agent_names(given: Sequence[str]) -> tuple[str, ...]:
-    """The agents of repeated --agents; no text means all.
+def agent_names(texts: Sequence[str]) -> tuple[str, ...]:
+    """Return the agents of repeated --agents; without a text all.
 
-    `all` and `available` do too: this only chooses among the samples that are there.
+    `all` and `available` also stand for all: this only selects among existing samples.
     """
-    names = [choice("--agents", name, (*AGENTS, *_ALL)) for name in words_of(given)]
-    return AGENTS if not names or set(names) & set(_ALL) else tuple(names)
+    names = [choice("--agents", name, (*AGENTS, *_ALL)) for name in words_of(texts)]
+    if not names or set(names) & set(_ALL):
+        return AGENTS
+    return tuple(names)
 
 
-def cooperating_parameter(whose: str, default: str) -> Callable[[Function], Function]:
-    """An option --agents for agents that cooperate (`names_or_configuration` reads it)."""
+def cooperating_parameter(meaning: str, default: str) -> Callable[[Function], Function]:
+    """Return an option --agents for cooperating agents (`names_or_configuration` reads it)."""
     return click.option(
         "--agents",
         multiple=True,
         metavar="NAME[,NAME…]",
-        help=f"{whose}: names, or one of {', '.join(AGENT_SETS)} (those that are there).  [default: {default}]",
+        help=f"{meaning}: names, or one of {', '.join(AGENT_SETS)} (those that are there).  "
+        f"[default: {default}]",
     )
 
 
-def names_or_configuration(given: Sequence[str]) -> str | list[str] | None:
-    """Repeated --agents for agents that cooperate: one configuration, names, or None if it was not given."""
-    names = words_of(given)
+def names_or_configuration(texts: Sequence[str]) -> str | list[str] | None:
+    """Return the configuration or the names in repeated --agents for cooperating agents.
+
+    The result is None if the option was not passed.
+    """
+    names = words_of(texts)
     if len(names) != 1:
         return names or None
-    alone = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
-    return names if alone in AGENTS else alone
+    name = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
+    if name in AGENTS:
+        return names
+    return name
 
 
 def link_parameters(
     latency: float = 0.0, pose_noise: float = 0.0
 ) -> Callable[[Function], Function]:
-    """Options for what happens to partners' data, with these defaults."""
+    """Return options for errors in partners' data, with these defaults."""
     return together(
         field_option(Link, "latency", default=latency),
         field_option(Link, "pose_noise", default=pose_noise, type=float),

@@ -57,10 +57,11 @@ def cache(
     codec: Any,
     **options: Any,
 ) -> None:
-    """Write the resized images of scenarios of the release in DATAROOT, for V2XConfig(images_cache=FOLDER).
+    """Write the resized images of scenarios of the release in DATAROOT.
 
-    Give --split or --where: all images at 704x256 take 0.9 TB as raw pixels. --dry-run says how much yours take. If a
-    run is interrupted, the same command continues it.
+    They are for V2XConfig(images_cache=FOLDER). Give --split or --where: all images at 704x256 take
+    0.9 TB as raw pixels. --dry-run says how much yours take. If a run is interrupted, the same
+    command continues it.
     """
     images = ImageConfig(
         resize=resize[::-1], crop=crop, cameras=tuple(words_of(channels)) or CAMERAS, decode=decode

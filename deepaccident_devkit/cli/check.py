@@ -1,4 +1,4 @@
-"""`deepaccident check`: find what is wrong in a release, an index, results, an evaluation or a split."""
+"""`deepaccident check`: find faults of releases, indexes, results, evaluations and splits."""
 
 from typing import Final
 
@@ -55,4 +55,4 @@ _VERBS: Final = {
 
 @click.group(cls=LazyVerbs, verbs=_VERBS, read_plugin=_check_verbs)
 def check() -> None:
-    """Check a release, its index, results, an evaluation, splits, scores or a reader of the files."""
+    """Check a release, its index, results, an evaluation, splits, scores or a file reader."""

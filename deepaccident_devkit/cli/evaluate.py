@@ -1,4 +1,4 @@
-"""`deepaccident evaluate` and `deepaccident check results`: the metrics of a results file, and a check of it."""
+"""`deepaccident evaluate` and `deepaccident check results`: metrics and checks of results files."""
 
 import json
 import sys
@@ -76,26 +76,28 @@ from deepaccident_devkit.support.plugins import LazyVerb, Plugin
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
-# Of a check that had nothing to compare.
+# Exit status of a check that had nothing to compare.
 _NOTHING_STATUS = 2
-_OF_RELEASE = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
+_RELEASE_OPTIONS = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
 _selection_parameters = together(
     click.option(
         "--split",
         default="val",
         show_default=True,
-        help="train, val, test, train_mini, val_mini, all (every scenario that is here), or a split file (.txt).",
+        help="train, val, test, train_mini, val_mini, all (every scenario that is here), or a "
+        "split file (.txt).",
     ),
     click.option(
         "--samples",
         type=WordChoice(get_args(SampleList)),
-        help="evaluate: samples within the horizon before the end. all: two samples per second of each scenario.  "
-        "[default: evaluate; for warnings, planning and forecasting: all]",
+        help="evaluate: samples within the horizon before the end. all: two samples per second of "
+        "each scenario.  [default: evaluate; for warnings, planning and forecasting: all]",
     ),
     click.option(
         "--scope",
         type=WordChoice(get_args(ScopeName)),
-        help="Accident scenarios only, or all scenarios.  [default: accident; with --samples all: all]",
+        help="Accident scenarios only, or all scenarios.  [default: accident; with --samples all: "
+        "all]",
     ),
     agents_parameter,
     click.option(
@@ -107,26 +109,27 @@ _selection_parameters = together(
 )
 
 
-_WARNING = together(
+_WARNING_OPTIONS = together(
     click.option(
         "--threshold-from",
         type=PATH,
-        help="Folder with an evaluation on another split; it sets the alarm threshold (protocol clean only).",
+        help="Folder with an evaluation on another split; it sets the alarm threshold (protocol "
+        "clean only).",
     ),
     advanced(
         "--threshold-by",
         type=WordChoice(get_args(Chooser)),
         default="best_f1",
         show_default=True,
-        help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm per minute. "
-        "braking: at most one second of braking for false alarms per minute, found by an evaluation with "
-        "--prevented.",
+        help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm "
+        "per minute. braking: at most one second of braking for false alarms per minute, "
+        "found by an evaluation with --prevented.",
     ),
     click.option(
         "--prevented",
         is_flag=True,
-        help="Also compute which accidents a braking driver would have avoided after the alarm, and how much "
-        "braking the false alarms cause (protocol clean only).",
+        help="Also compute which accidents a braking driver would have avoided after the alarm, "
+        "and how much braking the false alarms cause (protocol clean only).",
     ),
 )
 
@@ -134,7 +137,7 @@ _WARNING = together(
 def _attributes(
     context: click.Context, parameter: click.Parameter, names: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """The attributes that repeated --by names."""
+    """Return the attributes in repeated --by."""
     try:
         return tuple(map(attribute_name, names))
     except ChoiceError as error:
@@ -142,10 +145,13 @@ def _attributes(
 
 
 def _task_verb(task: str) -> click.Command:
-    """The verb of one task."""
+    """Return the verb of a task."""
     evaluator = evaluator_class(task)
     protocols = list(evaluator.protocols)
-    text = f"{evaluator.description}\n\nThe predictions are compared with the labels of the release in DATAROOT."
+    text = (
+        f"{evaluator.description}\n\n"
+        "The predictions are compared with the labels of the release in DATAROOT."
+    )
 
     @verb(task, help=text)
     @release_parameters
@@ -160,7 +166,7 @@ def _task_verb(task: str) -> click.Command:
         show_default=True,
         help="Rules of the metrics; docs/protocols.md describes them.",
     )
-    @(_WARNING if task == "warning" else together())
+    @(_WARNING_OPTIONS if task == "warning" else together())
     @advanced(
         "--switch",
         "switches",
@@ -171,23 +177,23 @@ def _task_verb(task: str) -> click.Command:
     @advanced(
         "--allow-partial",
         is_flag=True,
-        help="Accept results that lack some samples (which marks every number as partial), or leave out predictions of "
-        "other samples.",
+        help="Accept results that lack some samples (which marks every number as partial), or "
+        "leave out predictions of other samples.",
     )
     @click.option(
         "--by",
         multiple=True,
         callback=_attributes,
         metavar="NAME",
-        help="Also give the numbers for each value of this attribute; you can repeat this option. One of "
-        f"{', '.join(ATTRIBUTES)}.",
+        help="Also give the numbers for each value of this attribute; you can repeat this option. "
+        f"One of {', '.join(ATTRIBUTES)}.",
     )
     @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
     @click.option(
         "--sanity",
         is_flag=True,
-        help="Look for classic mistakes, such as mirrored axes or another frame. Exit status 2: there is nothing to "
-        "compare.",
+        help="Look for classic mistakes, such as mirrored axes or another frame. Exit status 2: "
+        "there is nothing to compare.",
     )
     @click.option(
         "--out", type=PATH, help="Folder to write all numbers, figures and a report into."
@@ -202,13 +208,15 @@ def _task_verb(task: str) -> click.Command:
         help="Copy the results into --out, so that others can verify them.",
     )
     @json_parameter
-    def evaluated(results: Path, protocol: str, switches: tuple[str, ...], **options: Any) -> None:
+    def evaluate_task(
+        results: Path, protocol: str, switches: tuple[str, ...], **options: Any
+    ) -> None:
         setup = EvaluationSetup(
             task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]
         )
         _evaluate(setup, results, **options)
 
-    return evaluated
+    return evaluate_task
 
 
 @workers_kept()
@@ -219,60 +227,65 @@ def _evaluate(
     _refuse_unused(setup, options)
     selection = _selection_of(setup, options)
     opened = read_results(results)
-    stated = {
+    requested = {
         **selection.as_dict(),
         "task": setup.task,
         "protocol": setup.protocol,
         "results": str(opened.path),
     }
-    if out is not None:
-        checked_target(
-            out, overwrite=options["overwrite"], asked=stated
-        )  # before the release is indexed
+    if out is not None:  # before the release is indexed
+        checked_target(out, overwrite=options["overwrite"], requested=requested)
     dataset = open_release(**release_of(options), **engine_of(options))
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(
             options["threshold_from"], options["threshold_by"], selection.tokens(dataset)
         )
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
-    asked = {
-        name: str(each) for name, each in options.items() if name not in ("workers", "executor")
+    texts = {
+        name: str(value) for name, value in options.items() if name not in ("workers", "executor")
     }
     command = digest_of(
-        {"setup": setup.as_dict(), "results": opened.fingerprint, "by": by, "options": asked}
+        {"setup": setup.as_dict(), "results": opened.fingerprint, "by": by, "options": texts}
     )
     with nullcontext() if out is None else evaluation_store(out, command).shared() as turn:
-        if out is not None:
-            checked_target(
-                out, overwrite=options["overwrite"]
-            )  # of another process, which has just ended
-        how = {
+        if out is not None:  # another process may just have finished
+            checked_target(out, overwrite=options["overwrite"])
+        run = evaluate_results(
+            dataset,
+            opened,
+            setup,
+            selection,
+            allow_partial=options["allow_partial"],
+            out=out,
+            progress=True,
             **engine_of(options),
-            "allow_partial": options["allow_partial"],
-            "out": out,
-            "progress": True,
-        }
-        run = evaluate_results(dataset, opened, setup, selection, **how)
+        )
         if turn is None or out is None or turn.alone():
-            summary, text = _written(run, dataset, opened, by, options)
+            summary, text = _complete(run, dataset, opened, by, options)
         else:  # another process with the same command has written it
             summary, text = read_bundle(out).summary, ""
-    shown = summary_text(summary, by or SHOWN_BREAKDOWNS)
-    click.echo(json.dumps(summary, indent=1) if as_json else f"{shown}\n\n{text}".strip())
+    if as_json:
+        click.echo(json.dumps(summary, indent=1))
+    else:
+        click.echo(f"{summary_text(summary, by or SHOWN_BREAKDOWNS)}\n\n{text}".strip())
     if out is not None:
         click.echo(f"written: {out}", err=as_json)
     if options["sanity"] and not summary["sanity"]["sought"]:
         sys.exit(_NOTHING_STATUS)
 
 
-def _written(
+def _complete(
     run: EvaluationRun,
     dataset: DeepAccident,
     results: Results,
     by: tuple[str, ...],
     options: dict[str, Any],
 ) -> tuple[Mapping[str, Any], str]:
-    """Complete a run, and save it where that is asked for; its summary, and the text of the sanity check."""
+    """Complete a run, and save it if requested.
+
+    Returns:
+        Its summary, and the text of the sanity check.
+    """
     engine = engine_of(options)
     resampling = Resampling(resamples=options["resamples"])
     run = run.broken_down(
@@ -283,19 +296,25 @@ def _written(
     text = ""
     if options["sanity"]:
         sanity = check_sanity(dataset, results, run.setup, sorted(run.evaluator.tokens), **engine)
-        text = "" if run.partial is None else f"{run.partial.text()}\n"
+        if run.partial is not None:
+            text = f"{run.partial.text()}\n"
         run, text = replace(run, sanity=sanity.as_dict()), f"{text}{sanity.to_text()}"
     if options["out"] is not None:
         from deepaccident_devkit.render.evaluation import save_report
 
         report = partial(save_report, run, dataset=dataset, results=results)
-        kept = {name: options[name] for name in ("include_results", "overwrite")}
-        save_run(run, options["out"], **kept, extras=[report])
+        save_run(
+            run,
+            options["out"],
+            include_results=options["include_results"],
+            overwrite=options["overwrite"],
+            extras=[report],
+        )
     return run.summary(), text
 
 
 def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
-    """End with a usage error if an option was given that changes nothing in this evaluation, or lacks another."""
+    """Raise a usage error for an option that changes nothing here, or that needs another one."""
     if options["out"] is None:
         refuse_unused("without --out", "overwrite", "include_results", "style")
     if options.get("threshold_from") is None:
@@ -304,12 +323,12 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         raise click.UsageError(
             "--threshold-from sets the threshold that --switch threshold=… sets; give one of them"
         )
-    if options.get("prevented") and not isinstance(setup.rules, CleanWarnings):
-        raise click.UsageError(
-            f"--prevented needs the scores of whole recordings, which --protocol {setup.protocol} does not have; give "
-            "--protocol clean"
-        )
     if options.get("prevented"):
+        if not isinstance(setup.rules, CleanWarnings):
+            raise click.UsageError(
+                "--prevented needs the scores of whole recordings, which --protocol "
+                f"{setup.protocol} does not have; give --protocol clean"
+            )
         extra_result("prevented")  # before long work, as its plug-in may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
         refuse_unused("with --protocol field, which has no intervals", "resamples")
@@ -317,16 +336,14 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         not evaluator_class(setup.task).has_horizon
         and _selection_of(setup, options).samples == "all"
     ):
-        why = (
-            "detections are of the present"
-            if setup.task == "detection"
-            else "the protocol has its own"
-        )
+        why = "the protocol has its own"
+        if setup.task == "detection":
+            why = "detections are of the present"
         refuse_unused(f"with --samples all: {why}", "horizon")
 
 
 def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:
-    """The samples that a verb's options name."""
+    """Return the samples that a verb's options select."""
     agents = agent_names(options["agents"])
     return default_selection(
         setup,
@@ -350,21 +367,20 @@ def check_results(results: Path, dataroot: Dataroot | None, version: str, **opti
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
     With --dataroot, also look for the mistakes of `evaluate … --sanity`.
-    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an entry is wrong, or
-    there is nothing to compare.
+    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an
+    entry is wrong, or there is nothing to compare.
     """
     if dataroot is None:
-        refuse_unused("without --dataroot", *_OF_RELEASE)
+        refuse_unused("without --dataroot", *_RELEASE_OPTIONS)
     opened, engine = read_results(results), engine_of(options)
     opened.check(**engine, progress=True)
     click.echo(results_text(opened))
     if dataroot is None:
         return
     dataset = open_release(dataroot, version=version, on_error=options["on_error"], **engine)
-    first = next(iter(evaluator_class(opened.task).protocols))
-    protocol = (
-        "boxes" if opened.task == "accident" else first
-    )  # the one that takes explicit accidents
+    protocol = next(iter(evaluator_class(opened.task).protocols))
+    if opened.task == "accident":
+        protocol = "boxes"  # the protocol that takes explicit accidents
     setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
     selection = _selection_of(setup, options)
     check_recordings(opened, dataset)
@@ -380,9 +396,8 @@ def check_results(results: Path, dataroot: Dataroot | None, version: str, **opti
 
 
 def _compare() -> click.Command:
-    from deepaccident_devkit.cli.evaluate_bundles import (
-        compare,
-    )  # it renders, and so imports matplotlib
+    # here, since it draws, and so imports matplotlib
+    from deepaccident_devkit.cli.evaluate_bundles import compare
 
     return compare
 

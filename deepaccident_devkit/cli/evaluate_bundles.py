@@ -1,4 +1,4 @@
-"""`deepaccident check bundle` and `deepaccident evaluate compare`: repeat an evaluation, or compare two."""
+"""`deepaccident check bundle` and `evaluate compare`: repeat an evaluation, or compare two."""
 
 import sys
 from pathlib import Path
@@ -41,7 +41,7 @@ from deepaccident_devkit.tables import place_outside
 from deepaccident_devkit.taxonomy import OnError
 
 _FINDINGS_STATUS = 1
-_KINDS = (".csv", ".json", *PICTURE_SUFFIXES)
+_SUFFIXES = (".csv", ".json", *PICTURE_SUFFIXES)
 _DPI = 130
 
 
@@ -70,19 +70,17 @@ def verify(
 ) -> None:
     """Repeat the evaluation in the folder DIR and list all differences.
 
-    DIR may come from anyone: paths that it names are opened only if you give them, as the error says; links in it are
-    not followed; nothing is written into the release.
+    DIR may come from anyone: paths that it names are opened only if you give them, as the error
+    explains; links in it are not followed; nothing is written into the release.
 
     Exit status 0: there is no difference. 1: there are differences. 2: nothing could be compared.
     """
     bundle = read_bundle(folder)
     check_repeated(bundle, {"dataroot": dataroot, "results": results, "split": split})
-    layout = find_release(
-        open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True, on_error=on_error),
-        bundle.release_version,
-    )
-    place = index_dir or place_outside(layout)
-    dataset = DeepAccident(layout.version, layout.root, place, on_error=on_error, **engine)
+    root = open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True, on_error=on_error)
+    layout = find_release(root, bundle.release_version)
+    index_path = index_dir or place_outside(layout)
+    dataset = DeepAccident(layout.version, layout.root, index_path, on_error=on_error, **engine)
     verification = verify_bundle(
         folder, dataset, results=results, split=split, progress=True, **engine
     )
@@ -115,19 +113,20 @@ def compare(
     out: tuple[Path, ...],
     as_json: bool,
 ) -> None:
-    """Compare the evaluations in the folders A and B, and test which differences are statistically significant.
+    """Compare the evaluations in the folders A and B, and test which differences are significant.
 
-    With MORE evaluations, show the main numbers of all over the bytes that partners send. Evaluations of different
-    sources, which have no scenario in common, are shown side by side, each by its own rules.
+    With MORE evaluations, show the main numbers of all over the bytes that partners send.
+    Evaluations of different sources, which have no scenario in common, are shown side by side, each
+    by its own rules.
     """
     for path in out:
-        if path.suffix.lower() not in _KINDS:
+        if path.suffix.lower() not in _SUFFIXES:
             raise click.BadParameter(
-                f"--out: expected a file that ends in {', '.join(_KINDS)}, found {str(path)!r}"
+                f"--out: expected a file that ends in {', '.join(_SUFFIXES)}, found {str(path)!r}"
             )
     comparison: SideBySide | OverBytes | Comparison
-    bundles = [read_bundle(each) for each in (a, b, *more)]
-    if not common and not set.intersection(*(set(each.scenarios()) for each in bundles)):
+    bundles = list(map(read_bundle, (a, b, *more)))
+    if not common and not set.intersection(*(set(bundle.scenarios()) for bundle in bundles)):
         comparison = side_by_side(bundles)
         if any(path.suffix.lower() in PICTURE_SUFFIXES for path in out):
             raise click.BadParameter(
@@ -137,17 +136,20 @@ def compare(
         comparison = over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
     else:
         comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
-    as_text = comparison.to_json()
     for path in out:
-        if path.suffix.lower() == ".csv":
-            write_csv(path, comparison.named_tables()["numbers"])
-        elif path.suffix.lower() == ".json":
-            write_bytes(path, as_text.encode())
-        else:
-            drawn: Any = (
-                render_over_bytes if isinstance(comparison, OverBytes) else render_comparison
-            )
-            save_picture(drawn(comparison), path, dpi=None if current_style().few else _DPI)
-    click.echo(as_text if as_json else comparison.to_text())
+        _write(comparison, path)
+    click.echo(comparison.to_json() if as_json else comparison.to_text())
     for path in out:
         click.echo(f"written: {path}", err=as_json)
+
+
+def _write(comparison: SideBySide | OverBytes | Comparison, path: Path) -> None:
+    """Write a comparison into a file, as its suffix requests."""
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        write_csv(path, comparison.named_tables()["numbers"])
+    elif suffix == ".json":
+        write_bytes(path, comparison.to_json().encode())
+    else:
+        draw: Any = render_over_bytes if isinstance(comparison, OverBytes) else render_comparison
+        save_picture(draw(comparison), path, dpi=None if current_style().few else _DPI)

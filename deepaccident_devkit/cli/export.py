@@ -1,4 +1,4 @@
-"""`deepaccident export`: the data in other tools' formats. Only the format that is written is imported."""
+"""`deepaccident export`: data in other tools' formats. Only the written format is imported."""
 
 import shutil
 from collections.abc import Callable
@@ -44,10 +44,10 @@ if TYPE_CHECKING:
     from deepaccident_devkit.export.bulk import Tally
 
 _CONTINUED: Final = "If a run is interrupted, the same command continues it."
-_WAYS: Final = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
+_LINK_NAMES: Final = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
 link_parameter = advanced(
     "--link",
-    type=WordChoice(_WAYS),
+    type=WordChoice(_LINK_NAMES),
     default="hard",
     show_default=True,
     help="How images are put there: hard links, else symbolic ones, else copies.",
@@ -55,9 +55,9 @@ link_parameter = advanced(
 
 
 def bulk_parameters(agents: Callable[[Any], Any] = agents_parameter) -> Callable[[Any], Any]:
-    """The arguments of a release, --out, --split, --where, --agents and --dry-run.
+    """Return a release's parameters, --out, --split, --where, --agents and --dry-run.
 
-    `agents` gives a verb --agents, if it means something of its own.
+    `agents` adds --agents to a verb that gives it another meaning.
     """
     return together(
         release_parameters,
@@ -86,50 +86,55 @@ def run_export(
     dry_run: bool,
     **release: Any,
 ) -> None:
-    """Export in a format with its `own` settings; says how much it will be, then what was written and left out."""
+    """Export in a format with its `own` settings.
+
+    Prints an estimate of the size, then what was written and left out.
+    """
     from deepaccident_devkit.export.bulk import export_release
 
-    form = kind(
-        split=split, where=where, agents=agent_names(agents), link=link, **own
-    )  # before the release is indexed
+    # before the release is indexed
+    form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)
     dataset = DeepAccident(**release)
-    left = export_release(dataset, out, form, dry_run=True)
-    if left.written:
-        free = shutil.disk_usage(
-            next(each for each in (left.folder, *left.folder.parents) if each.exists())
-        ).free
-        linked = sum(
-            left.tally.linked.values()
-        )  # a temporary folder may take other links than this one
-        told = f"{_counts(left.tally, 'to write')}{f', {linked:,} files to link' if linked else ''}"
-        click.echo(f"about {left.tally.samples:,} samples: {told}; {size_text(free)} free")
-        if left.tally.bytes > free:
-            raise ExportError(
-                f"{out}: there is too little room; choose another disk, or fewer scenarios or agents"
-            )
+    estimate = export_release(dataset, out, form, dry_run=True)
+    if estimate.written:
+        _print_estimate(estimate.tally, estimate.folder, out)
     if dry_run:
         return
     done = export_release(dataset, out, form, **engine_of(release), progress=True)
-    tally = done.tally
     linked_text = "".join(
-        f", {count:,} files as {_WAYS[way]}" for way, count in sorted(tally.linked.items())
+        f", {count:,} files as {_LINK_NAMES[name]}"
+        for name, count in sorted(done.tally.linked.items())
     )
     units = f"{counted(done.written, form.unit_word)} written now, {done.kept:,} were there already"
-    click.echo(f"{done.folder}: {_counts(tally, 'written')}{linked_text}; {units}")
-    for what, count in sorted(tally.left_out.items()):
-        click.echo(f"left out: {count:,} {what}")
+    click.echo(f"{done.folder}: {_counts(done.tally, 'written')}{linked_text}; {units}")
+    for name, count in sorted(done.tally.left_out.items()):
+        click.echo(f"left out: {count:,} {name}")
+
+
+def _print_estimate(tally: "Tally", folder: Path, out: Path) -> None:
+    """Print the size of an export; raises ExportError if the disk has too little room."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    counts = _counts(tally, "to write")
+    linked = sum(tally.linked.values())  # other links may be possible than in a temporary folder
+    if linked:
+        counts += f", {linked:,} files to link"
+    click.echo(f"about {tally.samples:,} samples: {counts}; {size_text(free)} free")
+    if tally.bytes > free:
+        raise ExportError(
+            f"{out}: there is too little room; choose another disk, or fewer scenarios or agents"
+        )
 
 
 def _counts(tally: "Tally", done: str) -> str:
-    return (
-        f"{f'{tally.files:,}' if tally.files else 'a few'} files {done} ({size_text(tally.bytes)})"
-    )
+    files = f"{tally.files:,}" if tally.files else "a few"
+    return f"{files} files {done} ({size_text(tally.bytes)})"
 
 
 def _of_format(
     kind: type[Any], *options: Callable[[Any], Any], summary: str = "", text: str = ""
 ) -> click.Command:
-    """Return the verb of a format, whose own options set fields of the format.
+    """Return the verb of a format, with options that set fields of the format.
 
     Args:
         kind: The format.
@@ -142,26 +147,25 @@ def _of_format(
     @verb(kind.name, short_help=summary, help=text or summary)
     @bulk_parameters()
     @together(*options)
-    def export_format(**chosen: Any) -> None:
-        run_export(kind, _own(kind, chosen), **chosen)
+    def export_format(**options: Any) -> None:
+        run_export(kind, _own(kind, options), **options)
 
     return export_format
 
 
-def _own(kind: type[Any], chosen: dict[str, Any]) -> dict[str, Any]:
-    """Take the fields that a format alone has out of a verb's options."""
+def _own(kind: type[Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Remove the fields that only this format has from a verb's options, and return them."""
     from deepaccident_devkit.export.bulk import Format
 
     fields = kind.__dataclass_fields__.keys() - Format.__dataclass_fields__.keys()
-    return {name: chosen.pop(name) for name in fields & chosen.keys()}
+    return {name: options.pop(name) for name in fields & options.keys()}
 
 
 def _nuscenes_options() -> tuple[Callable[[Any], Any], ...]:
     from deepaccident_devkit.export.nuscenes import NuScenes
 
-    return link_parameter, *(
-        field_option(NuScenes, each, option=advanced) for each in ("van", "lidar_axes", "sweeps")
-    )
+    fields = ("van", "lidar_axes", "sweeps")
+    return link_parameter, *(field_option(NuScenes, name, option=advanced) for name in fields)
 
 
 def _nuscenes() -> click.Command:
@@ -170,10 +174,11 @@ def _nuscenes() -> click.Command:
     return _of_format(
         NuScenes,
         *_nuscenes_options(),
-        text="Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all that reads nuScenes."
-        "\n\nKeyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, clouds are written: those of a whole release "
-        "take about 210 GB, and 42 GB with --no-sweeps; the nuScenes devkit holds its tables in 6 GB of memory, or "
-        f"4 GB. --dry-run says how large yours are. {_CONTINUED}",
+        text="Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all that "
+        "reads nuScenes.\n\nKeyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, "
+        "clouds are written: those of a whole release take about 210 GB, and 42 GB with "
+        "--no-sweeps; the nuScenes devkit holds its tables in 6 GB of memory, or 4 GB. "
+        f"--dry-run says how large yours are. {_CONTINUED}",
     )
 
 
@@ -194,23 +199,25 @@ def _mmdet3d() -> click.Command:
         type=WordChoice(("nuscenes", "released")),
         default="nuscenes",
         show_default=True,
-        help="nuscenes: for mmdet3d from 1.1 on. released: as the released code's converter makes them.",
+        help="nuscenes: for mmdet3d from 1.1 on. released: as the released code's converter makes "
+        "them.",
     )
     @together(*_nuscenes_options(), *released)
-    def mmdet3d(style: str, **chosen: Any) -> None:
-        """Write what mmdet3d's NuScenesDataset reads: infos, and a nuScenes export beside them if there is none yet.
+    def mmdet3d(style: str, **options: Any) -> None:
+        """Write infos for mmdet3d's NuScenesDataset, and a nuScenes export if there is none yet.
 
-        With --style released, write carla_infos_train.pkl and carla_infos_val.pkl, which the released code's two
-        dataset classes read together with the release itself.
+        With --style released, write carla_infos_train.pkl and carla_infos_val.pkl, which the
+        released code's two dataset classes read together with the release itself.
         """
-        of_released, of_nuscenes = (_own(kind, chosen) for kind in (ReleasedInfos, NuScenes))
+        released_fields = _own(ReleasedInfos, options)
+        nuscenes_fields = _own(NuScenes, options)
         if style == "released":
-            refuse_unused("with --style released", *of_nuscenes, "link")
-            run_export(ReleasedInfos, of_released, **chosen)
+            refuse_unused("with --style released", *nuscenes_fields, "link")
+            run_export(ReleasedInfos, released_fields, **options)
             return
-        refuse_unused("without --style released", *of_released)
+        refuse_unused("without --style released", *released_fields)
         for kind in (NuScenes, Mmdet3d):
-            run_export(kind, of_nuscenes, **chosen)
+            run_export(kind, nuscenes_fields, **options)
 
     return mmdet3d
 
@@ -233,8 +240,8 @@ def _opencood() -> click.Command:
         classes,
         field_option(OpenCood, "ego", type=WordChoice(VEHICLE_AGENTS)),
         field_option(OpenCood, "without_clouds", option=advanced),
-        text="Write scenarios of the release in DATAROOT as OPV2V has them: a folder each, with yaml, json and pcd "
-        f"files.\n\n{_CONTINUED}",
+        text="Write scenarios of the release in DATAROOT as OPV2V has them: a folder each, with "
+        f"yaml, json and pcd files.\n\n{_CONTINUED}",
     )
 
 
@@ -243,8 +250,8 @@ def _parquet() -> click.Command:
 
     return _of_format(
         Parquet,
-        text="Write all tables of the release in DATAROOT as Parquet files by split, with tokens in place of row "
-        f"numbers.\n\n{_CONTINUED}",
+        text="Write all tables of the release in DATAROOT as Parquet files by split, with tokens "
+        f"in place of row numbers.\n\n{_CONTINUED}",
     )
 
 
@@ -264,8 +271,8 @@ def _webdataset() -> click.Command:
         WebDataset,
         field_option(WebDataset, "frames"),
         size,
-        text="Write samples of the release in DATAROOT as tar files: the images, the LiDAR points, and the rest as "
-        f"JSON.\n\n{_CONTINUED}",
+        text="Write samples of the release in DATAROOT as tar files: the images, the LiDAR "
+        f"points, and the rest as JSON.\n\n{_CONTINUED}",
     )
 
 
@@ -293,7 +300,8 @@ def _questions() -> click.Command:
         type=WordChoice(("none", "link", "copy")),
         default="none",
         show_default=True,
-        help="Whether pictures go with the questions, under neutral names. link: as hard links, else copies.",
+        help="Whether pictures go with the questions, under neutral names. link: as hard links, "
+        "else copies.",
     )
     @click.option(
         "--channels",
@@ -309,10 +317,11 @@ def _questions() -> click.Command:
         channels: tuple[str, ...],
         **options: Any,
     ) -> None:
-        """Write questions about the release in DATAROOT: what some agents observed, and whether an accident follows.
+        """Write questions about the release in DATAROOT: whether an accident follows observations.
 
-        FOLDER/questions holds all that a model may see, FOLDER/truth.jsonl the answers. `deepaccident results` makes a
-        results file of what a model answers. If a run is interrupted, the same command continues it.
+        FOLDER/questions holds all that a model may see, FOLDER/truth.jsonl the answers.
+        `deepaccident results` makes a results file of what a model answers. If a run is
+        interrupted, the same command continues it.
         """
         if images == "none":
             refuse_unused("without --images", "channels")
@@ -335,9 +344,11 @@ def _questions() -> click.Command:
     return questions
 
 
-def _camera_names(given: tuple[str, ...]) -> tuple[str, ...]:
-    names = [choice("--channels", name, (*CAMERAS, "all")) for name in words_of(given)]
-    return CAMERAS if "all" in names else tuple(names) or CAMERAS[:1]
+def _camera_names(texts: tuple[str, ...]) -> tuple[str, ...]:
+    names = [choice("--channels", name, (*CAMERAS, "all")) for name in words_of(texts)]
+    if "all" in names:
+        return CAMERAS
+    return tuple(names) or CAMERAS[:1]
 
 
 @verb("mcap", short_help="Write a scenario as an interactive 3D scene (MCAP).")
@@ -373,8 +384,9 @@ def _mcap(
 ) -> None:
     """Write one scenario of the release in DATAROOT as an MCAP file for Foxglove or rerun.
 
-    SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024. Without SCENARIO the
-    command takes the first scenario with a collision, or if there is none, the first scenario.
+    SCENARIO is a token, such as type1_subtype1_accident/Town03_type001_subtype0001_scenario00024.
+    Without SCENARIO the command takes the first scenario with a collision, or if there is none, the
+    first scenario.
     """
     from deepaccident_devkit.evaluation.results import read_results
     from deepaccident_devkit.export.mcap import McapConfig, export_mcap
@@ -389,9 +401,9 @@ def _mcap(
     prediction = None if results is None else read_results(results)
     dataset = DeepAccident(**options)
     token = scenario or default_scenario(dataset)
-    made = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
-    size, script = f"{made.stat().st_size / 1e6:.1f} MB", made.with_suffix(".rerun.py")
-    click.echo(f"{made}: {token}, {size}; open it in Foxglove, or with: python {script}")
+    path = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
+    size, script = f"{path.stat().st_size / 1e6:.1f} MB", path.with_suffix(".rerun.py")
+    click.echo(f"{path}: {token}, {size}; open it in Foxglove, or with: python {script}")
 
 
 def _town_maps() -> click.Command:
@@ -420,7 +432,7 @@ _VERBS: Final = {
 
 
 def _format_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
-    """Return the verbs of a plug-in's formats, whose fields have no options of their own."""
+    """Return the verbs of a plug-in's formats; fields of these have no options of their own."""
     return {
         name: LazyVerb(export_format.summary, partial(_plugin_format, export_format))
         for name, export_format in plugin.export_formats.items()

@@ -18,17 +18,16 @@ from deepaccident_devkit.taxonomy import OnError
 @click.option(
     "--clear",
     is_flag=True,
-    help="Remove the index instead, from its own folder and from your cache. The release itself stays as it is.",
+    help="Remove the index instead, from its own folder and from your cache. The release itself "
+    "stays as it is.",
 )
 def index(dataroot: Dataroot, version: str, on_error: OnError, clear: bool, **options: Any) -> None:
     """Make or update the index of the release in DATAROOT, and print where it is."""
     if clear:
         refuse_unused("with --clear, which makes no index", "workers", "on_error")
         cleared = clear_index(dataroot, version=version, index_dir=options["index_dir"])
-        click.echo(
-            "\n".join(f"removed {folder}" for folder in cleared)
-            or f"{dataroot}: no index to remove"
-        )
+        lines = [f"removed {folder}" for folder in cleared]
+        click.echo("\n".join(lines) or f"{dataroot}: no index to remove")
         return
     _update(dataroot, version, on_error, check_files=False, **options)
 
@@ -36,9 +35,9 @@ def index(dataroot: Dataroot, version: str, on_error: OnError, clear: bool, **op
 @verb("index")
 @release_parameters
 def check_index(dataroot: Dataroot, version: str, on_error: OnError, **options: Any) -> None:
-    """Compare the index of the release in DATAROOT with the content of all label, calib and meta files, and mend it.
+    """Compare the index of the release in DATAROOT with the content of its files, and mend it.
 
-    `deepaccident index` compares the times of these files instead.
+    These are all label, calib and meta files; `deepaccident index` compares their times instead.
     """
     tables = _update(dataroot, version, on_error, check_files=True, **options)
     scenarios = counted(len(tables.table("scenario")), "scenario")
@@ -57,7 +56,7 @@ def _update(
         progress=True,
         **engine_of(options),
     )
-    made = open_index(
+    index = open_index(
         find_release(root, version),
         on_error=on_error,
         check_times=True,
@@ -65,9 +64,9 @@ def _update(
         progress=True,
         **options,
     )
-    tables = Tables(made.tables_folder)
+    tables = Tables(index.tables_folder)
     counts = ", ".join(
         f"{len(tables.table(name)):,} {name}s" for name in ("scenario", "sample", "annotation")
     )
-    click.echo(f"{made.tables_folder}: {counts}")
+    click.echo(f"{index.tables_folder}: {counts}")
     return tables

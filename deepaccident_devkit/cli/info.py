@@ -1,4 +1,4 @@
-"""`deepaccident info`: what a release holds, its statistics, and what scenarios can be found by."""
+"""`deepaccident info`: contents of a release, its statistics, and fields to find scenarios by."""
 
 import json
 import sys
@@ -22,8 +22,8 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.statistics.overview import overview, scenario_lines
 
 
-def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
-    if wanted:
+def _list_fields(context: click.Context, _parameter: click.Parameter, is_set: bool) -> None:
+    if is_set:
         from deepaccident_devkit.selection.fields import fields_text
 
         click.echo(fields_text())
@@ -50,14 +50,14 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, wanted: bo
 @click.option(
     "--out",
     type=click.Path(),
-    help="With --statistics: folder to write statistics.json, one CSV file per table, and figures into; earlier ones "
-    "there are replaced.",
+    help="With --statistics: folder to write statistics.json, one CSV file per table, and figures "
+    "into; earlier ones there are replaced.",
 )
 @click.option(
     "--facts",
     is_flag=True,
-    help="Compare the release with what others measured of the real one instead; broken scenarios are left out, and "
-    "counted (docs/validation.md).",
+    help="Compare the release with what others measured of the real one instead; broken scenarios "
+    "are left out, and counted (docs/validation.md).",
 )
 @click.option(
     "--croissant",
@@ -103,46 +103,57 @@ def info(
             *(["statistics"] if facts else []),
         )
     dataset = open_release(**(release | {"on_error": "skip"} if facts else release))
-    chosen = dataset.find(*where) if where else None
+    scenarios = dataset.find(*where) if where else None
     if facts:
         from deepaccident_devkit.statistics import release_facts
 
-        report = release_facts(dataset, chosen, **engine_of(release))
+        report = release_facts(dataset, scenarios, **engine_of(release))
         say_report(report, [], None, as_json=as_json)
         sys.exit(report.exit_status)
-    if chosen == [] and out is not None:
+    if scenarios == [] and out is not None:
         raise click.UsageError(
             "no scenario matches --where, so there is nothing to write; change it or omit --out"
         )
     if statistics:
         _statistics(
-            dataset, chosen, out, interactions=interactions, as_json=as_json, **engine_of(release)
+            dataset,
+            scenarios,
+            out,
+            interactions=interactions,
+            as_json=as_json,
+            **engine_of(release),
         )
         return
-    if chosen is None:
+    if scenarios is None:
         summary = overview(dataset)
         click.echo(summary.to_json() if as_json else summary.to_text())
     elif as_json:
-        click.echo(json.dumps(chosen, indent=2, ensure_ascii=False))
+        click.echo(json.dumps(scenarios, indent=2, ensure_ascii=False))
+    elif scenarios:
+        click.echo(f"{len(scenarios)} of {len(dataset.scenario)} scenarios match")
+        click.echo("\n".join(scenario_lines(scenarios)))
     else:
-        found = [
-            f"{len(chosen)} of {len(dataset.scenario)} scenarios match",
-            *scenario_lines(chosen),
-        ]
-        none = f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what can be asked for"
-        click.echo("\n".join(found) if chosen else none)
+        click.echo(
+            f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what "
+            "can be asked for"
+        )
 
 
 def _statistics(
-    dataset: DeepAccident, chosen: list[Any] | None, out: str | None, *, as_json: bool, **how: Any
+    dataset: DeepAccident,
+    scenarios: list[Any] | None,
+    out: str | None,
+    *,
+    as_json: bool,
+    **engine: Any,
 ) -> None:
     from deepaccident_devkit.render.statistics import save_statistics  # it imports matplotlib
     from deepaccident_devkit.statistics import dataset_statistics
     from deepaccident_devkit.support.files import writable_folder
 
     folder = None if out is None else writable_folder(out)
-    found = dataset_statistics(dataset, chosen, **how)
-    written: list[Path] = write_report(found, folder, "statistics.json")
+    statistics = dataset_statistics(dataset, scenarios, **engine)
+    written: list[Path] = write_report(statistics, folder, "statistics.json")
     if folder:
-        written += save_statistics(found, folder)
-    say_report(found, written, folder, as_json=as_json)
+        written += save_statistics(statistics, folder)
+    say_report(statistics, written, folder, as_json=as_json)

@@ -44,8 +44,8 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
     type=WordChoice(get_args(Purpose)),
     default="every",
     show_default=True,
-    help="every: all samples (10 Hz). all, keyframes: two samples per second. train, evaluate: those of training and "
-    "evaluation.",
+    help="every: all samples (10 Hz). all, keyframes: two samples per second. train, evaluate: "
+    "those of training and evaluation.",
 )
 @click.option(
     "--preset",
@@ -75,9 +75,9 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
 @click.option(
     "--names",
     type=WordChoice(get_args(BatchNames)),
-    help="Write one plain npz file per sample, for loops without the devkit: the arrays that this code's loader gives, "
-    "with its names, axes, types and orientation. Takes some 0.1 MB per sample, 25 times as much as label files.  "
-    "[default: label files]",
+    help="Write one plain npz file per sample, for loops without the devkit: the arrays that this "
+    "code's loader gives, with its names, axes, types and orientation. Takes some 0.1 MB per "
+    "sample, 25 times as much as label files.  [default: label files]",
 )
 def labels(
     split: str,
@@ -89,18 +89,19 @@ def labels(
 ) -> None:
     """Write the motion labels of one split of the release in DATAROOT.
 
-    There is one file per scenario and agent. If a run is interrupted, the same command continues it.
+    There is one file per scenario and agent. If a run is interrupted, the same command continues
+    it.
     """
     config = _config(options)
-    chosen = agent_names(agents)
+    agents = agent_names(agents)
     LabelManifest.of(folder_path(out), config, names)  # before the release is indexed
     dataset = open_release(**options)
     tokens = [
-        token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in chosen
+        token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in agents
     ]
     if not tokens:
         raise NotAvailableError(
-            f"{split}: has no labelled samples of {', '.join(chosen)} for --samples {purpose}"
+            f"{split}: has no labelled samples of {', '.join(agents)} for --samples {purpose}"
         )
     done = write_label_files(
         dataset,
@@ -113,19 +114,22 @@ def labels(
     )
     written = counted(done.written, "file")
     click.echo(
-        f"{counted(done.samples, 'sample')} in {out}: {written} written, {done.kept} were there already"
+        f"{counted(done.samples, 'sample')} in {out}: {written} written, {done.kept} were there "
+        "already"
     )
 
 
 def _config(options: dict[str, Any]) -> MotionLabelConfig:
-    """Take the options that say what labels show out of the verb's."""
+    """Remove the options of the label configuration from a verb's options, and return it."""
     preset, protocol, switches, seen_by, only_vehicle = (
         options.pop(name) for name in _CONFIG_OPTIONS
     )
     named = {"protocol": protocol, "agents": seen_by, "only_vehicle": only_vehicle or None}
     changes: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
     config = MotionLabelConfig.preset(preset, **changes)
-    return replace(config, protocol=_switched(config.rules, switches)) if switches else config
+    if switches:
+        return replace(config, protocol=_switched(config.rules, switches))
+    return config
 
 
 def _switched(rules: LabelProtocol, texts: tuple[str, ...]) -> LabelProtocol:

@@ -1,4 +1,4 @@
-"""The parameters that several verbs take, the same for all of them, and how they are read."""
+"""Parameters that several verbs share, and functions that read them."""
 
 import functools
 import os
@@ -19,7 +19,7 @@ from deepaccident_devkit.support.plugins import Opener, offers
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import VERSIONS, StyleName
 
-_WORDS = {"yes": "true", "no": "false"}
+_BOOLEAN_WORDS = {"yes": "true", "no": "false"}
 
 
 class DatarootParameter(click.Path):
@@ -31,23 +31,21 @@ class DatarootParameter(click.Path):
         param: click.Parameter | None,
         ctx: click.Context | None,
     ) -> str | bytes | os.PathLike[str]:
-        """The path, or the URL as it is."""
-        return (
-            value
-            if isinstance(value, str) and "://" in value
-            else super().convert(value, param, ctx)
-        )
+        """Return the path, or the URL unchanged."""
+        if isinstance(value, str) and "://" in value:
+            return value
+        return super().convert(value, param, ctx)
 
 
 DATAROOT = DatarootParameter(path_type=Path)
-"""The type of what names a release."""
+"""The type of arguments that name a release."""
 PATH = click.Path(path_type=Path)
 dataroot_argument = click.argument("dataroot", type=DATAROOT)
 _SCHEDULER = advanced(
     "--scheduler",
     metavar="ADDRESS|FILE.json",
-    help="Run on this dask scheduler, or on that which wrote its address into a file; or mpi: on all ranks "
-    "(docs/clusters.md).",
+    help="Run on this dask scheduler, or on that which wrote its address into a file; or mpi: on "
+    "all ranks (docs/clusters.md).",
 )
 version_parameter = click.option(
     "--version",
@@ -70,11 +68,11 @@ on_error_parameter = advanced(
 reader_parameters = together(
     dataroot_argument, version_parameter, workers_parameter, index_dir_parameter, on_error_parameter
 )
-"""For a verb that runs in one process: DATAROOT, --version, --index-dir, --workers and --on-error."""
+"""DATAROOT, --version, --index-dir, --workers and --on-error, for verbs in a single process."""
 
 
 def _enter_style(context: click.Context, _: click.Parameter, value: str | None) -> None:
-    """Make all figures of the command in a style."""
+    """Draw all figures of the command in a style."""
     from deepaccident_devkit.render.styles import style
 
     if value is not None:
@@ -86,14 +84,15 @@ figure_style_parameter = click.option(
     type=WordChoice(get_args(StyleName)),
     expose_value=False,
     callback=_enter_style,
-    help="Make the figures as wide as a paper's column or page, or for a slide, and write them as PDF files, too.",
+    help="Make the figures as wide as a paper's column or page, or for a slide, and write them as "
+    "PDF files, too.",
 )
 where_parameter = click.option(
     "--where",
     multiple=True,
     metavar="FILTER",
-    help="Only scenarios that match, such as town=Town03,Town05, weather!=Clear, length=40..60 or collision=true. "
-    "If you repeat this option, all filters must match.",
+    help="Only scenarios that match, such as town=Town03,Town05, weather!=Clear, length=40..60 or "
+    "collision=true. If you repeat this option, all filters must match.",
 )
 channels_parameter = click.option(
     "--channels",
@@ -118,22 +117,19 @@ json_parameter = click.option(
 
 
 def engine_parameters(run_verb: Function) -> Function:
-    """Give a verb `workers`, and as `executor` that of --scheduler, which is open while the verb runs."""
+    """Add `workers` to a verb, and as `executor` that of --scheduler, open while the verb runs."""
 
     @functools.wraps(run_verb)
     def run(*arguments: Any, scheduler: str | None, **options: Any) -> Any:
         if scheduler is None:
             return run_verb(*arguments, executor=None, **options)
-        from deepaccident_devkit.support.parallel import (
-            cluster_executor,
-        )  # here: most verbs start without it
+        # here, since most verbs start without it
+        from deepaccident_devkit.support.parallel import cluster_executor
 
         refuse_unused("with a scheduler, which has workers of its own", "workers")
-        # workers have working folders of their own
-        options = {
-            name: each.absolute() if isinstance(each, Path) else each
-            for name, each in options.items()
-        }
+        for name, value in options.items():
+            if isinstance(value, Path):  # workers have other working folders
+                options[name] = value.absolute()
         file = Path(scheduler) if scheduler.endswith(".json") else None
         with cluster_executor(None if file else scheduler, file) as executor:
             return run_verb(*arguments, executor=executor, **options)
@@ -144,23 +140,23 @@ def engine_parameters(run_verb: Function) -> Function:
 release_options = together(
     version_parameter, engine_parameters, index_dir_parameter, on_error_parameter
 )
-"""--version, --index-dir, --on-error and what `engine_parameters` gives."""
+"""--version, --index-dir, --on-error and the options of `engine_parameters`."""
 release_parameters = together(dataroot_argument, release_options)
 """For a verb on a release: DATAROOT and its options."""
 
 
 def engine_of(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a verb's options, those that say what it runs on."""
+    """Return the options of a verb that choose its workers."""
     return {name: options[name] for name in ("workers", "executor")}
 
 
-def open_release(dataroot: Any, *, index_dir: Path | None = None, **how: Any) -> DeepAccident:
-    """Return the release that a verb is about; plug-ins open dataroots of other datasets, such as nuScenes."""
+def open_release(dataroot: Any, *, index_dir: Path | None = None, **options: Any) -> DeepAccident:
+    """Return the release of a verb; plug-ins open other datasets, such as nuScenes."""
     opener = _opener(dataroot, own=True)
     if opener is None:
         try:
-            return DeepAccident(dataroot=dataroot, index_dir=index_dir, **how)
-        except DatarootError:  # perhaps somebody else's plug-in knows it
+            return DeepAccident(dataroot=dataroot, index_dir=index_dir, **options)
+        except DatarootError:  # perhaps a third-party plug-in opens it
             opener = _opener(dataroot, own=False)
             if opener is None:
                 raise
@@ -168,7 +164,7 @@ def open_release(dataroot: Any, *, index_dir: Path | None = None, **how: Any) ->
 
 
 def _opener(dataroot: Any, *, own: bool) -> Opener | None:
-    """Return the plug-ins' opener that recognizes a dataroot; None if it is a URL, or none does."""
+    """Return the plug-ins' opener that accepts a dataroot; None for a URL, or without any."""
     if not isinstance(dataroot, Path):
         return None
     openers = offers(lambda plugin: plugin.openers, own=own).by_name.values()
@@ -176,43 +172,53 @@ def _opener(dataroot: Any, *, own: bool) -> Opener | None:
 
 
 def release_of(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a verb's options, those that say which release is opened, and how."""
+    """Return the options of a verb that choose the release, and how it is opened."""
     return {name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")}
 
 
 def switches_of(texts: Sequence[str]) -> dict[str, Any]:
-    """The names and values of repeated --switch NAME=VALUE; a value that is neither yes, no nor JSON stays a text."""
+    """Return the names and values of repeated --switch NAME=VALUE.
+
+    A value that is neither yes, no nor JSON stays a text.
+    """
     switches: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise click.BadParameter(f"--switch: expected NAME=VALUE, found {text!r}")
         try:
-            switches[name] = parsed_json(_WORDS.get(value.lower(), value).encode())
+            switches[name] = parsed_json(_BOOLEAN_WORDS.get(value.lower(), value).encode())
         except ValueError:
             switches[name] = value
     return switches
 
 
 def write_report(report: Any, folder: Path | None, name: str) -> list[Path]:
-    """Write a report's tables, and all of it as JSON into a file `name`; the files written, none without a folder."""
+    """Write a report's tables, and all of it as JSON into a file `name`.
+
+    Returns:
+        The written files; none without a folder.
+    """
     if folder is None:
         return []
-    written = [*report.to_csv(folder), folder / name]
-    write_bytes(written[-1], report.to_json().encode())
-    return written
+    json_path = folder / name
+    write_bytes(json_path, report.to_json().encode())
+    return [*report.to_csv(folder), json_path]
 
 
 def say_report(report: Any, written: Sequence[Path], folder: Path | None, *, as_json: bool) -> None:
-    """Print a report, and how many files were written into a folder before: nothing written depends on the print."""
+    """Print a report, and how many files were written into a folder before.
+
+    No written file depends on the print.
+    """
     click.echo(report.to_json() if as_json else report.to_text())
     if folder is not None:
         click.echo(f"written: {counted(len(written), 'file')} in {folder}", err=as_json)
 
 
-def words_of(given: Sequence[str]) -> list[str]:
-    """The words of the texts of a repeated option, each text one word or several with commas."""
-    return [word for text in given for word in text.split(",")]
+def words_of(texts: Sequence[str]) -> list[str]:
+    """Return the words of a repeated option; a text is one word, or several with commas."""
+    return [word for text in texts for word in text.split(",")]
 
 
 seed_parameter = click.option(
@@ -221,28 +227,33 @@ seed_parameter = click.option(
 
 
 def use_threads_sparingly() -> None:
-    """Let threads that have nothing to do sleep, unless the environment says otherwise; before torch is imported.
+    """Let idle threads sleep, unless the environment has another setting; call it before torch.
 
-    By default they spin, and on a machine with other work each step then takes several times as long.
+    By default they spin, and on a machine with other work each step then takes several times as
+    long.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def was_given(parameter: str) -> bool:
-    """Whether the call of the verb that runs has this option, be it with its default."""
-    return (
-        click.get_current_context().get_parameter_source(parameter) is not ParameterSource.DEFAULT
-    )
+    """Return whether the user passed this option of the running verb explicitly."""
+    source = click.get_current_context().get_parameter_source(parameter)
+    return source is not ParameterSource.DEFAULT
 
 
 def refuse_unused(why: str, *parameters: str) -> None:
-    """End with a usage error if one of these parameters of the verb that runs was given, because it changes nothing."""
+    """Raise a usage error if a parameter was passed that changes nothing in the running verb.
+
+    Args:
+        why: Reason, such as `without --out`.
+        *parameters: Names of the parameters.
+    """
     context = click.get_current_context()
     for option in context.command.params:
         if option.name in parameters and was_given(option.name):
-            name = (
-                option.opts[0] if isinstance(option, click.Option) else option.human_readable_name
-            )
+            name = option.human_readable_name
+            if isinstance(option, click.Option):
+                name = option.opts[0]
             raise click.UsageError(f"{name} changes nothing {why}; leave it out", context)
 
 
@@ -281,4 +292,4 @@ frame_range_parameter = click.option(
     metavar="FIRST..LAST",
     help="Only these frames of a scenario, counted from 1.",
 )
-"""An option for `frames`, the numbers that it stands for, or None."""
+"""An option for `frames`: a range of frame numbers, or None."""

@@ -55,17 +55,17 @@ from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR, Frame, Styl
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
 
-_RELEASE = ("dataroot", "version", "index_dir", "workers", "executor", "on_error")
+_RELEASE_OPTIONS = ("dataroot", "version", "index_dir", "workers", "executor", "on_error")
 _VISIBILITY_STYLES = ("map", "table")
 _FRONT_AND_POINTS = (CAMERAS[0], LIDAR)
 _logger = logging.getLogger(__name__)
-_OUT = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
+_OUT_HELP = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for several pictures."
 
 
-def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
+def _with_link(draw: Callable[..., Any]) -> Callable[..., Any]:
     """Turn a function that takes `link` into one that takes --latency, --pose-noise and --seed."""
 
-    def drawn(
+    def draw_with_link(
         dataset: Dataset,
         token: str,
         *,
@@ -78,28 +78,28 @@ def _linked(draw: Callable[..., Any]) -> Callable[..., Any]:
         link = Link(latency=latency, pose_noise=pose_noise or None, seed=seed)
         return draw(dataset, token, link=link, **choices)
 
-    return drawn
+    return draw_with_link
 
 
-def _evaluated(dataset: Dataset, token: str, *, results: Path, **choices: Any) -> Any:
+def _draw_evaluation(dataset: Dataset, token: str, *, results: Path, **choices: Any) -> Any:
     prediction: Any = read_results(results).prediction(token)
     return render_evaluation(dataset, token, prediction, **choices)
 
 
-def _sensor_file(
+def _draw_sensor_file(
     dataset: Dataset, token: str, *, color_by: ColorBy | None = None, **choices: Any
 ) -> Any:
-    """What a sensor recorded, or with `color_by` the LiDAR points on its image."""
+    """Draw the data of a sensor, or with `color_by` the LiDAR points on its image."""
     if color_by is None:
         return render_sample_data(dataset, token, **choices)
     refuse_unused("with --color-by, which shows the image and all points", "layers")
     return render_pointcloud_in_image(dataset, token, color_by=color_by, **choices)
 
 
-def _visibility(
+def _draw_visibility(
     dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES[0], **choices: Any
 ) -> Any:
-    """Who sees whom, from above or as a table."""
+    """Draw which agents see which actors, from above or as a table."""
     if style == _VISIBILITY_STYLES[0]:
         return render_visibility(dataset, token, **choices)
     refuse_unused(f"with --style {style}", "frame", "view_range", "layers")
@@ -112,7 +112,7 @@ def _seconds(
     if value is None:
         return None
     try:
-        return [float(word) for word in value.split(",")]
+        return list(map(float, value.split(",")))
     except ValueError:
         raise click.BadParameter(
             f"expected seconds such as 2,1,0, found {value!r}", context, parameter
@@ -141,21 +141,22 @@ _LAYERS = click.option(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Picture:
-    """A view that is rendered into a picture.
+    """A view that is drawn as a picture.
 
     Attributes:
-        draw: the function of the render package, or one that calls it.
-        of: the table whose rows it renders.
-        canvas: `fig` if it renders into a figure, `ax` if into axes.
-        options: of this verb.
-        help: the first line of the verb's help.
-        default: what is rendered without a token.
-        styles: of its own, the default first.
-        channels: what it shows: of a partial download, a scenario stands for the moment with most files of these.
+        draw: Function of the render package, or one that calls it.
+        table: Table with the rows that it draws.
+        canvas: `fig` if it draws into a figure, `ax` if into axes.
+        options: Options of this verb.
+        help: First line of the verb's help.
+        default: Row that is drawn without a token.
+        styles: Its own styles, the default first.
+        channels: Channels that it shows: in a partial download, a scenario stands for the moment
+            with most files of these.
     """
 
     draw: Callable[..., Any]
-    of: str
+    table: str
     help: str
     canvas: str = "fig"
     options: tuple[Any, ...] = (_BY_CLASS, _LAYERS)
@@ -163,7 +164,7 @@ class _Picture:
     styles: tuple[str, ...] = ()
     channels: tuple[str, ...] = (*CAMERAS, LIDAR)
 
-    def drawn(
+    def figure(
         self,
         dataset: Dataset,
         row: str,
@@ -171,7 +172,7 @@ class _Picture:
         dpi: float,
         choices: dict[str, Any],
     ) -> Any:
-        """Render a row into a figure of the given size in pixels, or of the view's own size."""
+        """Draw a row into a figure of a size in pixels, or of the view's own size."""
         canvas = {}
         if size is not None:
             figure = figure_of_pixels(*size, dpi=dpi)
@@ -182,46 +183,50 @@ class _Picture:
 _PICTURES = {
     "sample": _Picture(
         draw=render_sample,
-        of="sample",
+        table="sample",
         help="Render one sample: its six camera images, and its boxes and LiDAR points from above.",
         options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
     "sample-data": _Picture(
-        draw=_sensor_file,
-        of="sample_data",
-        help="Render what one sensor recorded: a camera image, or the LiDAR or the BEV camera from above.",
+        draw=_draw_sensor_file,
+        table="sample_data",
+        help="Render what one sensor recorded: a camera image, or the LiDAR or the BEV camera "
+        "from above.",
         canvas="ax",
         options=(
             click.option(
                 "--color-by",
                 type=WordChoice((*get_args(ColorBy), "class")),
-                help="Show all LiDAR points on a camera image, with colours of this, also points that are hidden "
-                "behind objects; or class: a hue for each class of boxes.",
+                help="Show all LiDAR points on a camera image, with colours of this, also points "
+                "that are hidden behind objects; or class: a hue for each class of boxes.",
             ),
             _LAYERS,
         ),
     ),
     "annotation": _Picture(
         draw=render_annotation,
-        of="annotation",
-        help="Render one box: in the camera that shows it largest, from above, and described in words.",
+        table="annotation",
+        help="Render one box: in the camera that shows it largest, from above, and described in "
+        "words.",
     ),
     "instance": _Picture(
         draw=render_instance,
-        of="instance",
-        help="Render one actor over time: its path, its camera images, its speed, and which agents see it.",
+        table="instance",
+        help="Render one actor over time: its path, its camera images, its speed, and which "
+        "agents see it.",
         options=(_AGENTS, _BY_CLASS, _LAYERS),
     ),
     "frame": _Picture(
         draw=render_frame,
-        of="frame",
-        help="Render one moment of all agents side by side: front cameras, and boxes and LiDAR from above.",
+        table="frame",
+        help="Render one moment of all agents side by side: front cameras, and boxes and LiDAR "
+        "from above.",
         options=(_AGENTS, _BY_CLASS, _LAYERS),
         channels=_FRONT_AND_POINTS,
     ),
     "bev": _Picture(
-        draw=_linked(render_bev),
-        of="sample",
+        draw=_with_link(render_bev),
+        table="sample",
         canvas="ax",
         channels=(LIDAR, BEV_CAMERA),
         options=(
@@ -238,20 +243,23 @@ _PICTURES = {
             _BY_CLASS,
             _LAYERS,
         ),
-        help="Render one moment from above: boxes, LiDAR points and other layers, of one or several agents.",
+        help="Render one moment from above: boxes, LiDAR points and other layers, of one or "
+        "several agents.",
     ),
     "labels": _Picture(
         draw=render_motion_labels,
-        of="sample",
-        help="Render the motion labels of one sample: one column per frame; instances, centerness, offset and flow.",
+        table="sample",
+        help="Render the motion labels of one sample: one column per frame; instances, "
+        "centerness, offset and flow.",
         options=(_LAYERS,),
         styles=get_args(MotionStyle),
         channels=(),
     ),
     "visibility": _Picture(
-        draw=_visibility,
-        of="frame",
-        help="Render who sees whom: from above, an actor with one dot for each agent that sees it, or as a table.",
+        draw=_draw_visibility,
+        table="frame",
+        help="Render who sees whom: from above, an actor with one dot for each agent that sees "
+        "it, or as a table.",
         canvas="ax",
         styles=_VISIBILITY_STYLES,
         channels=(),
@@ -260,9 +268,10 @@ _PICTURES = {
     "accident": _Picture(
         draw=render_accident,
         default="the first accident",
-        of="scenario",
-        help="Render the countdown to an accident: one column per moment, one row per agent. Where there is little "
-        "room, as on a slide, it shows the agents that see the pair best; --agents all shows all.",
+        table="scenario",
+        help="Render the countdown to an accident: one column per moment, one row per agent. "
+        "Where there is little room, as on a slide, it shows the agents that see the pair "
+        "best; --agents all shows all.",
         options=(
             _AGENTS,
             click.option(
@@ -276,8 +285,8 @@ _PICTURES = {
         ),
     ),
     "evaluation": _Picture(
-        draw=_evaluated,
-        of="sample",
+        draw=_draw_evaluation,
+        table="sample",
         options=(
             click.option("--results", type=PATH, required=True, help="Results file of a model."),
             click.option(
@@ -291,20 +300,23 @@ _PICTURES = {
             ),
             _LAYERS,
         ),
-        help="Render the label of a sample beside a model's prediction, with the verdict in numbers.",
+        help="Render the label of a sample beside a model's prediction, with the verdict in "
+        "numbers.",
         default="the first of the results",
     ),
     "link": _Picture(
-        draw=_linked(render_link),
-        of="sample",
+        draw=_with_link(render_link),
+        table="sample",
         channels=(LIDAR,),
         options=(_AGENTS, _VIEW_RANGE, link_parameters(0.2, 0.3), seed_parameter, _LAYERS),
-        help="Render how latency and pose noise change the data that partners share with the sample's agent.",
+        help="Render how latency and pose noise change the data that partners share with the "
+        "sample's agent.",
     ),
     "calibration": _Picture(
         draw=render_calibration,
-        of="frame",
-        help="Render LiDAR points and boxes of all agents in camera images, to check the calibration.",
+        table="frame",
+        help="Render LiDAR points and boxes of all agents in camera images, to check the "
+        "calibration.",
         options=(_AGENTS, _BY_CLASS, _LAYERS),
         channels=_FRONT_AND_POINTS,
     ),
@@ -313,25 +325,31 @@ _PICTURES = {
 
 @click.group()
 def render() -> None:
-    """Render pictures of a release, one command per view; `video` and `replay` show a whole scenario."""
+    """Render pictures of a release, one command per view.
+
+    `video` and `replay` show a whole scenario.
+    """
+
+
+def _help_text(picture: _Picture) -> str:
+    text = f"{picture.help}\n\nTOKEN is a row of the table {picture.table}."
+    if picture.table not in ("scenario", "instance"):
+        text += " A scenario's token stands for the moment one second before its end"
+        if picture.channels:
+            text += ", or of a partial download the nearest one with most files"
+        text += "."
+    return f"{text} Without TOKEN the command renders {picture.default}."
 
 
 def _verb(name: str, picture: _Picture) -> click.Command:
-    text = f"{picture.help}\n\nTOKEN is a row of the table {picture.of}."
-    if picture.of not in ("scenario", "instance"):
-        most = (
-            ", or of a partial download the nearest one with most files" if picture.channels else ""
-        )
-        text += f" A scenario's token stands for the moment one second before its end{most}."
-    own = (
+    own_styles = (
         f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
     )
-    text += f" Without TOKEN the command renders {picture.default}."
 
-    @verb(name, help=text, short_help=picture.help)
+    @verb(name, help=_help_text(picture), short_help=picture.help)
     @release_parameters
     @click.argument("tokens", nargs=-1, metavar="[TOKEN…]")
-    @click.option("--out", type=PATH, required=True, metavar="FILE|FOLDER", help=_OUT)
+    @click.option("--out", type=PATH, required=True, metavar="FILE|FOLDER", help=_OUT_HELP)
     @click.option(
         "--size",
         callback=pixel_size,
@@ -348,8 +366,9 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         "styles",
         multiple=True,
         type=WordChoice((*picture.styles, *get_args(StyleName))),
-        help=f"{own}for papers as wide as a column or a page, with small text, few panels and no token; paper: one "
-        "panel in a column, several over a page (IEEE); slide: 16 to 9, with large text.",
+        help=f"{own_styles}for papers as wide as a column or a page, with small text, few panels "
+        "and no token; paper: one panel in a column, several over a page (IEEE); slide: 16 "
+        "to 9, with large text.",
     )
     @click.option("--no-title", is_flag=True, help="No title: a caption says it.")
     @frame_range_parameter
@@ -364,7 +383,7 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         frames: range | None,
         **options: Any,
     ) -> None:
-        release = {option: options.pop(option) for option in _RELEASE}
+        release = {option: options.pop(option) for option in _RELEASE_OPTIONS}
         options["agents"] = names_or_configuration(options.pop("agents", ()))
         if name == "bev" and options["agents"] in (None, "single"):
             refuse_unused(
@@ -382,24 +401,25 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         dataset = open_release(**release)
         rows = rows_to_draw(
             dataset,
-            picture.of,
+            picture.table,
             tokens,
             frames,
             picture.channels,
             latency=choices.get("latency", 0.0),
         )
-        looks = [word for word in styles if word in picture.styles]
-        if looks:
-            choices["style"] = looks[-1]
-        places = [cast(StyleName, word) for word in styles if word not in picture.styles]
-        # what else a view colours by is its own choice
+        view_styles = [word for word in styles if word in picture.styles]
+        if view_styles:
+            choices["style"] = view_styles[-1]
+        figure_styles = [cast(StyleName, word) for word in styles if word not in picture.styles]
+        figure_style = figure_styles[-1] if figure_styles else None
+        # other values of --color-by are choices of the view
         boxes_by: Any = choices.pop("color_by") if choices.get("color_by") == "class" else "role"
-        with style(places[-1] if places else None, title=not no_title, color_by=boxes_by):
+        with style(figure_style, title=not no_title, color_by=boxes_by):
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
-                drawn = picture.drawn(dataset, row, size, dpi or current_style().dpi, choices)
-                save_picture(drawn, path, dpi=dpi)
-                if words := missing_words(drawn):
-                    _logger.warning("%s: %s", path, "; ".join(words))
+                figure = picture.figure(dataset, row, size, dpi or current_style().dpi, choices)
+                save_picture(figure, path, dpi=dpi)
+                if missing := missing_words(figure):
+                    _logger.warning("%s: %s", path, "; ".join(missing))
                 click.echo(f"rendered: {row} in {path}")
 
     return render_view
@@ -421,6 +441,7 @@ for _name, _picture in _PICTURES.items():
 )
 @click.option(
     "--what",
+    "views",
     multiple=True,
     metavar="VIEW[,VIEW…]",
     help=f"Views to show side by side: {', '.join(VIEWS)}.  [default: frame]",
@@ -442,24 +463,24 @@ for _name, _picture in _PICTURES.items():
 def video(
     scenario: str | None,
     out: Path,
-    what: tuple[str, ...],
+    views: tuple[str, ...],
     agents: tuple[str, ...],
     layers: tuple[str, ...],
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as a video.
 
-    Without SCENARIO the command takes the first accident, or if there is none, the first scenario. MP4 needs the extra
-    `video`; in a checkout: pip install '.[video]'.
+    Without SCENARIO the command takes the first accident, or if there is none, the first scenario.
+    MP4 needs the extra `video`; in a checkout: pip install '.[video]'.
     """
-    release = {option: options.pop(option) for option in _RELEASE}
+    release = {option: options.pop(option) for option in _RELEASE_OPTIONS}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
     dataset = open_release(**release)
     path = render_scenario_video(
         dataset,
         scenario or default_scenario(dataset),
         out,
-        what=words_of(what) or "frame",
+        what=words_of(views) or "frame",
         agents=names_or_configuration(agents),
         layers=cast(list[Layer] | None, words_of(layers) or None),
         workers=release["workers"],
@@ -488,14 +509,19 @@ def video(
 def replay(
     scenario: str | None, out: str, results: str | None, agents: tuple[str, ...], **release: Any
 ) -> None:
-    """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser, without a network.
+    """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser.
 
-    Without SCENARIO the command takes the first accident, or if there is none, the first scenario. The file has at most
-    15 MB.
+    It needs no network. Without SCENARIO the command takes the first accident, or if there is none,
+    the first scenario. The file has at most 15 MB.
     """
     prediction = None if results is None else read_results(results)  # before the release is indexed
-    dataset, chosen = open_release(**release), names_or_configuration(agents)
+    dataset = open_release(**release)
     path = render_replay(
-        dataset, scenario, out, prediction=prediction, agents=chosen, progress=True
+        dataset,
+        scenario,
+        out,
+        prediction=prediction,
+        agents=names_or_configuration(agents),
+        progress=True,
     )
     click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")

@@ -1,4 +1,4 @@
-"""Which rows `deepaccident render` renders, and into which files."""
+"""Rows that `deepaccident render` draws, and the files that it writes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,8 @@ from deepaccident_devkit.taxonomy import CAMERAS, CHANNELS, FRAME_PERIOD, OWN_AC
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import default_scenario, first_accident
 
-_SECONDS_BEFORE = 1.0
+# Time before the end of a scenario at which it is drawn by default.
+_TIME_BEFORE_END_S = 1.0
 
 
 def rows_to_draw(
@@ -34,27 +35,39 @@ def rows_to_draw(
     *,
     latency: float = 0.0,
 ) -> list[str]:
-    """The tokens of a table's rows that a verb renders; raises DeepAccidentError, or click.UsageError for `frames`.
+    """Return the tokens of the rows of a table that a verb draws.
 
-    `tokens` are of rows of this table or of scenarios. A scenario stands for its first agent at `frames` (None: one
-    second before its end), and for the actor that this agent collides with. Of a partial download it is the moment,
-    agent and camera with most files of the `channels` that the verb shows, now and `latency` seconds before; of those
-    the nearest to the usual one. No tokens stand for the first accident; if there is none, for the first scenario,
-    except where a whole scenario is rendered.
+    A scenario stands for its first agent at `frames`, and for the actor that this agent collides
+    with. In a partial download its moment, agent and camera are the ones with most files of the
+    channels, now and `latency` seconds before; of several the nearest to the default moment.
+
+    Args:
+        dataset: The release.
+        table: The table.
+        tokens: Tokens of rows of this table or of scenarios. Without tokens the first accident is
+            drawn, or the first scenario if there is no accident and the verb does not draw a full
+            scenario.
+        frames: Numbers of frames; None for one second before the end.
+        channels: Channels that the verb shows.
+        latency: Age of the oldest data that the verb shows, in seconds.
+
+    Raises:
+        DeepAccidentError: no such row, scenario or frame.
+        UsageError: frames do not apply to the table or the tokens.
     """
     if frames is not None and table in ("scenario", "instance"):
         raise click.UsageError(
             f"--frame-range is for moments; a whole {table} is rendered, leave it out"
         )
     rows: list[str] = []
-    first = (
-        first_accident if table == "scenario" else default_scenario
-    )  # a whole scenario is counted down
-    for token in tokens or [first(dataset)]:
+    if not tokens:
+        # a full scenario is drawn as a countdown to its accident
+        find_default = first_accident if table == "scenario" else default_scenario
+        tokens = [find_default(dataset)]
+    for token in tokens:
         if token.count("/") == 1:
-            rows += _of_scenario(
-                dataset, table, token, frames, _files(dataset, token, channels, latency)
-            )
+            files = _file_counts(dataset, token, channels, latency)
+            rows += _rows_of_scenario(dataset, table, token, frames, files)
         elif frames is not None:
             raise click.UsageError(
                 f"--frame-range is for scenarios; {token} is a {table}, name its scenario instead"
@@ -64,9 +77,10 @@ def rows_to_draw(
     return rows
 
 
-def _of_scenario(
+def _rows_of_scenario(
     dataset: Dataset, table: str, token: str, frames: range | None, files: IntArray
 ) -> list[str]:
+    """Return the tokens of a scenario's rows; files are counts of (agents, channels, frames)."""
     record = dataset.get("scenario", token)
     if table == "scenario":
         return [token]
@@ -77,69 +91,77 @@ def _of_scenario(
             f"--frame-range: expected frames from 1 to {record['num_frames']}, found {frames[-1]}"
         )
     if frames is None:
-        usual = max(1, record["num_frames"] - round(_SECONDS_BEFORE / FRAME_PERIOD))
-        of_agents = files.sum(axis=1)
-        counts = of_agents.sum(axis=0) if table == "frame" else of_agents.max(axis=0)
-        most = np.flatnonzero(counts == counts.max()) + 1
-        nearest = int(most[np.abs(most - usual).argmin()])
+        default = max(1, record["num_frames"] - round(_TIME_BEFORE_END_S / FRAME_PERIOD))
+        agent_counts = files.sum(axis=1)
+        counts = agent_counts.sum(axis=0) if table == "frame" else agent_counts.max(axis=0)
+        best_frames = np.flatnonzero(counts == counts.max()) + 1
+        nearest = int(best_frames[np.abs(best_frames - default).argmin()])
         frames = range(nearest, nearest + 1)
     if table == "frame":
         return [frame_token(token, number) for number in frames]
-    of_frames = files[..., frames.start - 1 : frames.stop - 1].sum(axis=2)
-    agent = int(of_frames.sum(axis=1).argmax())
-    samples = [sample_token(token, agents_of(dataset, token)[agent], number) for number in frames]
+    channel_counts = files[..., frames.start - 1 : frames.stop - 1].sum(axis=2)
+    agent = int(channel_counts.sum(axis=1).argmax())
+    agent_name = agents_of(dataset, token)[agent]
+    samples = [sample_token(token, agent_name, number) for number in frames]
     if table == "sample_data":
-        camera = CAMERAS[of_frames[agent, : len(CAMERAS)].argmax()]
+        camera = CAMERAS[channel_counts[agent, : len(CAMERAS)].argmax()]
         return [f"{sample}/{camera}" for sample in samples]
-    return (
-        [_annotation(dataset, sample) for sample in samples] if table == "annotation" else samples
-    )
+    if table == "annotation":
+        return [_annotation(dataset, sample) for sample in samples]
+    return samples
 
 
-def _files(dataset: Dataset, scenario: str, channels: Sequence[str], latency: float) -> IntArray:
-    """How many files are here, (agents of the scenario, channels, frames), of each moment and of `latency` before."""
-    agents, late = agents_of(dataset, scenario), round(latency / FRAME_PERIOD)
-    files = np.zeros(
-        (len(agents), len(channels), dataset.get("scenario", scenario)["num_frames"]),
-        dtype=np.int64,
-    )
+def _file_counts(
+    dataset: Dataset, scenario: str, channels: Sequence[str], latency: float
+) -> IntArray:
+    """Return the number of existing files at each moment and `latency` before.
+
+    Its shape is (agents of the scenario, channels, frames).
+    """
+    agents, delay = agents_of(dataset, scenario), round(latency / FRAME_PERIOD)
+    frame_count = dataset.get("scenario", scenario)["num_frames"]
+    files = np.zeros((len(agents), len(channels), frame_count), dtype=np.int64)
     for (agent, channel), frames in dataset.sensor_frames(scenario).items():
         if channel in channels:
             files[agents.index(agent), channels.index(channel), np.array(frames, dtype=int) - 1] = 1
-    files[..., late:] += files[..., : max(0, files.shape[2] - late)].copy()
+    files[..., delay:] += files[..., : max(0, files.shape[2] - delay)].copy()
     return files
 
 
 def _instance(dataset: Dataset, scenario: str) -> str:
-    """The actor that the first agent collides with; without a collision, the scenario's first actor."""
+    """Return the actor that the first agent collides with; without a collision the first actor."""
     record = dataset.get("scenario", scenario)
     pair = () if record["collision"] is None else record["collision"]["ids"]
-    first = dataset.agent.get(f"{scenario}/{agents_of(dataset, scenario)[0]}")["actor_id"]
-    labelled = dataset.field2token("instance", "scenario_token", scenario)
-    others = (instance_token(scenario, actor) for actor in pair if actor != first)
-    return next((other for other in others if other in labelled), labelled[0])
+    own_actor = dataset.agent.get(f"{scenario}/{agents_of(dataset, scenario)[0]}")["actor_id"]
+    labelled: list[str] = dataset.field2token("instance", "scenario_token", scenario)
+    for actor in pair:
+        instance = instance_token(scenario, actor)
+        if actor != own_actor and instance in labelled:
+            return instance
+    return labelled[0]
 
 
 def _annotation(dataset: Dataset, sample: str) -> str:
-    """The box of a colliding actor that is not the sample's agent, or of those in an image, that with most points."""
+    """Return a box of another actor than the sample's agent.
+
+    Colliding actors come first, then boxes in an image, then boxes with most points.
+    """
     boxes = dataset.boxes(sample)
     boxes = boxes.select(boxes.actor_id != OWN_ACTOR_ID)
     if not len(boxes):
         raise NotAvailableError(f"{sample}: has no boxes of other actors; name an annotation")
     collides = np.isin(boxes.actor_id, list(collider_ids(dataset, sample)))
-    in_image = as_floats(
-        [
-            best_view(dataset, [sample], boxes.select(boxes.row == row)) is not None
-            for row in boxes.row
-        ]
-    )
-    return annotation_token(
-        sample, int(boxes.row[np.lexsort((boxes.num_lidar_pts, in_image, collides))[-1]])
-    )
+    views = [best_view(dataset, [sample], boxes.select(boxes.row == row)) for row in boxes.row]
+    in_image = as_floats([view is not None for view in views])
+    best = np.lexsort((boxes.num_lidar_pts, in_image, collides))[-1]
+    return annotation_token(sample, int(boxes.row[best]))
 
 
 def picture_paths(out: Path, view: str, rows: Sequence[str]) -> list[Path]:
-    """Where the pictures of rows go: a single one into the file `out`, several into the folder; or click.UsageError."""
+    """Return the paths of the pictures of rows: the file `out` for one, files in it for several.
+
+    Raises click.UsageError.
+    """
     if out.suffix.lower() not in PICTURE_SUFFIXES:
         if out.suffix and not out.is_dir():
             kinds = ", ".join(PICTURE_SUFFIXES)

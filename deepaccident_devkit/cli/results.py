@@ -1,4 +1,4 @@
-"""`deepaccident results`: results files, made of those of other tools."""
+"""`deepaccident results`: results files, made from the output of other tools."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
     type=click.FloatRange(0, 1),
     default=0.5,
     show_default=True,
-    help="With --truth: probability from which a second is an alarm; 0 keeps all alarms, for curves.",
+    help="With --truth: probability from which a second is an alarm; 0 keeps all alarms, for "
+    "curves.",
 )
 @click.option(
     "--method",
@@ -37,13 +38,13 @@ def results(
 ) -> None:
     """Make a results file of what a model of another framework predicts.
 
-    With DATAROOT, FILE has detections of a nuScenes export of that release: the JSON of a detector, as the nuScenes
-    devkit reads it. Boxes of classes that DeepAccident does not have are left out. `deepaccident evaluate detection
-    --samples all` evaluates what this writes.
+    With DATAROOT, FILE has detections of a nuScenes export of that release: the JSON of a detector,
+    as the nuScenes devkit reads it. Boxes of classes that DeepAccident does not have are left out.
+    `deepaccident evaluate detection --samples all` evaluates what this writes.
 
-    With --truth, FILE has answers to the questions of `deepaccident export questions`, one a line, as README.md beside
-    the questions says. A question without an answer raises no alarm. `deepaccident evaluate accident` and
-    `deepaccident evaluate warning` take what this writes.
+    With --truth, FILE has answers to the questions of `deepaccident export questions`, one a line,
+    as README.md beside the questions describes. A question without an answer raises no alarm.
+    `deepaccident evaluate accident` and `deepaccident evaluate warning` take what this writes.
     """
     if (truth is None) == (release["dataroot"] is None):
         raise click.UsageError(
@@ -51,32 +52,34 @@ def results(
         )
     if truth is None:
         refuse_unused("without --truth", "threshold", "method")
-        _of_detections(file, out, release)
+        _convert_detections(file, out, release)
     else:
         refuse_unused("with --truth", "version", "index_dir", "on_error", "workers", "scheduler")
-        _of_answers(file, truth, out, threshold, {} if method is None else {"method": method})
+        _convert_answers(file, truth, out, threshold, {} if method is None else {"method": method})
 
 
-def _of_detections(file: Path, out: Path, release: dict[str, Any]) -> None:
+def _convert_detections(file: Path, out: Path, release: dict[str, Any]) -> None:
     from deepaccident_devkit.deepaccident import DeepAccident
     from deepaccident_devkit.evaluation.results import ResultsWriter
     from deepaccident_devkit.export.nuscenes.detections import results_from_nuscenes
 
-    ResultsWriter(out, "detection")  # refuses a path that is taken, before the release is indexed
-    found = results_from_nuscenes(DeepAccident(**release), file)
-    with ResultsWriter(out, "detection", meta=found.meta) as writer:
-        for token, boxes in found.boxes.items():
+    ResultsWriter(out, "detection")  # raises if the path exists, before the release is indexed
+    detections = results_from_nuscenes(DeepAccident(**release), file)
+    with ResultsWriter(out, "detection", meta=detections.meta) as writer:
+        for token, boxes in detections.boxes.items():
             writer.add(token, boxes)
-    click.echo(
-        f"{out}: {sum(map(len, found.boxes.values())):,} boxes of {counted(len(found.boxes), 'sample')}"
-    )
-    for name, count in found.left_out.items():
+    box_count = sum(map(len, detections.boxes.values()))
+    samples = counted(len(detections.boxes), "sample")
+    click.echo(f"{out}: {box_count:,} boxes of {samples}")
+    for name, count in detections.left_out.items():
         click.echo(
             f"left out: {count:,} boxes of the class {name}, which DeepAccident does not have"
         )
 
 
-def _of_answers(file: Path, truth: Path, out: Path, threshold: float, meta: dict[str, str]) -> None:
+def _convert_answers(
+    file: Path, truth: Path, out: Path, threshold: float, meta: dict[str, str]
+) -> None:
     from deepaccident_devkit.export.questions import results_of_answers
 
     read = results_of_answers(file, truth, out, threshold=threshold, meta=meta)

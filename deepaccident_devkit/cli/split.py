@@ -30,8 +30,8 @@ from deepaccident_devkit.selection.splits import (
 @click.option(
     "--out",
     type=PATH,
-    help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into; or a file that ends in "
-    ".txt: a split file of the scenarios that match --where, or of all.",
+    help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into; or "
+    "a file that ends in .txt: a split file of the scenarios that match --where, or of all.",
 )
 @where_parameter
 @click.option("--overwrite", is_flag=True, help="Replace files that already exist.")
@@ -44,7 +44,7 @@ def split(
     as_json: bool,
     **release: Any,
 ) -> None:
-    """Split the release in DATAROOT by the official procedure, and print how the scenarios are distributed.
+    """Split the release in DATAROOT by the official procedure, and print how scenarios are spread.
 
     With --where, report only the scenarios that match all filters.
     """
@@ -59,13 +59,13 @@ def split(
         refuse_unused("without --out", "overwrite")
     dataset = DeepAccident(**release)
     if where or save:
-        chosen = [scenario["token"] for scenario in dataset.find(*where)]
-        written = [save_selection(chosen, save, overwrite=overwrite)] if save else []
-        report = split_report(dataset, {"selection": chosen})
+        tokens = [scenario["token"] for scenario in dataset.find(*where)]
+        written = [save_selection(tokens, save, overwrite=overwrite)] if save else []
+        report = split_report(dataset, {"selection": tokens})
     else:
-        made = official_split(dataset, seed)
-        written = made.save(out, overwrite=overwrite) if out else []
-        report = split_report(dataset, made)
+        splits = official_split(dataset, seed)
+        written = splits.save(out, overwrite=overwrite) if out else []
+        report = split_report(dataset, splits)
     click.echo(report.to_json() if as_json else report.to_text())
     for path in written:
         click.echo(f"written: {path}", err=as_json)

@@ -29,28 +29,30 @@ from deepaccident_devkit.support.text import counted
 def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -> None:
     """Write a file FOLDER/TOWN.geojson for each town of the release in DATAROOT.
 
-    The maps are made from what the BEV cameras of all recordings saw. Coordinates are metres of the simulator's world,
-    right-handed: no longitude and latitude.
+    The maps are made from what the BEV cameras of all recordings saw. Coordinates are metres of the
+    simulator's world, right-handed: no longitude and latitude.
     """
     folder, dataset = writable_folder(out), DeepAccident(**release)
-    chosen = dataset.find(*where) if where else None
-    if chosen == []:
+    scenarios = dataset.find(*where) if where else None
+    if scenarios == []:
         raise click.UsageError(
             "no scenario matches --where, so there is no map; change it or omit it"
         )
     written: dict[str, dict[str, Any]] = {}
-    for town in towns_of(dataset, chosen):
+    for town in towns_of(dataset, scenarios):
         try:
-            made = town_map(dataset, town, scenarios=chosen, progress=True, **engine_of(release))
+            town_plan = town_map(
+                dataset, town, scenarios=scenarios, progress=True, **engine_of(release)
+            )
         except NotAvailableError as error:
             click.echo(f"left out: {error}", err=True)
             continue
-        path = made.to_geojson(folder / f"{made.town}.geojson")
+        path = town_plan.to_geojson(folder / f"{town_plan.town}.geojson")
         counts = {
-            name: getattr(made, name) for name in ("scenarios", "looks", "missing", "damaged")
+            name: getattr(town_plan, name) for name in ("scenarios", "looks", "missing", "damaged")
         }
-        area = round(float(made.drivable().sum()) * made.resolution**2, 1)
-        written[made.town] = {"path": str(path), **counts, "drivable_square_metres": area}
+        area = round(float(town_plan.drivable().sum()) * town_plan.resolution**2, 1)
+        written[town_plan.town] = {"path": str(path), **counts, "drivable_square_metres": area}
     if not written:
         raise NotAvailableError("no town has a map: there is no readable file of a BEV camera")
     click.echo(
@@ -58,8 +60,9 @@ def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -
     )
 
 
-def _town_line(told: dict[str, Any]) -> str:
+def _town_line(facts: dict[str, Any]) -> str:
     return (
-        f"{told['path']}: {told['drivable_square_metres']:,.0f} m² of road, from {told['looks']:,} pictures of "
-        f"{counted(told['scenarios'], 'scenario')} ({told['missing']:,} missing, {told['damaged']:,} damaged)"
+        f"{facts['path']}: {facts['drivable_square_metres']:,.0f} m² of road, from "
+        f"{facts['looks']:,} pictures of {counted(facts['scenarios'], 'scenario')} "
+        f"({facts['missing']:,} missing, {facts['damaged']:,} damaged)"
     )

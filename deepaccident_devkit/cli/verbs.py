@@ -1,4 +1,4 @@
-"""What verbs are made of: groups that import the verb that runs alone, a heading "Advanced", options of fields."""
+"""Building blocks of verbs: lazily loaded groups, advanced options, options of fields."""
 
 import inspect
 import re
@@ -22,7 +22,7 @@ else:
 
 
 class LazyVerbs(click.Group):
-    """Verbs that are made when they are asked for, so that only what the verb that runs needs is imported.
+    """A group that loads its verbs on demand: only the imports of the running verb are needed.
 
     The list of verbs imports none of them.
     """
@@ -34,20 +34,20 @@ class LazyVerbs(click.Group):
         read_plugin: Callable[[Plugin], Mapping[str, LazyVerb]],
         **options: Any,
     ) -> None:
-        """Take what `click.Group` takes.
+        """Create the group.
 
         Args:
-            *arguments: Of `click.Group`.
+            *arguments: Arguments of `click.Group`.
             verbs: The group's own verbs by name.
-            read_plugin: Gives the verbs that a plug-in adds to the group.
-            **options: Of `click.Group`.
+            read_plugin: Returns the verbs that a plug-in adds to the group.
+            **options: Options of `click.Group`.
         """
         super().__init__(*arguments, **options)
         self._verbs = verbs
         self._read_plugin = read_plugin
 
     def _offers(self, *, own: bool = False) -> Offers[LazyVerb]:
-        """Return what plug-ins add; the devkit's own ones only with `own`, which reads no entry points."""
+        """Return the verbs of plug-ins; with `own` only the devkit's, without entry points."""
         return offers(self._read_plugin, self._verbs, own=own)
 
     def _all_verbs(self) -> dict[str, LazyVerb]:
@@ -62,11 +62,11 @@ class LazyVerbs(click.Group):
         for verbs in (self._verbs, self._offers(own=True).by_name):
             if cmd_name in verbs:
                 return verbs[cmd_name].load()
-        found = self._offers().by_name.get(cmd_name)
-        if found is None:
+        plugin_verb = self._offers().by_name.get(cmd_name)
+        if plugin_verb is None:
             return None
         try:
-            return found.load()
+            return plugin_verb.load()
         except Exception as error:
             raise MissingPluginError(
                 f"{cmd_name}: its plug-in fails with {type(error).__name__}: {error}"
@@ -78,7 +78,8 @@ class LazyVerbs(click.Group):
             formatter.write_dl(
                 [(name, verb.summary) for name, verb in sorted(self._all_verbs().items())]
             )
-        if refusals := self._offers().refusals_text():
+        refusals = self._offers().refusals_text()
+        if refusals:
             formatter.write_paragraph()
             formatter.write_text(refusals)
 
@@ -87,75 +88,83 @@ class LazyVerbs(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the verb that the first word names.
 
-        The error for an unknown word names the verb that was probably meant, and the plug-ins that were left out.
+        The error for an unknown word suggests the most similar verb, and names the plug-ins that
+        were left out.
         """
-        command = self.get_command(ctx, args[0])
+        name = args[0]
+        command = self.get_command(ctx, name)
         if command is not None:
-            return args[0], command, args[1:]
-        if not ctx.resilient_parsing and args[0][:1].isalnum():
-            meant = get_close_matches(args[0], self._all_verbs(), n=1)
-            hint = f" Did you mean '{meant[0]}'?" if meant else ""
+            return name, command, args[1:]
+        if not ctx.resilient_parsing and name[:1].isalnum():
+            message = f"No such command '{name}'."
+            for similar_name in get_close_matches(name, self._all_verbs(), n=1):
+                message += f" Did you mean '{similar_name}'?"
             refusals = self._offers().refusals_text()
-            ctx.fail(f"No such command '{args[0]}'.{hint}" + (f"\n{refusals}" if refusals else ""))
+            if refusals:
+                message += f"\n{refusals}"
+            ctx.fail(message)
         return super().resolve_command(ctx, args)
 
 
 class Advanced(click.Option):
-    """An option that few need: the help names it last."""
+    """An option that few users need; the help lists it last."""
 
 
 class Verb(click.Command):
-    """A command whose help has advanced options under a heading of their own."""
+    """A command with a help that lists advanced options under a separate heading."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, and then the advanced ones."""
-        options = [each for each in self.get_params(ctx) if isinstance(each, click.Option)]
-        for heading, kind in (("Options", False), ("Advanced", True)):
-            records = (
-                each.get_help_record(ctx) for each in options if isinstance(each, Advanced) is kind
-            )
-            if rows := [record for record in records if record is not None]:
+        for heading in ("Options", "Advanced"):
+            records = []
+            for option in self.get_params(ctx):
+                is_advanced = isinstance(option, Advanced)
+                if isinstance(option, click.Option) and is_advanced == (heading == "Advanced"):
+                    record = option.get_help_record(ctx)
+                    if record is not None:
+                        records.append(record)
+            if records:
                 with formatter.section(heading):
-                    formatter.write_dl(rows)
+                    formatter.write_dl(records)
 
 
 def verb(name: str | None = None, **options: Any) -> Callable[[Callable[..., Any]], Verb]:
-    """A decorator that makes a verb of a function; takes what `click.command` takes."""
+    """Return a decorator that makes a verb of a function; it takes arguments of `click.command`."""
     return click.command(name, cls=Verb, **options)
 
 
 advanced = partial(click.option, cls=Advanced)
-"""As `click.option`."""
+"""Like `click.option`."""
 
 
 def together(*parameters: Callable[[Any], Any]) -> Callable[[Function], Function]:
-    """A decorator that gives a verb all of these parameters, in this order."""
+    """Return a decorator that adds all these parameters to a verb, in this order."""
 
-    def give(function: Function) -> Function:
+    def add(function: Function) -> Function:
         for parameter in reversed(parameters):
             function = parameter(function)
         return function
 
-    return give
+    return add
 
 
 class WordChoice(_Choice):
-    """One of some words in any case of letters; the error of another one names the word that was probably meant."""
+    """One of several words, in upper or lower case; errors suggest a similar word."""
 
     def __init__(
         self, words: Iterable[str], elsewhere: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Take the words, and what to say of words that mean something in another place."""
+        """Store the words, and hints for words that are valid elsewhere."""
         super().__init__(tuple(words), case_sensitive=False)
         self.elsewhere = elsewhere
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The word in its own spelling."""
+        """Return the word in its own spelling."""
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:
-            meant = self.elsewhere.get(value) or meant_text(value, self.choices)
-            self.fail(f"{error.message.removesuffix('.')}{meant}", param, ctx)
+            hint = self.elsewhere.get(value) or meant_text(value, self.choices)
+            self.fail(f"{error.message.removesuffix('.')}{hint}", param, ctx)
 
 
 def field_option(
@@ -165,36 +174,46 @@ def field_option(
     option: Callable[..., Any] = click.option,
     **changes: Any,
 ) -> Callable[[Function], Function]:
-    """An option for a field of a dataclass, so that nothing is said twice.
+    """Return an option for a field of a dataclass, with the field's name, type and default.
 
-    Its name, type and default are the field's, its help is the first sentence of what the class says of the field.
-    `names` are of the option if other ones, `changes` what is other than the field, as `click.option` takes it.
+    Its help is the first sentence of the field's documentation.
+
+    Args:
+        config: The dataclass.
+        field: Name of the field.
+        *names: Names of the option, if they differ from the field's.
+        option: Function that makes the option.
+        **changes: Arguments of `click.option` that differ from the field.
     """
     default = changes.get("default", config.__dataclass_fields__[field].default)
     hint = get_type_hints(config)[field]
-    hints = [each for each in get_args(hint) or (hint,) if each is not NoneType]
-    words = (
-        hint
-        if get_origin(hint) is Literal
-        else next((each for each in hints if get_origin(each) is Literal), None)
-    )
     name = field.replace("_", "-")
-    settings: dict[str, Any] = {"default": default, "help": field_text(config, field)}
-    if words is not None:
-        settings["type"] = WordChoice(get_args(words))
+    settings: dict[str, Any] = {
+        "default": default,
+        "help": field_text(config, field),
+        "show_default": default is not None and default is not False,
+    }
+    hints = [part for part in get_args(hint) or (hint,) if part is not NoneType]
+    literals = [part for part in (hint, *hints) if get_origin(part) is Literal]
+    if literals:
+        settings["type"] = WordChoice(get_args(literals[0]))
     elif hint is bool:
         settings["is_flag"] = True
     else:
         settings["type"] = hints[0]
-    settings["show_default"] = default is not None and default is not False
-    usual = (f"--{name}/--no-{name}" if default is True else f"--{name}", field)
-    made: Callable[[Function], Function] = option(*(names or usual), **{**settings, **changes})
-    return made
+    flag = f"--{name}/--no-{name}" if default is True else f"--{name}"
+    decorator: Callable[[Function], Function] = option(
+        *(names or (flag, field)), **{**settings, **changes}
+    )
+    return decorator
 
 
 def field_text(config: type[Any], field: str) -> str:
-    """The first sentence of what a class says of one of its attributes."""
+    """Return the first sentence of a class's documentation of one of its attributes."""
     pattern = rf"^    {field}: (.+?)(?=\n    \w|\n\n|\Z)"
-    found = re.search(pattern, inspect.getdoc(config) or "", re.DOTALL | re.MULTILINE)
-    sentence = re.split(r"(?<=\.)\s+(?=[A-Z`])", " ".join(found[1].split()))[0] if found else ""
+    match = re.search(pattern, inspect.getdoc(config) or "", re.DOTALL | re.MULTILINE)
+    if match is None:
+        return ""
+    text = " ".join(match[1].split())
+    sentence: str = re.split(r"(?<=\.)\s+(?=[A-Z`])", text)[0]
     return sentence[:1].upper() + sentence[1:]

@@ -1,4 +1,4 @@
-"""What a format is: settings, units of scenarios, what each of them writes into an export's folder; and shards."""
+"""Base of export formats: settings, units of scenarios, output of a unit; shards and README."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from deepaccident_devkit.tables.tables import split_choice
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
 
 LinkKind = Literal["hard", "symbolic", "copy"]
-# What a file system answers that cannot make a link; a full disk is another matter.
+# Errors of a file system that cannot make a link; a full disk is another matter.
 _NO_LINKS: Final = (
     errno.EXDEV,
     errno.EPERM,
@@ -37,9 +37,10 @@ _NO_LINKS: Final = (
     errno.ENOTSUP,
     errno.ENOSYS,
 )
-_DIGEST: Final = re.compile(r"-[0-9a-f]{16}\Z")
-# Of a name made from a token; the devkit's and the formats' endings come to it, and systems allow 255.
-_MOST_CHARACTERS: Final = 150
+_DIGEST_SUFFIX: Final = re.compile(r"-[0-9a-f]{16}\Z")
+# In characters, of a name made from a token; endings of the devkit and of formats are appended, and
+# systems allow 255.
+_MAX_NAME_LENGTH: Final = 150
 README: Final = "README.md"
 SPLIT_NAMES: Final[Mapping[str | None, str]] = {
     "train": "train",
@@ -47,22 +48,27 @@ SPLIT_NAMES: Final[Mapping[str | None, str]] = {
     "test": "test",
     None: "unknown",
 }
-"""A scenario's split → what files are called by it; `datasets` expects these words."""
-_TEXT: Final = """\
+"""A scenario's split → its word in names of files; `datasets` expects these words."""
+_README_TEMPLATE: Final = """\
 ---
 {head}---
 
 # {title}
 
-Made by `deepaccident export {name}` of the DeepAccident devkit {devkit} from version {version} of DeepAccident
+Made by `deepaccident export {name}` of the DeepAccident devkit {devkit} from version {version} of \
+DeepAccident
 (https://deepaccident.github.io/). {selection}
 
-Please cite the paper: Wang et al., DeepAccident: A Motion and Accident Prediction Benchmark for V2X Autonomous Driving,
-AAAI 2024, https://arxiv.org/abs/2304.01168. The data are those of its authors, and their terms hold. The licence of the
+Please cite the paper: Wang et al., DeepAccident: A Motion and Accident Prediction Benchmark for \
+V2X Autonomous Driving,
+AAAI 2024, https://arxiv.org/abs/2304.01168. The data are those of its authors, and their terms \
+hold. The licence of the
 devkit, Apache-2.0, is that of its code alone.
 
-Everything is right-handed: x forward, y left, z up, yaw counter-clockwise; metres, seconds, radians. Quaternions are
-w, x, y, z. Cameras have optical axes: x right, y down, z forward. Frames are numbered from 1 and 0.1 s apart. The
+Everything is right-handed: x forward, y left, z up, yaw counter-clockwise; metres, seconds, \
+radians. Quaternions are
+w, x, y, z. Cameras have optical axes: x right, y down, z forward. Frames are numbered from 1 and \
+0.1 s apart. The
 impact of an accident is the last frame of its scenario.
 
 {body}"""
@@ -73,11 +79,12 @@ class Tally:
     """Counts of what was written.
 
     Attributes:
-        samples: agents at moments.
-        files: written, not linked or copied.
-        bytes: in them.
-        linked: way → files of the release that were linked or copied.
-        left_out: what → how much of it the format cannot hold, or is not in this (partial) release.
+        samples: Number of agents at moments.
+        files: Number of files written, not linked or copied.
+        bytes: Their size.
+        linked: Kind of link → number of files of the release that were linked or copied.
+        left_out: Kind of data → how much of it the format cannot hold, or is missing in this
+            (partial) release.
     """
 
     samples: int = 0
@@ -87,21 +94,23 @@ class Tally:
     left_out: dict[str, int] = field(default_factory=dict)
 
     def add(self, other: Tally) -> None:
-        """Count what another one counts."""
+        """Add the counts of another tally."""
         self.samples += other.samples
         self.files += other.files
         self.bytes += other.bytes
-        self.linked = dict(sorted((Counter(self.linked) + Counter(other.linked)).items()))
-        self.left_out = dict(sorted((Counter(self.left_out) + Counter(other.left_out)).items()))
+        linked = Counter(self.linked) + Counter(other.linked)
+        self.linked = dict(sorted(linked.items()))
+        left_out = Counter(self.left_out) + Counter(other.left_out)
+        self.left_out = dict(sorted(left_out.items()))
 
 
 class Output:
     """The folder that a unit is written into. Each file is complete or absent, and counted.
 
     Attributes:
-        folder: where paths begin.
-        parts: a folder of the unit's own for what `finish` puts together.
-        tally: the counts so far; the format counts samples itself.
+        folder: Folder that paths are relative to.
+        parts: Folder of the unit's own files for `finish`.
+        tally: The counts so far; the format counts samples itself.
     """
 
     def __init__(
@@ -112,11 +121,17 @@ class Output:
         tally: Tally | None = None,
         note: Callable[[str], object] = lambda _: None,
     ) -> None:
-        """Write below `folder`, and link the release's files in this way or, where that cannot be, in the next one.
+        """Prepare to write below `folder`.
 
-        `note` is called with each path before something is written there.
+        Args:
+            folder: Folder that paths are relative to.
+            parts: Folder of the unit's own files.
+            link: Kind of links to the release's files; if it is impossible, the next kind is used.
+            tally: Counts to add to; None for new ones.
+            note: Function that is called with each path before something is written there.
         """
-        self.folder, self.parts, self.tally = folder, parts, Tally() if tally is None else tally
+        self.folder, self.parts = folder, parts
+        self.tally = Tally() if tally is None else tally
         self._link, self._note = link, note
 
     def __repr__(self) -> str:
@@ -138,77 +153,82 @@ class Output:
 
     @contextmanager
     def whole_folder(self, path: str) -> Iterator[Output]:
-        """Yield the output of a folder whose files all appear at once, in the place of an older one."""
+        """Yield the output of a folder; its files appear at once, and replace an older folder."""
         target = self._place(path)
         remove_in(self.folder, path)
         with replacing_folder(target) as temporary:
             yield Output(temporary, self.parts, self._link, self.tally)
 
     def link(self, source: ReleasePath, path: str, *, symbolic: bool = True) -> None:
-        """Link a file of the release: hard, else symbolic, else copied, as one out of an archive is.
+        """Link a file of the release: tries a hard link, then a symbolic link, then a copy.
+
+        A file in an archive is always copied.
 
         Args:
-            source: the file.
-            path: relative to the folder.
-            symbolic: whether it may be a symbolic link, which shows the path of the file in the release.
+            source: The file.
+            path: Path relative to the folder.
+            symbolic: Whether a symbolic link is allowed, which shows the path of the file in the
+                release.
 
         Raises:
             SensorFileError: it cannot be read.
         """
         try:
             if isinstance(source, StorePath):
-                content, real = read_bytes(source, "image"), None
+                content, file = read_bytes(source, "image"), None
             else:
-                content, real = b"", Path(os.path.realpath(source))
-                open_file(real).close()
+                content, file = b"", Path(os.path.realpath(source))
+                open_file(file).close()
         except OSError as error:
             raise SensorFileError(
                 f"{source}: {fault_text(error)}; restore it from its archive"
             ) from error
         with replacing(self._place(path)) as temporary:
-            if real is None:
+            if file is None:
                 temporary.write_bytes(content)
-            way = (
-                "copy" if real is None else _linked(real, temporary, self._link, symbolic=symbolic)
-            )
-        self.tally.linked[way] = self.tally.linked.get(way, 0) + 1
+                link = "copy"
+            else:
+                link = _link_file(file, temporary, self._link, symbolic=symbolic)
+        self.tally.linked[link] = self.tally.linked.get(link, 0) + 1
 
-    def leave_out(self, what: str, count: int = 1) -> None:
-        """Count what is not written; `what` is a plural in plain words, such as `untracked boxes`."""
+    def leave_out(self, kind: str, count: int = 1) -> None:
+        """Count data that is not written; `kind` is a plain plural, such as `untracked boxes`."""
         if count:
-            self.tally.left_out[what] = self.tally.left_out.get(what, 0) + count
+            self.tally.left_out[kind] = self.tally.left_out.get(kind, 0) + count
 
     def _place(self, path: str) -> Path:
         self._note(path)
         return place_in(self.folder, path)
 
 
-def _linked(source: Path, target: Path, link: LinkKind, *, symbolic: bool) -> str:
-    """Make `target` show `source`, and say how."""
-    ways: dict[str, Callable[[], object]] = {
+def _link_file(source: Path, target: Path, link: LinkKind, *, symbolic: bool) -> str:
+    """Link `target` to `source` by the first possible kind, from `link` on, and return the kind."""
+    functions: dict[str, Callable[[], object]] = {
         "hard": lambda: os.link(source, target),
         "symbolic": lambda: target.symlink_to(source),
         "copy": lambda: shutil.copyfile(source, target),
     }
-    for way in get_args(LinkKind)[get_args(LinkKind).index(link) :]:
-        if symbolic or way != "symbolic":
-            try:
-                ways[way]()
-            except OSError as error:
-                if way == "copy" or error.errno not in _NO_LINKS:
-                    raise
-            else:
-                break
-    return str(way)
+    kinds = get_args(LinkKind)
+    for kind in kinds[kinds.index(link) :]:
+        if kind == "symbolic" and not symbolic:
+            continue
+        try:
+            functions[kind]()
+        except OSError as error:
+            if kind == "copy" or error.errno not in _NO_LINKS:
+                raise
+        else:
+            break
+    return str(kind)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unit:
-    """What one worker writes at once. No two units write the same file.
+    """Scenarios that one worker writes at once. No two units write the same file.
 
     Attributes:
-        name: of its folder of parts: letters, digits, `_`, `-` and dots, no dot first; unique.
-        scenarios: tokens, in order.
+        name: Name of its folder of parts: letters, digits, `_`, `-` and dots, no dot first; unique.
+        scenarios: Tokens, in order.
     """
 
     name: str
@@ -220,14 +240,14 @@ class Format(ABC):
     """A format with its settings; cheap to pickle. Each format adds settings of its own.
 
     Attributes:
-        split: only scenarios of this split, or of a split file of your own; None for all.
-        where: only scenarios that match all of these filters (`deepaccident_devkit.selection`).
-        agents: only what these recorded.
-        link: how files of the release are put there where the format takes them as they are: `hard` links, else
-            `symbolic` ones, else copies.
+        split: Only scenarios of this split, or of your own split file; None for all.
+        where: Only scenarios that match all of these filters (`deepaccident_devkit.selection`).
+        agents: Only recordings of these agents.
+        link: How files of the release are included where the format takes them unchanged: `hard`
+            links, otherwise `symbolic` ones, otherwise copies.
 
     Raises:
-        ChoiceError: no such split, agent or way; or a filter is no text of that form.
+        ChoiceError: no such split, agent or kind of link; or a filter is not a valid text.
     """
 
     split: str | os.PathLike[str] | None = None
@@ -236,102 +256,122 @@ class Format(ABC):
     link: LinkKind = "hard"
 
     name: ClassVar[str]
-    """One word, as on the command line."""
+    """Name on the command line, a single word."""
     unit_word: ClassVar[str] = "scenario"
-    """What a unit is, for people."""
+    """Name of a unit in texts."""
     channels: ClassVar[tuple[str, ...]] = CHANNELS
-    """Sensors whose files decide what is written; tables and infos name files, there or not."""
+    """Sensors with files that decide what is written; tables and infos also name missing files."""
     nothing: ClassVar[str] = (
         "no chosen agent recorded one of these scenarios; choose other agents or scenarios"
     )
     """Why there may be no sample to write, and the remedy."""
     beside: ClassVar[tuple[str, ...]] = ()
-    """Formats whose exports may lie in the same folder already."""
+    """Formats that may already have exports in the same folder."""
 
     def __post_init__(self) -> None:
-        """Check the choices, give them their usual spelling, and put the agents in their usual order."""
+        """Check the choices, and give them their usual spelling and order."""
         settle_choices(self, {"link": get_args(LinkKind)})
         if isinstance(self.split, str) and not self.split.endswith(".txt"):
             object.__setattr__(self, "split", split_choice(self.split))
         object.__setattr__(self, "where", tuple(members_of("where", self.where, "filters")))
         for text in self.where:
             parse_where(text)
-        object.__setattr__(self, "agents", some_of("agents", self.agents, AGENTS))
+        object.__setattr__(self, "agents", checked_names("agents", self.agents, AGENTS))
 
     def settings(self) -> dict[str, Any]:
-        """Everything that decides what is written, but the release; for JSON. Links show the same as copies."""
-        found = asdict(self)
-        del found["link"]
-        return {**found, "split": None if self.split is None else os.fspath(self.split)}
+        """Return all settings that decide what is written, for JSON.
+
+        The release is not among them. Links are not either, since they have the content of copies.
+        """
+        values = asdict(self)
+        del values["link"]
+        return {**values, "split": None if self.split is None else os.fspath(self.split)}
 
     def sensors(self) -> tuple[tuple[str, str], ...]:
-        """Agents and channels of the sensor files that decide what is written."""
+        """Return agents and channels of the sensor files that decide what is written."""
         return tuple(product(self.agents, self.channels))
 
-    def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:  # noqa: ARG002 - for those that ask it
-        """The chosen scenarios as units: one each."""
+    def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:  # noqa: ARG002 - for other formats
+        """Return the selected scenarios as units: one each."""
         return [Unit(name=flat_name(token), scenarios=(token,)) for token in scenarios]
 
-    def check(self, dataset: Dataset, folder: Path) -> None:  # noqa: B027 - most formats add to nothing
-        """Refuse a folder that lacks what the format adds to; raises ExportError or ConfigError."""
+    def check(self, dataset: Dataset, folder: Path) -> None:  # noqa: B027 - few formats add to one
+        """Raise ExportError or ConfigError if a folder lacks the export that the format adds to."""
 
     @abstractmethod
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write a unit, and count its samples (`output.tally`); called again for the same one after an interruption."""
+        """Write a unit, and count its samples (`output.tally`).
+
+        It is called again for the same unit after an interruption.
+        """
 
     def finish(  # noqa: B027 - some formats write nothing more
         self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
     ) -> None:
-        """Write what spans units, from the parts that they left; called again after an interruption."""
+        """Write files that span units, from their parts; called again after an interruption."""
 
 
-def some_of(argument: str, given: Sequence[str], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Those of the names that are given, each once, in their usual order; raises ChoiceError, for none too."""
-    named = choices(argument, given, names)
-    return tuple(name for name in names if name in named)
+def checked_names(
+    argument: str, requested: Sequence[str], names: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Return the requested names, each once, in their usual order.
+
+    Raises ChoiceError, also for none.
+    """
+    valid_names = choices(argument, requested, names)
+    return tuple(name for name in names if name in valid_names)
 
 
 def flat_name(token: str) -> str:
-    """A scenario's token as the name of one folder: `<type>__<scenario>`; no two tokens have the same.
+    """Return a scenario's token as the name of one folder: `<type>__<scenario>`; it is unique.
 
-    A digest of the token stands at the end if characters were replaced (all but ASCII letters, digits, `_`, `-` and
-    dots), if the name was too long, or if it looks as if it had one.
+    A digest of the token is appended if characters were replaced (all but ASCII letters, digits,
+    `_`, `-` and dots), if the name was too long, or if it seems to end with a digest.
     """
     plain = token.replace("/", "__")
-    name = re.sub(r"[^\w.-]", "_", plain, flags=re.ASCII)[:_MOST_CHARACTERS]
-    if name == plain and not _DIGEST.search(name):
+    name = re.sub(r"[^\w.-]", "_", plain, flags=re.ASCII)[:_MAX_NAME_LENGTH]
+    if name == plain and not _DIGEST_SUFFIX.search(name):
         return name
-    return f"{name}-{hashlib.blake2b(token.encode(), digest_size=8).hexdigest()}"
+    digest = hashlib.blake2b(token.encode(), digest_size=8).hexdigest()
+    return f"{name}-{digest}"
 
 
 def shards(
     dataset: Dataset, sizes: Mapping[str, int], limit: int
 ) -> dict[str, list[tuple[str, ...]]]:
-    """Name of a split → its shards: consecutive scenarios, sizes up to the limit, but at least one scenario."""
-    found: dict[str, list[tuple[str, ...]]] = {name: [] for name in SPLIT_NAMES.values()}
-    room = dict.fromkeys(found, 0)
+    """Return name of a split → its shards, each a tuple of consecutive scenarios.
+
+    Args:
+        dataset: The release.
+        sizes: Scenario → its size.
+        limit: Largest sum of sizes in a shard, unless it has only one scenario.
+    """
+    groups: dict[str, list[tuple[str, ...]]] = {name: [] for name in SPLIT_NAMES.values()}
+    free = dict.fromkeys(groups, 0)
     for scenario, size in sizes.items():
         split = SPLIT_NAMES[dataset.scenario.get(scenario)["split"]]
-        if not found[split] or size > room[split]:
-            found[split].append(())
-            room[split] = limit
-        found[split][-1] = (*found[split][-1], scenario)
-        room[split] -= size
-    return {split: groups for split, groups in found.items() if groups}
+        split_groups = groups[split]
+        if not split_groups or size > free[split]:
+            split_groups.append(())
+            free[split] = limit
+        split_groups[-1] = (*split_groups[-1], scenario)
+        free[split] -= size
+    return {split: split_groups for split, split_groups in groups.items() if split_groups}
 
 
 def readme(form: Format, dataset: Dataset, title: str, head: Mapping[str, Any], body: str) -> bytes:
-    """A README.md with a head in YAML, what is in the export and where it is from, and a body."""
+    """Return a README.md with a head in YAML, the export's contents and source, and a body."""
     import yaml
 
-    selection = [f"split {form.split}"] if form.split is not None else []
-    selection += [f"scenarios where {text}" for text in form.where]
-    return _TEXT.format(
+    parts = [f"split {form.split}"] if form.split is not None else []
+    parts += [f"scenarios where {text}" for text in form.where]
+    scenarios, agents = ", ".join(parts) or "all scenarios", ", ".join(form.agents)
+    return _README_TEMPLATE.format(
         head=yaml.safe_dump({"pretty_name": title, **head}, sort_keys=False, allow_unicode=True),
         title=title,
         name=form.name,
         devkit=__version__,
         version=dataset.version,
-        selection=f"It holds {', '.join(selection) or 'all scenarios'}, as recorded by {', '.join(form.agents)}.",
+        selection=f"It holds {scenarios}, as recorded by {agents}.",
         body=body,
     ).encode()

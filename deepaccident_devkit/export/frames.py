@@ -1,4 +1,4 @@
-"""The frames of a recording that formats take: keyframes, two a second counted back from its end; and their files."""
+"""Keyframes of a recording, two a second counted back from its end, and its sensor files."""
 
 from __future__ import annotations
 
@@ -13,39 +13,53 @@ from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CHANNEL_FORMAT
 
 KEY_STEP: Final = 5
-"""Recorded frames from one keyframe to the next."""
+"""Number of recorded frames between keyframes."""
 
 
-def keyframes(last: int) -> range:
-    """The numbers of a recording's keyframes; frames are counted from 1 to `last`."""
-    return range((last - 1) % KEY_STEP + 1, last + 1, KEY_STEP)
+def keyframes(frame_count: int) -> range:
+    """Return the numbers of a recording's keyframes, from 1 to its number of frames."""
+    return range((frame_count - 1) % KEY_STEP + 1, frame_count + 1, KEY_STEP)
 
 
-def keyframe_after(number: int, last: int) -> int:
-    """The keyframe that a frame leads to: itself, or the next one."""
-    return number + (last - number) % KEY_STEP
+def keyframe_after(number: int, frame_count: int) -> int:
+    """Return the keyframe that a frame leads to: itself, or the next one."""
+    return number + (frame_count - number) % KEY_STEP
 
 
 def sensor_files(
     dataset: Dataset, scenario: str, agent: str, channel: str
 ) -> dict[int, tuple[ReleasePath, int]]:
-    """Frame number → path and bytes of a channel's files that are there; raises TokenError and DatarootError."""
-    count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
-    folder = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}").parent
-    ending = CHANNEL_FORMAT[channel]
-    return {
-        number: (folder / f"{folder.name}_{number:03d}.{ending}", size)
-        for number, size in frame_sizes(folder, ending).items()
-        if number <= count
-    }
+    """Return frame number → path and bytes of a channel's existing files.
+
+    Raises TokenError and DatarootError.
+    """
+    frame_count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
+    first_path = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}")
+    folder = first_path.parent
+    suffix = CHANNEL_FORMAT[channel]
+    files = {}
+    for number, size in frame_sizes(folder, suffix).items():
+        if number <= frame_count:
+            files[number] = (folder / f"{folder.name}_{number:03d}.{suffix}", size)
+    return files
 
 
 def stored_camera(
     dataset: Dataset, camera: str, file: tuple[ReleasePath, int] | None
 ) -> PinholeCamera:
-    """A camera, by its image's token, with K and size of its file of `sensor_files`; without a file, those of calib.
+    """Return a camera with K and size of its file of `sensor_files`, or of calib without a file.
 
-    Raises TokenError, and SensorFileError if the file is no image.
+    Args:
+        dataset: The release.
+        camera: Token of the camera's image.
+        file: Path and bytes of the image; None for no file.
+
+    Raises:
+        TokenError: no such image.
+        SensorFileError: the file is no image.
     """
-    lens = dataset.camera(camera)
-    return lens if file is None else lens.resized(*image_size(file[0]))
+    pinhole = dataset.camera(camera)
+    if file is None:
+        return pinhole
+    path, _ = file
+    return pinhole.resized(*image_size(path))

@@ -28,64 +28,69 @@ _NO_STD: Final = (1.0, 1.0, 1.0)
 
 
 class VirtualCamera(NamedTuple):
-    """A pinhole camera that takes the place of another one, with its pose: cameras of two rigs then look alike.
+    """A pinhole camera with the pose of a real one, to compare images of two sensor setups.
 
-    The image is scaled until its focal length is this one, to a whole pixel of its size, and moved by whole pixels
-    until its principal point is in the middle; what the camera did not see is black. So K is exact, and a little off
-    what is asked for.
+    The image is scaled to this focal length, rounded to whole pixels of its size, and moved by
+    whole pixels until its principal point is in the middle; areas that the camera did not see are
+    black. So K is exact, but differs slightly from the requested one.
 
     Attributes:
-        focal: focal length, pixels.
-        height: of the image, pixels.
-        width: of the image, pixels.
+        focal: Focal length in pixels.
+        height: Height of the image in pixels.
+        width: Width of the image in pixels.
     """
 
     focal: float
     height: int
     width: int
 
-    def taken(
+    def capture(
         self, image: ByteArray, lens: PinholeCamera, decode: Decoding
     ) -> tuple[ByteArray, FloatArray]:
-        """The image (height, width, 3) of a camera's whole one, and its K."""
+        """Return the image of this camera, shape (height, width, 3), and its K.
+
+        Args:
+            image: The full image of the real camera.
+            lens: The real camera.
+            decode: How images are resized.
+        """
         height = max(round(lens.height * self.focal / lens.intrinsic[1, 1]), 1)
         width = max(round(lens.width * self.focal / lens.intrinsic[0, 0]), 1)
         intrinsic = lens.resized(width, height).intrinsic.copy()
-        left, top = (
-            np.rint(intrinsic[:2, 2] - (self.width / 2, self.height / 2)).astype(int).tolist()
-        )
+        corner = np.rint(intrinsic[:2, 2] - (self.width / 2, self.height / 2)).astype(int)
+        left, top = corner.tolist()
         intrinsic[:2, 2] -= (left, top)
         result = np.zeros((3, self.height, self.width), dtype=np.uint8).transpose(1, 2, 0)
-        rows, columns = (
-            slice(max(first, 0), min(first + shown, whole))
-            for first, shown, whole in ((top, self.height, height), (left, self.width, width))
-        )
+        rows = slice(max(top, 0), min(top + self.height, height))
+        columns = slice(max(left, 0), min(left + self.width, width))
         if rows.start < rows.stop and columns.start < columns.stop:
             part = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
-            seen = resized_part(image, (height, width), part, decode)
-            result[
-                rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
-            ] = seen
+            target_rows = slice(rows.start - top, rows.stop - top)
+            target_columns = slice(columns.start - left, columns.stop - left)
+            result[target_rows, target_columns] = resized_part(image, (height, width), part, decode)
         return result, intrinsic
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageConfig:
-    """How images are prepared; checked when made, raises ConfigError.
+    """How images are prepared; checked on creation, raises ConfigError.
 
     Attributes:
-        resize: height and width to which a whole image is resized; None keeps the stored size.
-        crop: top, left, height and width of the part to keep, in pixels of the resized image; None keeps all.
+        resize: Height and width to which the full image is resized; None keeps the stored size.
+        crop: Top, left, height and width of the retained part, in pixels of the resized image; None
+            retains all.
         dtype: `float32` in [0, 1], or `uint8` as decoded.
-        mean: subtracted from the channels R, G, B in [0, 1]; `float32` only.
-        std: the channels are then divided by this; `float32` only.
-        cameras: the cameras, in this order.
-        decode: how images are resized: `full`, or `scaled` in two thirds of the time, with slightly other pixels
-            (docs/training.md). `full` decodes whole images and resizes as Pillow's bilinear filter; `scaled` decodes
-            JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8 that is no smaller than `resize` and resizes as OpenCV's area
-            filter. A pixel is at most 1 of 255 from what these libraries make, but where `scaled` shrinks one axis and
-            grows the other, for which OpenCV has another filter.
-        virtual_camera: in place of `resize` and `crop`: the pinhole camera that all images look as if taken by.
+        mean: Subtracted from the channels R, G, B in [0, 1]; `float32` only.
+        std: The channels are then divided by this; `float32` only.
+        cameras: The cameras, in this order.
+        decode: How images are resized: `full`, or `scaled` in two thirds of the time, with slightly
+            different pixels (docs/training.md). `full` decodes full images and resizes like
+            Pillow's bilinear filter; `scaled` decodes JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8
+            that is no smaller than `resize` and resizes like OpenCV's area filter. A pixel differs
+            by at most 1 of 255 from these libraries, except where `scaled` shrinks one axis and
+            enlarges the other, for which OpenCV has another filter.
+        virtual_camera: Replaces `resize` and `crop`: the pinhole camera that all images look as if
+            taken by.
     """
 
     resize: tuple[int, int] | None = None
@@ -102,40 +107,41 @@ class ImageConfig:
         if self.resize is not None:
             self._set("resize", _pixels("resize", self.resize, "height and width", (1, 1)))
         if self.crop is not None:
-            self._set(
-                "crop", _pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1))
-            )
+            crop = _pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1))
+            self._set("crop", crop)
             if self.resize is not None:
                 _check_crop(self.crop, self.resize)
-        settle_choices(
-            self, {"dtype": get_args(ImageDtype), "decode": get_args(Decoding)}, error=ConfigError
-        )
+        allowed = {"dtype": get_args(ImageDtype), "decode": get_args(Decoding)}
+        settle_choices(self, allowed, error=ConfigError)
         for name in ("mean", "std"):
             self._set(name, _channels(name, getattr(self, name)))
         if min(self.std) <= 0:
             raise ConfigError(f"std: expected numbers above 0, found {self.std}")
         if self.dtype == "uint8" and (self.mean, self.std) != (_NO_MEAN, _NO_STD):
             raise ConfigError(
-                "mean and std: uint8 images are not scaled; choose dtype='float32', or leave them out"
+                "mean and std: uint8 images are not scaled; choose dtype='float32', or leave them "
+                "out"
             )
         self._set("cameras", _cameras(self.cameras))
         if self.virtual_camera is not None:
             focal, *size = self.virtual_camera
             height, width = _pixels("virtual_camera", size, "height and width", (1, 1))
             self._set("virtual_camera", VirtualCamera(focal, height, width))
-            if not 0 < focal < math.inf or (self.resize, self.crop) != (None, None):
+            is_used_with_others = (self.resize, self.crop) != (None, None)
+            if not 0 < focal < math.inf or is_used_with_others:
                 raise ConfigError(
-                    "virtual_camera: expected a focal length above 0, and no resize or crop beside it"
+                    "virtual_camera: expected a focal length above 0, and no resize or crop "
+                    "beside it"
                 )
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     def load(self, dataset: Dataset, camera: RowArgument) -> tuple[ByteArray, FloatArray]:
-        """An image (h, w, 3) uint8 RGB, resized and cropped, and its intrinsic (3, 3).
+        """Return an image (h, w, 3) uint8 RGB, resized and cropped, and its intrinsic (3, 3).
 
-        Pixel centres are at 0.5, 1.5, …, as everywhere in the devkit: a point at (u, v) of the whole image is at
-        (u · width' / width − left, v · height' / height − top).
+        Pixel centres are at 0.5, 1.5, …, as everywhere in the devkit: a point at (u, v) of the
+        full image is at (u · width' / width − left, v · height' / height − top).
 
         Raises:
             TokenError: no such image.
@@ -146,22 +152,23 @@ class ImageConfig:
         lens = dataset.camera(camera)
         if self.virtual_camera is not None:
             image = dataset.load_image(camera)
-            return self.virtual_camera.taken(
+            return self.virtual_camera.capture(
                 image, lens.resized(image.shape[1], image.shape[0]), self.decode
             )
         if self.resize is not None:
-            image = dataset.load_image(
-                camera, min_size=self.resize if self.decode == "scaled" else None
-            )
-            return resized_part(image, self.resize, self.crop, self.decode), self.intrinsic(
-                lens, self.resize
-            )
+            min_size = self.resize if self.decode == "scaled" else None
+            image = dataset.load_image(camera, min_size=min_size)
+            resized = resized_part(image, self.resize, self.crop, self.decode)
+            return resized, self.intrinsic(lens, self.resize)
         image = dataset.load_image(camera)
         height, width = image.shape[:2]
         return self.cropped(image), self.intrinsic(lens, (height, width))
 
     def cropped(self, image: ByteArray) -> ByteArray:
-        """The part to keep of a resized image (h, w, 3), as a view; raises ConfigError if it reaches beyond it."""
+        """Return the retained part of a resized image (h, w, 3), as a view.
+
+        Raises ConfigError if it reaches beyond the image.
+        """
         if self.crop is None:
             return image
         _check_crop(self.crop, (image.shape[0], image.shape[1]))
@@ -169,7 +176,12 @@ class ImageConfig:
         return image[top : top + height, left : left + width]
 
     def intrinsic(self, lens: PinholeCamera, size: tuple[int, int]) -> FloatArray:
-        """The intrinsic (3, 3) of a camera's image that was resized to `size`, height and width, then cropped."""
+        """Return the intrinsic (3, 3) of a camera's image after resizing and cropping.
+
+        Args:
+            lens: The camera.
+            size: Height and width of the resized image, before cropping.
+        """
         height, width = size
         intrinsic: FloatArray = lens.resized(width, height).intrinsic.copy()
         if self.crop is not None:
@@ -178,21 +190,23 @@ class ImageConfig:
         return intrinsic
 
     def values(self, images: ByteArray, known: BoolArray) -> AnyArray:
-        """Images (A, P, C, 3, h, w) uint8 as an array of `dtype`; where `known` (A, P) is False they stay 0."""
+        """Return images (A, P, C, 3, h, w) uint8 as an array of `dtype`.
+
+        Images are 0 where `known` (A, P) is False.
+        """
         if self.dtype == "uint8":
             return images
-        result = (np.empty if known.all() else np.zeros)(images.shape, dtype=np.float32)
-        mean, std = (
-            np.array(three, dtype=np.float32)[:, None, None] for three in (self.mean, self.std)
-        )
+        make_array = np.empty if known.all() else np.zeros
+        result = make_array(images.shape, dtype=np.float32)
+        mean = np.array(self.mean, dtype=np.float32)[:, None, None]
+        std = np.array(self.std, dtype=np.float32)[:, None, None]
         scale, shift = np.float32(1) / (np.float32(255) * std), mean / std
         for a, p in np.argwhere(known).tolist():
-            for image, out in zip(
-                images[a, p], result[a, p], strict=True
-            ):  # one fits into the processor's cache
-                np.copyto(out, image)
-                np.multiply(out, scale, out=out)
-                np.subtract(out, shift, out=out)
+            # image by image, since one fits into the processor's cache
+            for image, target in zip(images[a, p], result[a, p], strict=True):
+                np.copyto(target, image)
+                np.multiply(target, scale, out=target)
+                np.subtract(target, shift, out=target)
         return result
 
 
@@ -202,51 +216,56 @@ def resized_part(
     crop: tuple[int, int, int, int] | None,
     decode: Decoding,
 ) -> ByteArray:
-    """A part (top, left, height, width) of an image (H, W, 3) resized to `size`; None is all of it.
+    """Return a part of an image (H, W, 3) that is resized to `size`.
 
     Args:
-        image: the whole image.
-        size: height and width to which all of it would be resized; little more than the part is made.
-        crop: the part.
-        decode: which filter: of `full`, weights fall linearly with the distance, over two pixels of the smaller of both
-            images in each direction, as of Pillow's bilinear filter; of `scaled`, they are the areas that pixels share,
-            as of OpenCV's area filter.
+        image: The full image.
+        size: Height and width to which the full image would be resized; little more than the part
+            is computed.
+        crop: Top, left, height and width of the part; None for all.
+        decode: The filter: with `full`, weights fall linearly with the distance, over two pixels of
+            the smaller of both images in each direction, like Pillow's bilinear filter; with
+            `scaled`, they are the areas that pixels share, like OpenCV's area filter.
 
     Returns:
-        (height, width, 3), the view of an array (3, height, width): as `ImageConfig.decode` says.
+        Image (height, width, 3), the view of an array (3, height, width); see `ImageConfig.decode`.
     """
     import cv2
 
     top, left, height, width = crop or (0, 0, *size)
-    rows = _resampled(image.reshape(len(image), -1), size[0], range(top, top + height), decode)
+    row_part, column_part = range(top, top + height), range(left, left + width)
+    rows = _resample(image.reshape(len(image), -1), size[0], row_part, decode)
     turned: Any = cv2.transpose(rows.reshape(height, -1, 3)).reshape(-1, 3 * height)
-    columns = _resampled(turned, size[1], range(left, left + width), decode).reshape(
-        width, height, 3
-    )
-    return np.stack([cv2.transpose(each) for each in cv2.split(columns)], dtype=np.uint8).transpose(
-        1, 2, 0
-    )
+    columns = _resample(turned, size[1], column_part, decode).reshape(width, height, 3)
+    channels = [cv2.transpose(channel) for channel in cv2.split(columns)]
+    return np.stack(channels, dtype=np.uint8).transpose(1, 2, 0)
 
 
-def _resampled(rows: ByteArray, new: int, part: range, decode: Decoding) -> ByteArray:
-    """A part of the `new` rows to which rows (old, n) are resized: running means of old rows, many at once."""
+def _resample(rows: ByteArray, new: int, part: range, decode: Decoding) -> ByteArray:
+    """Return a part of the `new` rows to which rows (old, n) are resized.
+
+    They are running means of old rows, many at once.
+    """
     import cv2
 
     if len(rows) == new:
         return rows[part.start : part.stop]
     result = np.empty((len(part), rows.shape[1]), dtype=np.uint8)
     groups = _groups(len(rows), new, part, decode)
-    means = np.zeros((max(len(made) for made, _ in groups), rows.shape[1]), dtype=np.float32)
-    for made, olds in groups:
-        out = result[made.start - part.start : made.stop - part.start : made.step]
-        if len(olds) == 2:
-            (first, whole), (second, rest) = olds
-            cv2.addWeighted(rows[first], whole - rest, rows[second], rest, 0, out)
+    means = np.zeros(
+        (max(len(new_rows) for new_rows, _ in groups), rows.shape[1]), dtype=np.float32
+    )
+    for new_rows, old_rows in groups:
+        start, stop = new_rows.start - part.start, new_rows.stop - part.start
+        target = result[start : stop : new_rows.step]
+        if len(old_rows) == 2:
+            (first, total), (second, share) = old_rows
+            cv2.addWeighted(rows[first], total - share, rows[second], share, 0, target)
         else:
-            mean = means[: len(made)]
-            for old, share in olds:
+            mean = means[: len(new_rows)]
+            for old, share in old_rows:
                 cv2.accumulateWeighted(rows[old], mean, share)
-            cv2.convertScaleAbs(mean, out)
+            cv2.convertScaleAbs(mean, target)
     return result
 
 
@@ -254,67 +273,70 @@ def _resampled(rows: ByteArray, new: int, part: range, decode: Decoding) -> Byte
 def _groups(
     old: int, new: int, part: range, decode: Decoding
 ) -> list[tuple[range, list[tuple[slice, float]]]]:
-    """Which of `new` rows are the same means of the `old` rows near them, and of which.
+    """Return groups of `new` rows that are the same means of the `old` rows near them.
 
     Returns:
-        For each group its rows, those that lie alike between the old ones, and a list of the old rows: the first one
-        of the mean for each row of the group, and so on, with their share in the mean of all up to them. Places are
-        counted in the 2 `new`-th part of an old row, and so in whole numbers.
+        For each group its rows, which have the same position between the old rows, and a list of
+        the old rows: the first one of the mean for each row of the group, and so on, with their
+        share in the mean of all up to them. Positions are counted in units of 1 / (2 `new`) of an
+        old row, and so in whole numbers.
     """
     reach = 2 * max(old, new) if decode == "full" else old
     step, stride = new // gcd(old, new), old // gcd(old, new)
-    edge = -((old - reach) // (2 * old))  # so many rows at both ends reach beyond the old ones
+    edge = -(
+        (old - reach) // (2 * old)
+    )  # number of rows at each end that reach beyond the old ones
     inner = range(max(part.start, edge), min(part.stop, new - edge))
+    row_groups = [range(row, row + 1) for row in part if row not in inner]
+    row_groups += [inner[start::step] for start in range(step) if inner[start:]]
     groups = []
-    for made in [range(i, i + 1) for i in part if i not in inner] + [
-        inner[i::step] for i in range(step) if inner[i:]
-    ]:
-        centre = (2 * made[0] + 1) * old
-        rows = range(
-            max((centre - reach) // (2 * new), 0), min(-((-centre - reach) // (2 * new)), old)
-        )
-        near = [reach - abs((2 * row + 1) * new - centre) for row in rows]
-        weights = [
-            max(each, 0) if decode == "full" else min(each + new, 2 * min(old, new))
-            for each in near
-        ]
-        shares = [
-            (slice(row, row + stride * (len(made) - 1) + 1, stride), weight / total)
-            for row, weight, total in zip(rows, weights, accumulate(weights), strict=True)
-            if weight
-        ]
-        groups.append((made, shares))
+    for new_rows in row_groups:
+        centre = (2 * new_rows[0] + 1) * old
+        start = max((centre - reach) // (2 * new), 0)
+        stop = min(-((-centre - reach) // (2 * new)), old)
+        old_rows = range(start, stop)
+        overlaps = [reach - abs((2 * row + 1) * new - centre) for row in old_rows]
+        if decode == "full":
+            weights = [max(overlap, 0) for overlap in overlaps]
+        else:
+            weights = [min(overlap + new, 2 * min(old, new)) for overlap in overlaps]
+        length = stride * (len(new_rows) - 1) + 1
+        shares = []
+        for row, weight, total in zip(old_rows, weights, accumulate(weights), strict=True):
+            if weight:
+                shares.append((slice(row, row + length, stride), weight / total))
+        groups.append((new_rows, shares))
     return groups
 
 
 def _pixels(
-    name: str, given: Iterable[SupportsIndex], meaning: str, least: Sequence[int]
+    name: str, values: Iterable[SupportsIndex], meaning: str, minima: Sequence[int]
 ) -> tuple[int, ...]:
+    """Return whole numbers of pixels; raises ConfigError if one is below its minimum."""
     try:
-        numbers = tuple(operator.index(number) for number in given)
+        numbers = tuple(map(operator.index, values))
     except TypeError:
         numbers = ()
-    if len(numbers) != len(least) or any(
-        number < low for number, low in zip(numbers, least, strict=True)
-    ):
-        raise ConfigError(f"{name}: expected {meaning} in pixels, found {given!r}")
+    is_valid = len(numbers) == len(minima) and all(map(operator.ge, numbers, minima))
+    if not is_valid:
+        raise ConfigError(f"{name}: expected {meaning} in pixels, found {values!r}")
     return numbers
 
 
-def _channels(name: str, given: ArrayLike) -> tuple[float, ...]:
+def _channels(name: str, values: ArrayLike) -> tuple[float, ...]:
     try:
-        numbers = checked(name, given, (3,))
+        numbers = checked(name, values, (3,))
     except GeometryError:
         numbers = np.full(3, np.nan)
     if not np.isfinite(numbers).all():
-        raise ConfigError(f"{name}: expected a number for each of R, G and B, found {given!r}")
+        raise ConfigError(f"{name}: expected a number for each of R, G and B, found {values!r}")
     return tuple(numbers.tolist())
 
 
-def _cameras(given: Iterable[str]) -> tuple[str, ...]:
-    names = choices("cameras", given, CAMERAS, error=ConfigError)
+def _cameras(requested: Iterable[str]) -> tuple[str, ...]:
+    names = choices("cameras", requested, CAMERAS, error=ConfigError)
     if len(set(names)) != len(names):
-        raise ConfigError(f"cameras: expected each camera once, found {given!r}")
+        raise ConfigError(f"cameras: expected each camera once, found {requested!r}")
     return names
 
 
@@ -322,6 +344,6 @@ def _check_crop(crop: tuple[int, int, int, int], size: tuple[int, int]) -> None:
     top, left, height, width = crop
     if top + height > size[0] or left + width > size[1]:
         raise ConfigError(
-            f"crop: rows {top} to {top + height} and columns {left} to {left + width} reach beyond an image of "
-            f"{size[0]} × {size[1]} (height × width); choose a smaller part"
+            f"crop: rows {top} to {top + height} and columns {left} to {left + width} reach "
+            f"beyond an image of {size[0]} × {size[1]} (height × width); choose a smaller part"
         )

@@ -7,7 +7,7 @@
     da = DeepAccident(dataroot="data/DeepAccident")
     export_release(da, "data/opv2v", OpenCood(split="val"))
 
-docs/exports.md says what becomes what, and what is lost.
+docs/exports.md describes the mapping, and what is lost.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.export.format import Format, Output, Unit, some_of
+from deepaccident_devkit.export.format import Format, Output, Unit, checked_names
 from deepaccident_devkit.export.frames import sensor_files, stored_camera
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.conventions import (
@@ -60,15 +60,16 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Our split → their folder.
+# Split → folder in OPV2V.
 _SPLITS: Final[Mapping[str | None, str]] = {
     "train": "train",
     "val": "validate",
     "test": "test",
     None: "unknown",
 }
-_AGENTS: Final = "agents.json"
-# Our camera → theirs. OPV2V has four: front, right rear, left rear, back; loaders leave out the other two.
+_AGENTS_FILE: Final = "agents.json"
+# Camera → its name in OPV2V, which has four: front, right rear, left rear, back; loaders leave out
+# the other two.
 _CAMERA_NAMES: Final[Mapping[str, str]] = {
     "Camera_Front": "camera0",
     "Camera_BackRight": "camera1",
@@ -77,19 +78,23 @@ _CAMERA_NAMES: Final[Mapping[str, str]] = {
     "Camera_FrontLeft": "camera4",
     "Camera_FrontRight": "camera5",
 }
-_KMH: Final = 3.6
-_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+# Factor from m/s to km/h.
+_KMH_PER_MPS: Final = 3.6
+_POINT_DTYPE: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenCood(Format):
-    """OPV2V's folders. Loaders take the first vehicle by name for the ego; agents are therefore 1 to 4, the pole −1.
+    """OPV2V's folders. Loaders take the first vehicle by name for the ego.
+
+    Agents are therefore called 1 to 4, the pole −1.
 
     Attributes:
-        classes: which boxes are vehicles; OpenCOOD has one class, so all of these become it.
-        ego: the vehicle that is 1; the others follow in their usual order.
-        without_clouds: whether to write agents and moments that lack a point cloud, too, for models of cameras alone.
-            Loaders of clouds take them for moments at which nothing was hit, with true boxes.
+        classes: Classes of boxes that are vehicles; OpenCOOD has one class, so they all become it.
+        ego: The vehicle that is called 1; the others follow in their usual order.
+        without_clouds: Whether to also write agents and moments that lack a point cloud, for models
+            that use only cameras. Loaders of clouds treat them as moments without any LiDAR hit,
+            with true boxes.
     """
 
     classes: tuple[str, ...] = ("car", "truck", "van")
@@ -97,32 +102,33 @@ class OpenCood(Format):
     without_clouds: bool = False
     name: ClassVar[str] = "opencood"
     nothing: ClassVar[str] = (
-        "no moment of these scenarios and agents has its point clouds; unpack the archives of lidar01, leave out the "
-        "agents without it (agents, --agents), or write images alone (without_clouds, --without-clouds)"
+        "no moment of these scenarios and agents has its point clouds; unpack the archives of "
+        "lidar01, leave out the agents without it (agents, --agents), or write images alone "
+        "(without_clouds, --without-clouds)"
     )
 
     def __post_init__(self) -> None:
         """Check the choices."""
         super().__post_init__()
         settle_choices(self, {"ego": VEHICLE_AGENTS})
-        object.__setattr__(self, "classes", some_of("classes", self.classes, CATEGORIES))
+        object.__setattr__(self, "classes", checked_names("classes", self.classes, CATEGORIES))
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write a scenario's folder, which appears when it is whole."""
+        """Write a scenario's folder, which appears when it is complete."""
         recording = _Recording(
             dataset, unit.scenarios[0], self.agents, self.ego, self.without_clouds
         )
         recording.count(output)
+        folders = []
         if recording.frames:  # loaders stop at a scenario without agents
-            with output.whole_folder(f"{_SPLITS[recording.record['split']]}/{unit.name}") as folder:
+            split_folder = _SPLITS[recording.record["split"]]
+            with output.whole_folder(f"{split_folder}/{unit.name}") as folder:
                 folder.write("data_protocol.yaml", _yaml(recording.protocol()))
                 for agent in recording.agents:
                     self._write_agent(recording, agent, folder)
-        folders = (
-            [recording.folders[agent] for agent in recording.agents] if recording.frames else []
-        )
+            folders = [recording.folders[agent] for agent in recording.agents]
         facts = {"folders": folders, "written": recording.written, "samples": recording.samples}
-        write_bytes(output.parts / _AGENTS, json.dumps(facts).encode())
+        write_bytes(output.parts / _AGENTS_FILE, json.dumps(facts).encode())
 
     def finish(
         self,
@@ -132,50 +138,48 @@ class OpenCood(Format):
         parts: Callable[[Unit], Path],
     ) -> None:
         """Write HEAL's assignment, by which all agents have the same sensors."""
-        facts = {
-            unit.name: parsed_json(read_bytes(parts(unit) / _AGENTS, "bundle")) for unit in units
-        }
-        found = {
-            name: dict.fromkeys(each["folders"], "m1")
-            for name, each in facts.items()
-            if each["folders"]
-        }
-        output.write("heter_modality_assign.json", f"{json.dumps(found, indent=1)}\n".encode())
-
-        written, samples = (
-            sum(each[name] for each in facts.values()) for name in ("written", "samples")
-        )
+        assignment = {}
+        written = samples = 0
+        for unit in units:
+            facts = parsed_json(read_bytes(parts(unit) / _AGENTS_FILE, "bundle"))
+            written += facts["written"]
+            samples += facts["samples"]
+            if facts["folders"]:
+                assignment[unit.name] = dict.fromkeys(facts["folders"], "m1")
+        text = f"{json.dumps(assignment, indent=1)}\n"
+        output.write("heter_modality_assign.json", text.encode())
         if 2 * written < samples:
             logger.warning(
-                "%d of %d samples, most of the export, are left out for lack of point clouds; unpack the archives of "
-                "lidar01, leave out the agents without it (agents, --agents), or write images alone "
-                "(without_clouds, --without-clouds)",
+                "%d of %d samples, most of the export, are left out for lack of point clouds; "
+                "unpack the archives of lidar01, leave out the agents without it (agents, "
+                "--agents), or write images alone (without_clouds, --without-clouds)",
                 samples - written,
                 samples,
             )
 
     def _write_agent(self, recording: _Recording, agent: str, output: Output) -> None:
-        moments = _Moments(recording, agent, self.classes)
+        """Write the folder of an agent."""
+        frames = _AgentFrames(recording, agent, self.classes)
         files = recording.files[agent]
         for number in recording.frames:
-            stem, facts = f"{recording.folders[agent]}/{number:06d}", moments.facts(number, output)
+            stem = f"{recording.folders[agent]}/{number:06d}"
+            facts = frames.facts(number, output)
             output.write(f"{stem}.yaml", _yaml(facts))
-            output.write(
-                f"{stem}.json", json.dumps(facts).encode()
-            )  # CoAlign and HEAL read it in place of the yaml
+            # CoAlign and HEAL read this instead of the YAML
+            output.write(f"{stem}.json", json.dumps(facts).encode())
             if number in files[LIDAR]:
-                output.write(
-                    f"{stem}.pcd", pcd_bytes(read_lidar(files[LIDAR][number][0], raw=True))
-                )
+                cloud_path, _ = files[LIDAR][number]
+                output.write(f"{stem}.pcd", pcd_bytes(read_lidar(cloud_path, raw=True)))
             for camera, name in _CAMERA_NAMES.items():
                 if number in files[camera]:
-                    output.link(files[camera][number][0], f"{stem}_{name}.png")
+                    image_path, _ = files[camera][number]
+                    output.link(image_path, f"{stem}_{name}.png")
 
 
 def _yaml(content: Mapping[str, Any]) -> bytes:
     import yaml
 
-    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the one in C is there with most builds
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # most builds have the one in C
     return str(yaml.dump(content, Dumper=dumper, default_flow_style=None)).encode()
 
 
@@ -183,16 +187,18 @@ class _Recording:
     """A scenario's agents, their folders and their sensor files.
 
     Attributes:
-        dataset: the release.
-        token: the scenario's.
-        record: the scenario's.
-        agents: that are written; without a point cloud in the whole scenario an agent is not.
-        frames: numbers of those that are written. Loaders look up the moments of one agent in all of them, and a cloud
-            that is not there is for them one without points. So all have a frame, and its cloud, or none has.
-        folders: agent → name of its folder; loaders sort them as words and take the first for the ego.
-        files: agent → channel → frame → path and bytes of what is there and written.
-        samples: agents at moments that the release has.
-        written: how many of them are written: not all if clouds are missing.
+        dataset: The release.
+        token: Token of the scenario.
+        record: Record of the scenario.
+        agents: Agents that are written; an agent without any point cloud is not.
+        frames: Numbers of the frames that are written. Loaders look up the moments of one agent in
+            all agents, and treat a missing cloud as a moment without points. So either all agents
+            have a frame with its cloud, or none has.
+        folders: Agent → name of its folder; loaders sort them as words and take the first for the
+            ego.
+        files: Agent → channel → frame → path and bytes of existing files that are written.
+        samples: Number of samples that the release has.
+        written: Number of them that are written: not all if clouds are missing.
     """
 
     def __init__(
@@ -203,54 +209,49 @@ class _Recording:
         ego: str,
         without_clouds: bool,  # noqa: FBT001
     ) -> None:
-        """Look which files of these agents are there, and choose what is written. Raises TokenError."""
+        """Find the files of these agents, and select what is written. Raises TokenError."""
         self.dataset, self.token = dataset, token
         self.record: ScenarioRecord = dataset.scenario[dataset.getind("scenario", token)]
         numbers = range(1, self.record["num_frames"] + 1)
-        self._there: dict[str, dict[str, dict[int, tuple[ReleasePath, int]]]] = {
-            agent: {channel: sensor_files(dataset, token, agent, channel) for channel in CHANNELS}
-            for agent in agents_of(dataset, token)
-            if agent in agents
-        }
-        self._absent, self.samples = len(agents) - len(self._there), len(self._there) * len(numbers)
-        moments = {
-            agent: set(numbers if without_clouds else files[LIDAR])
-            for agent, files in self._there.items()
-        }
-        self.agents = [agent for agent in self._there if moments[agent]]
-        common = set(numbers).intersection(*(moments[agent] for agent in self.agents))
+        self._all_files: dict[str, dict[str, dict[int, tuple[ReleasePath, int]]]] = {}
+        for agent in agents_of(dataset, token):
+            if agent in agents:
+                self._all_files[agent] = {
+                    channel: sensor_files(dataset, token, agent, channel) for channel in CHANNELS
+                }
+        self._absent = len(agents) - len(self._all_files)
+        self.samples = len(self._all_files) * len(numbers)
+        self.agents: list[str] = []
+        common = set(numbers)
+        for name, files in self._all_files.items():
+            moments = set(numbers if without_clouds else files[LIDAR])
+            if moments:
+                self.agents.append(name)
+                common &= moments
         self.frames = sorted(common) if self.agents else []
         self.written = len(self.agents) * len(self.frames)
-        self.files = {
-            agent: {
-                channel: {number: found[number] for number in self.frames if number in found}
-                for channel, found in self._there[agent].items()
-            }
-            for agent in self.agents
-        }
+        self.files = {agent: self._written_files(agent) for agent in self.agents}
         order = sorted(VEHICLE_AGENTS, key=lambda agent: agent != ego)
-        self.folders: dict[str, str] = {
-            **{agent: str(number) for number, agent in enumerate(order, 1)},
-            INFRASTRUCTURE: "-1",
-        }
+        self.folders: dict[str, str] = {agent: str(number) for number, agent in enumerate(order, 1)}
+        self.folders[INFRASTRUCTURE] = "-1"
+
+    def _written_files(self, agent: str) -> dict[str, dict[int, tuple[ReleasePath, int]]]:
+        """Return channel → frame → path and bytes of an agent's files in the written frames."""
+        written = {}
+        for channel, files in self._all_files[agent].items():
+            written[channel] = {number: files[number] for number in self.frames if number in files}
+        return written
 
     def protocol(self) -> dict[str, Any]:
-        """Where the scenario comes from; no loader reads it."""
-        actors = {
-            agent: self.dataset.get("agent", f"{self.token}/{agent}")["actor_id"]
-            for agent in self.agents
-        }
-        return {
-            "source": "DeepAccident",
-            "scenario": self.token,
-            "agents": {
-                self.folders[agent]: {"name": agent, "actor_id": actor}
-                for agent, actor in actors.items()
-            },
-        }
+        """Return the source of the scenario; no loader reads it."""
+        agents = {}
+        for agent in self.agents:
+            actor_id = self.dataset.get("agent", f"{self.token}/{agent}")["actor_id"]
+            agents[self.folders[agent]] = {"name": agent, "actor_id": actor_id}
+        return {"source": "DeepAccident", "scenario": self.token, "agents": agents}
 
     def count(self, output: Output) -> None:
-        """Count the samples, and what of the scenario is not written; boxes are counted moment by moment."""
+        """Count the samples, and the data that is not written; boxes are counted frame by frame."""
         output.tally.samples += self.written
         images = sum(map(self._count, CAMERAS))
         output.leave_out("agents of scenarios that are not in this release", self._absent)
@@ -266,151 +267,162 @@ class _Recording:
         output.leave_out("files of the BEV camera", self._count(BEV_CAMERA))
 
     def _count(self, channel: str) -> int:
-        return sum(len(files[channel]) for files in self._there.values())
+        """Return the number of existing files of a channel."""
+        return sum(len(files[channel]) for files in self._all_files.values())
 
 
-class _Moments:
-    """The moments of one agent of a scenario, computed at once.
+class _AgentFrames:
+    """The frames of one agent of a scenario, computed at once.
 
     Attributes:
-        samples: tokens, by frame.
+        samples: Tokens, by frame.
     """
 
     def __init__(self, recording: _Recording, agent: str, classes: tuple[str, ...]) -> None:
-        """Take an agent, and the classes that count as vehicles; raises TokenError."""
+        """Read the poses and speeds of an agent; raises TokenError.
+
+        Args:
+            recording: The scenario.
+            agent: The agent.
+            classes: Classes that count as vehicles.
+        """
         self._dataset = dataset = recording.dataset
-        self._files, numbers = recording.files[agent], [CATEGORIES.index(name) for name in classes]
-        self._kept: dict[str, Callable[[Boxes], BoolArray]] = {
+        self._files = recording.files[agent]
+        class_numbers = list(map(CATEGORIES.index, classes))
+        self._filters: dict[str, Callable[[Boxes], BoolArray]] = {
             "boxes of the agents themselves": lambda boxes: boxes.actor_id != OWN_ACTOR_ID,
-            "boxes of other classes": lambda boxes: np.isin(boxes.category, numbers),
+            "boxes of other classes": lambda boxes: np.isin(boxes.category, class_numbers),
             "untracked boxes": lambda boxes: boxes.actor_id != UNTRACKED_ID,
             "boxes without LiDAR points": lambda boxes: boxes.num_lidar_pts > 0,
         }
         count = recording.record["num_frames"]
-        self.samples = [
-            sample_token(recording.token, agent, number) for number in range(1, count + 1)
-        ]
+        numbers = range(1, count + 1)
+        self.samples = [sample_token(recording.token, agent, number) for number in numbers]
         first = dataset.getind("sample", self.samples[0])
-        self._world_from_ego = stored_transforms(
-            dataset.columns("ego_pose")["matrix"][first : first + count]
-        )
-        rows = slice(first * len(CHANNELS), (first + count) * len(CHANNELS))
-        sensors = stored_transforms(dataset.columns("sample_data")["matrix"][rows])
+        rows = slice(first, first + count)
+        self._world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
+        sensor_rows = slice(first * len(CHANNELS), (first + count) * len(CHANNELS))
+        sensors = stored_transforms(dataset.columns("sample_data")["matrix"][sensor_rows])
         self._ego_from = sensors.reshape(count, len(CHANNELS), 4, 4)
         samples = dataset.columns("sample")
-        self._velocity, self._labelled = (
-            samples[name][first : first + count] for name in ("velocity", "labelled")
-        )
+        self._velocity = samples["velocity"][rows]
+        self._labelled = samples["labelled"][rows]
         self._extrinsic = {name: self._camera_from_lidar(name) for name in _CAMERA_NAMES}
 
     def facts(self, number: int, output: Output) -> dict[str, Any]:
-        """All that the file of a frame says; frames are counted from 1. What it leaves out is counted in `output`."""
-        at = number - 1
-        ego = carla_six(self._world_from_ego[at]).tolist()
-        world_from_lidar = self._world_from_ego[at] @ self._ego_from[at, CHANNELS.index(LIDAR)]
+        """Return the content of a frame's file, and count boxes that it leaves out.
+
+        Args:
+            number: Number of the frame, from 1.
+            output: Output that counts the boxes.
+        """
+        index = number - 1
+        ego = carla_six(self._world_from_ego[index]).tolist()
+        world_from_lidar = (
+            self._world_from_ego[index] @ self._ego_from[index, CHANNELS.index(LIDAR)]
+        )
+        raw_world_from_lidar = flip_pose(world_from_lidar)
+        cameras = {}
+        for camera, name in _CAMERA_NAMES.items():
+            cameras[name] = self._camera(camera, index, raw_world_from_lidar)
+        # the driven path; a recording has no planned speeds, so they are 0
+        driven_path = carla_six(self._world_from_ego[number:])[:, :2].tolist()
         return {
-            **{
-                theirs: self._camera(ours, at, flip_pose(world_from_lidar))
-                for ours, theirs in _CAMERA_NAMES.items()
-            },
-            "ego_speed": self._speed(at),
+            **cameras,
+            "ego_speed": self._speed(index),
             "lidar_pose": carla_six(world_from_lidar).tolist(),
-            "plan_trajectory": [  # where it went; a recording has no planned speed
-                [x, y, 0.0] for x, y in carla_six(self._world_from_ego[number:])[:, :2].tolist()
-            ],
+            "plan_trajectory": [[x, y, 0.0] for x, y in driven_path],
             "predicted_ego_pos": list(ego),  # no noise
             "true_ego_pos": ego,
-            "vehicles": self._vehicles(at, output),
+            "vehicles": self._vehicles(index, output),
         }
 
-    def _vehicles(self, at: int, output: Output) -> dict[int, dict[str, Any]]:
-        """Those that the agent's LiDAR hits, without the agent itself, as in OPV2V, which merges boxes by id."""
-        if not self._labelled[at]:
+    def _vehicles(self, index: int, output: Output) -> dict[int, dict[str, Any]]:
+        """Return the boxes that the agent's LiDAR hits, without the agent itself.
+
+        So does OPV2V, which merges boxes by id.
+        """
+        if not self._labelled[index]:
             output.leave_out("labels that are not in this release")
-        boxes = self._dataset.boxes(self.samples[at], "world")
-        for what, is_kept in self._kept.items():
-            kept = is_kept(boxes)
-            output.leave_out(what, int(np.count_nonzero(~kept)))
-            boxes = boxes.select(kept)
+        boxes = self._dataset.boxes(self.samples[index], "world")
+        for kind, is_retained in self._filters.items():
+            retained = is_retained(boxes)
+            output.leave_out(kind, int(np.count_nonzero(~retained)))
+            boxes = boxes.select(retained)
         pose = np.zeros((len(boxes), 4, 4))
         pose[:, :3, :3], pose[:, :3, 3], pose[:, 3, 3] = to_matrix(boxes.rotation), boxes.center, 1
         six = carla_six(pose)
-        half = boxes.size / 2
-        # loaders add `center` to `location` without turning it
-        center = np.column_stack([np.zeros((len(boxes), 2)), half[:, 2]])
-        speed = np.linalg.norm(np.nan_to_num(boxes.velocity), axis=1) * _KMH
-        return {
-            actor: {
-                "angle": angle,
-                "center": middle,
-                "extent": extent,
-                "location": location,
-                "speed": kmh,
-            }
-            for actor, angle, middle, extent, location, kmh in zip(
-                boxes.actor_id.tolist(),
-                six[:, 3:].tolist(),
-                center.tolist(),
-                half.tolist(),
-                (six[:, :3] - center).tolist(),
-                speed.tolist(),
-                strict=True,
-            )
+        half_size = boxes.size / 2
+        # loaders add `center` to `location` without rotating it
+        center = np.column_stack([np.zeros((len(boxes), 2)), half_size[:, 2]])
+        speed = np.linalg.norm(np.nan_to_num(boxes.velocity), axis=1) * _KMH_PER_MPS
+        columns = {
+            "angle": six[:, 3:].tolist(),
+            "center": center.tolist(),
+            "extent": half_size.tolist(),
+            "location": (six[:, :3] - center).tolist(),
+            "speed": speed.tolist(),
         }
+        vehicles = {}
+        for row, actor in enumerate(boxes.actor_id.tolist()):
+            vehicles[actor] = {name: values[row] for name, values in columns.items()}
+        return vehicles
 
-    def _camera(self, name: str, at: int, raw_world_from_lidar: FloatArray) -> dict[str, Any]:
-        lidar_to_camera = self._extrinsic[name][at]
-        lens = stored_camera(
-            self._dataset, f"{self.samples[at]}/{name}", self._files[name].get(at + 1)
-        )
+    def _camera(self, name: str, index: int, raw_world_from_lidar: FloatArray) -> dict[str, Any]:
+        """Return pose, extrinsic and intrinsic of a camera in a frame."""
+        token = f"{self.samples[index]}/{name}"
+        lens = stored_camera(self._dataset, token, self._files[name].get(index + 1))
+        lidar_to_camera = self._extrinsic[name][index]
+        raw_world_from_camera = raw_world_from_lidar @ inverses(lidar_to_camera)
         return {
-            "cords": carla_six(
-                flip_pose(raw_world_from_lidar @ inverses(lidar_to_camera))
-            ).tolist(),
+            "cords": carla_six(flip_pose(raw_world_from_camera)).tolist(),
             "extrinsic": lidar_to_camera.tolist(),
             "intrinsic": lens.intrinsic.tolist(),
         }
 
     def _camera_from_lidar(self, name: str) -> FloatArray:
-        """(N, 4, 4) LiDAR → camera in CARLA's axes, as calib files have it."""
+        """Return LiDAR → camera (N, 4, 4) in CARLA's axes, as in calib files."""
         ego_from_camera = self._ego_from[:, CHANNELS.index(name)]
         return camera_from_lidar_to_raw(
             inverses(ego_from_camera) @ self._ego_from[:, CHANNELS.index(LIDAR)]
         )
 
-    def _speed(self, at: int) -> float:
-        """The agent's, in km/h: the label's; without a label by its positions."""
-        velocity = self._velocity[at]
+    def _speed(self, index: int) -> float:
+        """Return the agent's speed in km/h by its label, or without a label by its positions."""
+        velocity = self._velocity[index]
         if np.isnan(velocity).any():
-            near = self._world_from_ego[max(at - 1, 0) : at + 2, :2, 3]
-            seconds = max(len(near) - 1, 1) * FRAME_PERIOD
-            velocity = (near[-1] - near[0]) / seconds
-        return float(np.hypot(*velocity)) * _KMH
+            positions = self._world_from_ego[max(index - 1, 0) : index + 2, :2, 3]
+            seconds = max(len(positions) - 1, 1) * FRAME_PERIOD
+            velocity = (positions[-1] - positions[0]) / seconds
+        return float(np.hypot(*velocity)) * _KMH_PER_MPS
 
 
 def carla_six(pose: ArrayLike) -> FloatArray:
-    """Right-handed rigid matrices (…, 4, 4) → CARLA's (…, 6): x, y, z in metres, roll, yaw, pitch in degrees.
+    """Return CARLA's poses (…, 6) of right-handed rigid matrices (…, 4, 4).
 
-    Left-handed, as CARLA's `Transform` and OpenCOOD's `x_to_world` have them: yaw clockwise from above, pitch upwards.
+    They are x, y, z in metres, roll, yaw, pitch in degrees, left-handed as in CARLA's `Transform`
+    and OpenCOOD's `x_to_world`: yaw clockwise from above, pitch upwards.
     """
-    m = flip_pose(pose)
-    roll = np.arctan2(-m[..., 2, 1], m[..., 2, 2])
-    yaw = np.arctan2(m[..., 1, 0], m[..., 0, 0])
-    pitch = np.arcsin(np.clip(m[..., 2, 0], -1.0, 1.0))
+    matrix = flip_pose(pose)
+    roll = np.arctan2(-matrix[..., 2, 1], matrix[..., 2, 2])
+    yaw = np.arctan2(matrix[..., 1, 0], matrix[..., 0, 0])
+    pitch = np.arcsin(np.clip(matrix[..., 2, 0], -1.0, 1.0))
     angles = np.degrees(np.stack([roll, yaw, pitch], axis=-1))
-    return np.concatenate([m[..., :3, 3], angles], axis=-1)
+    return np.concatenate([matrix[..., :3, 3], angles], axis=-1)
 
 
 def pcd_bytes(points: AnyArray) -> bytes:
-    """A binary `.pcd` of points (N, 4): x, y, z, intensity in [0, 1], which gets the 8 bits of red.
+    """Return a binary `.pcd` of points (N, 4): x, y, z, intensity in [0, 1].
 
-    A field `intensity` would not do: Open3D ignores it, and OpenCOOD reads the red channel.
+    The intensity goes into the 8 bits of red, since Open3D ignores a field `intensity`, and
+    OpenCOOD reads the red channel.
     """
-    cloud = np.zeros(len(points), dtype=_POINT)
+    cloud = np.zeros(len(points), dtype=_POINT_DTYPE)
     cloud["x"], cloud["y"], cloud["z"] = points[:, :3].T
     cloud["rgb"] = np.round(255 * np.clip(points[:, 3], 0, 1)).astype(np.uint32) << 16
     header = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\n"
-        f"COUNT 1 1 1 1\nWIDTH {len(cloud)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(cloud)}\nDATA binary\n"
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 "
+        f"4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH {len(cloud)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 "
+        f"0\nPOINTS {len(cloud)}\nDATA binary\n"
     )
     return header.encode() + cloud.tobytes()

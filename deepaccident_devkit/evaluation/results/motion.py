@@ -1,4 +1,4 @@
-"""Motion results in a folder: how they are stored, the manifest of their shards, and the arrays in these.
+"""Motion results in a folder: their form, the manifest of their shards, and the shards' arrays.
 
 Arrays are never unpickled, and never larger than expected.
 """
@@ -28,9 +28,9 @@ from deepaccident_devkit.evaluation.results.records import (
     ResultsTask,
     Shard,
     Stored,
-    at,
     check_token,
     fault_of,
+    locate_errors,
 )
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
@@ -48,23 +48,25 @@ from deepaccident_devkit.support.reading import (
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# Name of a sample's array in the archive, of its token and the array's name.
+# Path of an array in the archive, for a sample's token and the array's name.
 MEMBER: Final = "{}/{}.npy"
-# Map → its channels.
+# Map → number of its channels.
 HEADS: Final[Mapping[str, int]] = {"segmentation": 2, "centerness": 1, "offset": 2, "flow": 2}
-# Arrays that earlier files have beside their maps, which say the same.
+# Arrays that earlier files have beside their maps, with the same content.
 NOT_READ: Final = ("trajectory_id", "trajectory")
-# Cells over all frames and predictions of a sample, twenty times as many as ten released predictions have. A small
-# archive can hold more, but memory cannot.
-_MOST_VALUES: Final = 2**26
-# Bytes of a number.
-_WIDEST: Final = 8
-_LONGEST_HEADER: Final = 1 << 16
-# How an array's member begins.
-_NPY: Final = b"\x93NUMPY\x01\x00"
-_KINDS: Final = {"u": "unsigned whole numbers", "i": "whole numbers", "f": "floats"}
-_HIGHEST_ID: Final = 2**31 - 1
-_OPEN_FILES: Final = 8
+# Number of cells over all frames and predictions of a sample, twenty times that of ten released
+# predictions. A small archive can hold more, but memory cannot.
+_MAX_CELLS: Final = 2**26
+# Bytes of a number, and of the header of an array.
+_MAX_NUMBER_BYTES: Final = 8
+_MAX_HEADER_BYTES: Final = 1 << 16
+# First bytes of an array's file.
+_NPY_MAGIC: Final = b"\x93NUMPY\x01\x00"
+_KIND_NAMES: Final = {"u": "unsigned whole numbers", "i": "whole numbers", "f": "floats"}
+_MAX_ID: Final = 2**31 - 1
+_MAX_OPEN_FILES: Final = 8
+# Tolerance of a step in frames.
+_FRAME_TOLERANCE: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,11 +75,13 @@ class MotionForm:
 
     Attributes:
         stored: `instances`: maps of ids; `heads`: the model's own maps.
-        grid: the cells; its orientation is how the maps lie.
-        predictions: how many a sample has at most, K; of several, the last one is the mean.
-        frames: T, the present one first.
-        step: seconds from one frame to the next, a whole number of recorded frames (0.1 s).
-        labels: name of the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned from; None if not known.
+        grid: BEV grid of the maps, with their orientation.
+        predictions: Largest number K of predictions of a sample; of several, the last one is the
+            mean.
+        frames: Number T of frames, the present one first.
+        step: Seconds between frames, a whole number of recorded frames (0.1 s).
+        labels: Name of the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned from;
+            None if not known.
     """
 
     stored: Stored
@@ -91,28 +95,32 @@ class MotionForm:
         """Check the values; raises ResultsError that names the field."""
         if not isinstance(self.grid, BevGrid):
             raise ResultsError(f"grid: expected a BevGrid, found {type(self.grid).__name__}")
-        settle_choices(
-            self,
-            {"stored": get_args(Stored), "labels": (*LABEL_PROTOCOLS, None)},
-            error=ResultsError,
-        )
+        allowed = {"stored": get_args(Stored), "labels": (*LABEL_PROTOCOLS, None)}
+        settle_choices(self, allowed, error=ResultsError)
         for name in ("predictions", "frames"):
-            if type(value := getattr(self, name)) is not int or value < 1:
+            value = getattr(self, name)
+            if type(value) is not int or value < 1:
                 raise ResultsError(f"{name}: expected a whole number from 1, found {value!r}")
         object.__setattr__(self, "step", checked_number("step", self.step, error=ResultsError))
-        steps = self.step / FRAME_PERIOD
-        if not (math.isfinite(steps) and steps > 0.5 and abs(steps - round(steps)) < 1e-6):
+        self._check_step()
+        if self.predictions * self.frames * self.grid.cells > _MAX_CELLS:
             raise ResultsError(
-                f"step: expected seconds, a whole number of recorded frames of 0.1 s, found {self.step!r}"
+                f"form: {self.predictions} predictions of {self.frames} frames of "
+                f"{self.grid.cells} cells are more than memory holds; store fewer"
             )
-        if self.predictions * self.frames * self.grid.cells > _MOST_VALUES:
+
+    def _check_step(self) -> None:
+        """Raise ResultsError unless the step is a whole number of recorded frames."""
+        frames = self.step / FRAME_PERIOD
+        is_positive = math.isfinite(frames) and frames > 0.5
+        if not (is_positive and abs(frames - round(frames)) < _FRAME_TOLERANCE):
             raise ResultsError(
-                f"form: {self.predictions} predictions of {self.frames} frames of {self.grid.cells} cells are more "
-                "than memory holds; store fewer"
+                "step: expected seconds, a whole number of recorded frames of 0.1 s, found "
+                f"{self.step!r}"
             )
 
     def as_dict(self) -> dict[str, Any]:
-        """The form as JSON holds it."""
+        """Return the form as JSON."""
         return {
             "stored": self.stored,
             "x": list(self.grid.x),
@@ -125,91 +133,100 @@ class MotionForm:
         }
 
     @classmethod
-    def from_record(cls, told: FormRecord) -> MotionForm:
-        """The form that JSON holds; raises ContentError that names the field."""
+    def from_record(cls, record: FormRecord) -> MotionForm:
+        """Return the form of a JSON record; raises ContentError that names the field."""
         try:
-            grid = BevGrid(told.x, told.y, told.orientation)
-            others = {
-                name: getattr(told, name)
-                for name in ("stored", "predictions", "frames", "step", "labels")
-            }
-            return cls(grid=grid, **others)
+            return cls(
+                grid=BevGrid(record.x, record.y, record.orientation),
+                stored=record.stored,
+                predictions=record.predictions,
+                frames=record.frames,
+                step=record.step,
+                labels=record.labels,
+            )
         except DeepAccidentError as error:
             raise ContentError(str(error)) from error
 
 
 class MotionContents:
-    """Motion, in the shards of a folder, as `reader.EntryContents` has other predictions."""
+    """Motion in the shards of a folder; the counterpart of `reader.EntryContents`."""
 
     task: ResultsTask = "motion"
 
     def __init__(self, path: Path, meta: Mapping[str, Any], document: MotionFile) -> None:
-        """Check the manifest, and that its shards exist and have their sizes; raises ContentError."""
+        """Check the manifest, and the existence and size of its shards; raises ContentError."""
         self._path, self._root = path, path.parent
         self.meta = meta
         self.shards = document.shards
-        with at("form"):
+        with locate_errors("form"):
             self.form = MotionForm.from_record(document.form)
         self._shard_of = _shards_of(document.shards, path.parent)
         self.tokens: Collection[str] = self._shard_of.keys()
 
     def prediction(self, token: str) -> MotionOutput:
-        """The prediction of a sample; raises ResultsError."""
-        shard, within = self._shard_of[token], ""
+        """Return the prediction of a sample; raises ResultsError."""
+        shard = self._shard_of[token]
+        failed_token = ""
         try:
             archive = shared_archive(self._root, shard, os.getpid())
-            within = token
-            return stored_output(archive, token, self.form)
+            failed_token = token
+            return read_output(archive, token, self.form)
         except (ContentError, OSError) as error:
-            raise fault_of(self._path, error, shard.file, within) from error
+            raise fault_of(self._path, error, shard.file, failed_token) from error
 
-    def check(self, **how: Any) -> None:
-        """Read every array, as `run_batch` is told; raises ResultsError that names shard, token and array."""
+    def check(self, **engine: Any) -> None:
+        """Read every array; raises ResultsError that names shard, token and array.
+
+        Args:
+            **engine: Arguments of `run_batch`.
+        """
         check = partial(check_shard, self._root, self.form)
-        run_batch(check, self.shards, label="shards", places=Places(reads=(self._root,)), **how)
+        run_batch(check, self.shards, label="shards", places=Places(reads=(self._root,)), **engine)
 
 
 def _shards_of(shards: Sequence[Shard], root: Path) -> dict[str, Shard]:
-    """Token → its shard, in the order of the shards; raises ContentError that names the field, or the shard."""
+    """Return token → its shard, in the order of the shards.
+
+    Raises ContentError that names the field, or the shard.
+    """
     shard_of: dict[str, Shard] = {}
     files: set[str] = set()
     for number, shard in enumerate(shards):
-        with at(f"shards[{number}]"):
+        with locate_errors(f"shards[{number}]"):
             _check_file(shard, root, files)
         files.add(shard.file)
         for token in shard.tokens:
-            with at(f"shards[{number}].tokens"):
+            with locate_errors(f"shards[{number}].tokens"):
                 check_token(token)
             if token in shard_of:
-                others = "twice" if shard_of[token] is shard else f"also in {shard_of[token].file}"
+                owner = shard_of[token]
+                repetition = "twice" if owner is shard else f"also in {owner.file}"
                 raise ContentError(
-                    f"{shard.file}: {token}: stands there {others}; store a sample once"
+                    f"{shard.file}: {token}: stands there {repetition}; store a sample once"
                 )
             shard_of[token] = shard
     return shard_of
 
 
-def _check_file(shard: Shard, root: Path, others: AbstractSet[str]) -> None:
-    """Whether a shard's file is there, as long as it should be, in the folder, and not another shard's too."""
-    if (
-        not shard.file.isprintable()
-        or "\\" in shard.file
-        or not _is_inside(PurePosixPath(shard.file))
-    ):
+def _check_file(shard: Shard, root: Path, other_files: AbstractSet[str]) -> None:
+    """Raise ContentError unless a shard's file is in the folder, complete, and listed once."""
+    is_printable = shard.file.isprintable() and "\\" not in shard.file
+    if not is_printable or not _is_inside(PurePosixPath(shard.file)):
         raise ContentError(
-            f"file: expected a path inside the folder of the results, found {shortened(shard.file)!r}"
+            "file: expected a path inside the folder of the results, found "
+            f"{shortened(shard.file)!r}"
         )
     path = root / shard.file
-    if shard.file in others:
+    if shard.file in other_files:
         raise ContentError(f"file: {shard.file} is another entry's too; list each file once")
     try:
         status = path.stat()
-        inside = path.resolve().is_relative_to(root.resolve())
+        is_in_folder = path.resolve().is_relative_to(root.resolve())
     except OSError as error:
         raise ContentError(
             f"file: {shard.file} cannot be opened ({error.strerror}); copy it to its place"
         ) from error
-    if not inside:
+    if not is_in_folder:
         raise ContentError(
             f"file: {shard.file} is a link that leads out of the folder; put the file itself there"
         )
@@ -227,18 +244,18 @@ def _is_inside(path: PurePosixPath) -> bool:
     return not path.is_absolute() and path.parts != () and ".." not in path.parts
 
 
-@lru_cache(maxsize=_OPEN_FILES)
+@lru_cache(maxsize=_MAX_OPEN_FILES)
 def shared_archive(root: Path, shard: Shard, _process: int) -> zipfile.ZipFile:
-    """A shard's archive, one of the last few, which stay open; raises ContentError.
+    """Return a shard's archive; the most recent archives stay open. Raises ContentError.
 
-    Threads may share it, so the garbage collector closes it. A fork shares positions in open files with its parent, and
-    so must name its own process.
+    Threads may share it, so the garbage collector closes it. A fork shares positions in open files
+    with its parent, and so must pass its own process id.
     """
-    return opened(root, shard)
+    return open_archive(root, shard)
 
 
-def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
-    """A shard's archive; raises ContentError."""
+def open_archive(root: Path, shard: Shard) -> zipfile.ZipFile:
+    """Open a shard's archive; raises ContentError."""
     try:
         return open_zip(root / shard.file)
     except DAMAGED_ARCHIVE as error:
@@ -248,55 +265,62 @@ def opened(root: Path, shard: Shard) -> zipfile.ZipFile:
 
 
 def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
-    """Read all of a shard of the results in a folder; raises ResultsError that names shard, token and array."""
-    path, within = root / shard.file, ""
+    """Read a shard of the results in a folder; raises ResultsError with shard, token and array."""
+    path = root / shard.file
+    token = ""
     try:
         if path.stat().st_size != shard.bytes or file_checksum(path) != shard.checksum:
             raise ContentError(
-                "its bytes are not those that the checksum is of; copy it again from where it was made"
+                "its bytes are not those that the checksum is of; copy it again from where it was "
+                "made"
             )
-        with opened(root, shard) as archive:
+        with open_archive(root, shard) as archive:
             _check_members(archive, shard, form)
-            for within in shard.tokens:
-                stored_output(archive, within, form)
+            for token in shard.tokens:
+                read_output(archive, token, form)
     except (ContentError, OSError) as error:
-        raise fault_of(root / RESULTS_FILE, error, shard.file, within) from error
+        raise fault_of(root / RESULTS_FILE, error, shard.file, token) from error
 
 
 def _check_members(archive: zipfile.ZipFile, shard: Shard, form: MotionForm) -> None:
-    tokens, arrays = set(shard.tokens), set(map("{}.npy".format, (*members(form), *NOT_READ)))
-    for name, times in Counter(archive.namelist()).items():
+    """Raise ContentError if an archive has foreign or repeated members."""
+    tokens = set(shard.tokens)
+    arrays = {f"{name}.npy" for name in (*array_layout(form), *NOT_READ)}
+    for name, count in Counter(archive.namelist()).items():
         token, _, array = name.rpartition("/")
         if token not in tokens or array not in arrays:
             raise ContentError(
                 f"{name}: belongs to no sample of the shard; store the arrays of its tokens alone"
             )
-        if times > 1:
-            raise ContentError(f"{name}: stands there {times} times; store each array once")
+        if count > 1:
+            raise ContentError(f"{name}: stands there {count} times; store each array once")
 
 
-def members(form: MotionForm) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Array of each sample → its shape, whose first axis may be shorter, and numpy's letters of its kinds."""
+def array_layout(form: MotionForm) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return array of each sample → its shape and numpy's letters of its kinds.
+
+    The first axis may be shorter.
+    """
     maps, cells = (form.predictions, form.frames), form.grid.shape
     if form.stored == "instances":
         return {"instance": ((*maps, *cells), "ui")}
     return {name: ((*maps, channels, *cells), "f") for name, channels in HEADS.items()}
 
 
-def stored_output(archive: zipfile.ZipFile, token: str, form: MotionForm) -> MotionOutput:
-    """The prediction of a sample; raises ContentError that begins with the array's name."""
+def read_output(archive: zipfile.ZipFile, token: str, form: MotionForm) -> MotionOutput:
+    """Return the prediction of a sample; raises ContentError that begins with the array's name."""
     arrays: dict[str, AnyArray] = {}
     name = ""
     try:
-        for name, (shape, kinds) in members(form).items():
-            arrays[name] = take_array(archive, MEMBER.format(token, name), shape, kinds)
+        for name, (shape, kinds) in array_layout(form).items():
+            arrays[name] = read_array(archive, MEMBER.format(token, name), shape, kinds)
     except ContentError as error:
         raise ContentError(f"{name}: {error}") from error
     if form.stored == "instances":
         maps = arrays["instance"]
-        if maps.min() < 0 or maps.max() > _HIGHEST_ID:
+        if maps.min() < 0 or maps.max() > _MAX_ID:
             raise ContentError(
-                f"instance: expected ids from 0 to {_HIGHEST_ID}, found {maps.min()} to {maps.max()}"
+                f"instance: expected ids from 0 to {_MAX_ID}, found {maps.min()} to {maps.max()}"
             )
         return MotionOutput(grid=form.grid, instances=maps.astype(np.int32))
     try:
@@ -305,17 +329,26 @@ def stored_output(archive: zipfile.ZipFile, token: str, form: MotionForm) -> Mot
         raise ContentError(str(error)) from error
 
 
-def take_array(archive: zipfile.ZipFile, member: str, shape: Sequence[int], kinds: str) -> AnyArray:
-    """An array of an archive, as long as the shape or shorter, else it is not decompressed; raises ContentError."""
+def read_array(archive: zipfile.ZipFile, member: str, shape: Sequence[int], kinds: str) -> AnyArray:
+    """Return an array of an archive, as long as the shape or shorter; raises ContentError.
+
+    An array that takes more bytes is not decompressed.
+
+    Args:
+        archive: The archive.
+        member: Path in the archive.
+        shape: Expected shape.
+        kinds: numpy's letters of the expected kinds.
+    """
     try:
         entry = archive.getinfo(member)
     except KeyError:
         raise ContentError(f"is missing; expected the member {member}") from None
     expected = f"expected shape (1 to {shape[0]}, {', '.join(map(str, shape[1:]))})"
-    most = math.prod(shape) * _WIDEST + _LONGEST_HEADER
-    if entry.file_size > most:
+    max_bytes = math.prod(shape) * _MAX_NUMBER_BYTES + _MAX_HEADER_BYTES
+    if entry.file_size > max_bytes:
         raise ContentError(
-            f"{expected}, which has at most {most:,} bytes, found {entry.file_size:,} bytes"
+            f"{expected}, which has at most {max_bytes:,} bytes, found {entry.file_size:,} bytes"
         )
     try:
         content = read_member(archive, entry, "results")
@@ -324,16 +357,13 @@ def take_array(archive: zipfile.ZipFile, member: str, shape: Sequence[int], kind
         raise ContentError(
             f"cannot be read ({error}); the file is damaged, copy it again"
         ) from error
-    if not content.startswith(_NPY):
+    if not content.startswith(_NPY_MAGIC):
         raise ContentError("expected npy format 1.0, as numpy.save writes numbers")
     if array.dtype.kind not in kinds:
         raise ContentError(
-            f"expected {' or '.join(_KINDS[kind] for kind in kinds)}, found {array.dtype}"
+            f"expected {' or '.join(_KIND_NAMES[kind] for kind in kinds)}, found {array.dtype}"
         )
-    if (
-        array.ndim != len(shape)
-        or not 1 <= len(array) <= shape[0]
-        or array.shape[1:] != tuple(shape[1:])
-    ):
+    has_shape = array.ndim == len(shape) and array.shape[1:] == tuple(shape[1:])
+    if not has_shape or not 1 <= len(array) <= shape[0]:
         raise ContentError(f"{expected}, found {array.shape}")
     return array

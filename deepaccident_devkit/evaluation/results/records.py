@@ -1,4 +1,4 @@
-"""What results files hold: the records, which schema/results is made of, reading them, and how faults are told."""
+"""Records of results files, which schema/results is made of, and their strict reader."""
 
 from __future__ import annotations
 
@@ -27,22 +27,23 @@ from deepaccident_devkit.taxonomy import CATEGORIES
 ResultsTask = Literal["motion", "accident", "detection", "planning", "forecasting"]
 Stored = Literal["instances", "heads"]
 _Format = Literal["DeepAccident results"]
-# Counted up with what files hold.
+# Incremented when the contents of files change.
 Version = Literal[1]
 FORMAT: Final = get_args(_Format)[0]
 FORMAT_VERSION: Final = get_args(Version)[0]
 RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(
     {name: name if name == "motion" else f"{name}.json" for name in get_args(ResultsTask)}
 )
-"""Task → the name of its file, of motion a folder, where results of all tasks are written into one folder."""
-# The manifest of motion results, in their folder; results of the other tasks in a folder are called so too.
+"""Task → name of its file (for motion a folder), if results of all tasks share a folder."""
+# Name of the manifest of motion results in their folder, and of other results in a folder.
 RESULTS_FILE: Final = "results.json"
-# A regular expression of tokens: words with `/` between.
+# Regular expression of tokens: words separated by `/`.
 WORDS: Final = r"^[^/\\]+(/[^/\\]+)*$"
-# Metres, seconds, metres a second: larger numbers are mistakes, and squares of the largest floats overflow.
-LARGEST: Final = 1e6
-_Measure = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-FromZero = Annotated[float, Meta(ge=0, le=LARGEST)]
+# Largest value in metres, seconds, or metres a second: larger numbers are mistakes, and squares of
+# the largest floats overflow.
+MAX_MEASURE: Final = 1e6
+_Measure = Annotated[float, Meta(ge=-MAX_MEASURE, le=MAX_MEASURE)]
+FromZero = Annotated[float, Meta(ge=0, le=MAX_MEASURE)]
 Count = Annotated[int, Meta(ge=1)]
 ActorId = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Token = Annotated[str, Meta(extra_json_schema={"pattern": WORDS})]
@@ -50,14 +51,14 @@ Token = Annotated[str, Meta(extra_json_schema={"pattern": WORDS})]
 Ignored = Annotated[msgspec.Raw | UnsetType, Meta(description="Ignored.")]
 Kind = TypeVar("Kind")
 Entry = TypeVar("Entry", bound=msgspec.Struct)
-# From nuScenes' width, length, height to our length, width, height, and back.
+# Order of axes between nuScenes' width, length, height and the devkit's length, width, height.
 LENGTH_FIRST: Final = [1, 0, 2]
-# Characters of a wrong value that an error shows.
-_SHOWN: Final = 80
+# Number of characters of a wrong value that an error shows.
+_MAX_VALUE_LENGTH: Final = 80
 # The largest depth of nested objects and lists in `meta`, which people and reports read.
-_MOST_LEVELS: Final = 30
-# Characters.
-_LONGEST_TOKEN: Final = 1000
+_MAX_META_LEVELS: Final = 30
+# In characters.
+_MAX_TOKEN_LENGTH: Final = 1000
 
 
 class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
@@ -66,8 +67,8 @@ class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     positions: Annotated[
         tuple[tuple[_Measure, _Measure], tuple[_Measure, _Measure]],
         Meta(
-            description="Of the two that collide: x forward, y left, metres, in the present ego frame of the sample's "
-            "agent."
+            description="Of the two that collide: x forward, y left, metres, in the present ego "
+            "frame of the sample's agent."
         ),
     ]
     time: Annotated[FromZero, Meta(description="Seconds after the present.")]
@@ -95,7 +96,8 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     rotation: Annotated[
         tuple[float, float, float, float],
         Meta(
-            description="Unit quaternion w, x, y, z: the box's axes (x along its length) in the world."
+            description="Unit quaternion w, x, y, z: the box's axes (x along its length) in the "
+            "world."
         ),
     ]
     detection_name: Annotated[Literal[CATEGORIES], Meta(description="Category.")]  # type: ignore[valid-type]
@@ -125,7 +127,8 @@ class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
         list[Place],
         Meta(
             min_length=1,
-            description="Where its ego frame is at these times: x forward, y left, metres, in the present ego frame.",
+            description="Where its ego frame is at these times: x forward, y left, metres, in the "
+            "present ego frame.",
         ),
     ]
     score: Annotated[
@@ -134,7 +137,8 @@ class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     yaw: Annotated[
         list[_Measure] | UnsetType | None,
         Meta(
-            description="Its headings at these times, radians, counter-clockwise; null for those of the steps."
+            description="Its headings at these times, radians, counter-clockwise; null for those "
+            "of the steps."
         ),
     ] = UNSET
 
@@ -148,8 +152,8 @@ class ForecastEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
         list[list[Place]],
         Meta(
             min_length=1,
-            description="Of each mode where its box's centre is at these times: x forward, y left, metres, in the "
-            "present ego frame of the sample's agent.",
+            description="Of each mode where its box's centre is at these times: x forward, y "
+            "left, metres, in the present ego frame of the sample's agent.",
         ),
     ]
     probabilities: Annotated[
@@ -219,8 +223,8 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, tag_field=
 
     @property
     def task(self) -> ResultsTask:
-        """What its predictions are of."""
-        task: ResultsTask = self.__struct_config__.tag  # type: ignore[assignment]  # the class says which
+        """Kind of its predictions."""
+        task: ResultsTask = self.__struct_config__.tag  # type: ignore[assignment]  # the class has it
         return task
 
 
@@ -267,132 +271,167 @@ class MotionFile(_File, tag="motion"):
 ResultsFile: TypeAlias = MotionFile | AccidentFile | DetectionFile | PlanningFile | ForecastingFile
 
 
-def _schema(kind: type[_File]) -> dict[str, Any]:
-    made = msgspec.json.schema(kind)
-    title = f"{FORMAT}: {kind.__struct_config__.tag}"
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, **made}
+def _schema(file_type: type[_File]) -> dict[str, Any]:
+    title = f"{FORMAT}: {file_type.__struct_config__.tag}"
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": title,
+        **msgspec.json.schema(file_type),
+    }
 
 
 RESULT_SCHEMAS: Final = MappingProxyType(
-    {str(kind.__struct_config__.tag): _schema(kind) for kind in get_args(ResultsFile)}
+    {
+        str(file_type.__struct_config__.tag): _schema(file_type)
+        for file_type in get_args(ResultsFile)
+    }
 )
 """Task → schema of its JSON file: for motion that is the manifest.
 
-What a schema cannot say, `read_results` checks too: names that stand twice, NaN, unit quaternions, arrays.
+`read_results` also checks what a schema cannot express: repeated names, NaN, unit quaternions,
+arrays.
 """
 
 
 class ContentError(ValueError):
-    """What is wrong, as half a sentence; `fault_of` makes a ResultsError of it."""
+    """A fault of a file, as half a sentence; `fault_of` makes a ResultsError of it."""
 
 
 @contextmanager
-def at(place: str) -> Iterator[None]:
-    """Put the place before the message of an error."""
+def locate_errors(location: str) -> Iterator[None]:
+    """Put a location before the message of a ContentError."""
     try:
         yield
     except ContentError as error:
-        raise ContentError(f"{place}: {error}") from error
+        raise ContentError(f"{location}: {error}") from error
 
 
-def fault_of(path: Path, error: ContentError | OSError, *places: str) -> ResultsError:
-    """The error for what is found wrong at a place in a file, or for one that cannot be read, with the remedy."""
+def fault_of(path: Path, error: ContentError | OSError, *locations: str) -> ResultsError:
+    """Return the ResultsError for a fault at a location in a file, or for an unreadable file.
+
+    Its message includes the remedy.
+    """
     if isinstance(error, ContentError):
-        told = ": ".join(filter(None, (str(path), *places, str(error))))
-        return ResultsError(f"{told}; the format is described in schema/results/README.md")
+        message = ": ".join(filter(None, (str(path), *locations, str(error))))
+        return ResultsError(f"{message}; the format is described in schema/results/README.md")
     return ResultsError(f"{path}: {fault_text(error)}; give a results file that can be read")
 
 
-def shown(value: object) -> str:
-    """A value of a JSON file as it stands there, cut if it is long."""
+def json_excerpt(value: object) -> str:
+    """Return a value as JSON text, cut if it is long."""
     text = json.dumps(value, ensure_ascii=False, default=repr)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+    if len(text) <= _MAX_VALUE_LENGTH:
+        return text
+    return f"{text[:_MAX_VALUE_LENGTH]}…"
 
 
 def parsed_json(content: bytes, levels: int = json_text.MOST_LEVELS) -> Any:
-    """The value of JSON text; raises ContentError that names the place of a fault."""
+    """Return the value of JSON text; raises ContentError that names the location of a fault."""
     try:
         return json_text.parsed_json(content, levels=levels)
     except ValueError as error:
         raise ContentError(str(error)) from error
 
 
-def decoded(content: bytes, kind: type[Kind]) -> Kind:
-    """The record that JSON text describes; raises ContentError that names the place of a fault, and what it found.
+def decode_record(content: bytes, record_type: type[Kind]) -> Kind:
+    """Return the record that JSON text describes.
 
-    A name that stands twice in an object is not noticed.
+    A name that is repeated in an object is not noticed. A ContentError names the location of a
+    fault, and the value there.
     """
     try:
-        return msgspec.json.decode(content, type=kind)
+        return msgspec.json.decode(content, type=record_type)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        value = parsed_json(content)  # it says of NaN where it stands
-        said, _, place = str(error).partition(" - at `$")
-        place = place.strip(".`")
-        told = _told(
-            shortened(said[:1].lower() + said[1:], MOST_TOLD), value, inspect.type_info(kind), place
-        )
-        raise ContentError(f"{place}: {told}" if place else told) from error
+        value = parsed_json(content)  # names the location of NaN, which msgspec does not
+        text, _, location = str(error).partition(" - at `$")
+        location = location.strip(".`")
+        fault = shortened(text[:1].lower() + text[1:], MOST_TOLD)
+        message = _explain_fault(fault, value, inspect.type_info(record_type), location)
+        raise ContentError(f"{location}: {message}" if location else message) from error
 
 
-def _told(said: str, value: Any, kind: inspect.Type, place: str) -> str:
-    """What msgspec says of a value, with what it found at the place, and what it expected or means there."""
-    kinds, meaning = _single(kind), ""
+def _explain_fault(fault: str, value: Any, value_type: inspect.Type, location: str) -> str:
+    """Return the fault as msgspec reports it, with the value, and its expected values or meaning.
+
+    Args:
+        fault: Message of msgspec.
+        value: The parsed JSON.
+        value_type: Its expected type.
+        location: Location in the value, as in the message of msgspec.
+    """
+    types, meaning = _single_types(value_type), ""
     if isinstance(value, dict):
-        kinds = [each for each in kinds if getattr(each, "tag", None) == value.get("task")] or kinds
-    for part in re.findall(r"\w+|\.\.\.", place):
-        if part == "...":  # a name, which msgspec does not tell
-            return said
+        tagged = [kind for kind in types if getattr(kind, "tag", None) == value.get("task")]
+        types = tagged or types
+    for part in re.findall(r"\w+|\.\.\.", location):
+        if part == "...":  # a name, which msgspec does not report
+            return fault
         value = value[int(part) if isinstance(value, list) else part]
-        inner = [each for outer in kinds for each in _inner(outer, part)]
-        kinds = [each for whole in inner for each in _single(whole)]
-        notes = [
-            each.extra_json_schema or {} for each in inner if isinstance(each, inspect.Metadata)
-        ]
-        meaning = next(
-            (f" ({note['description']})" for note in notes if "description" in note), meaning
-        )
-    if said.startswith("object "):  # lacks a field, or has one too many
-        names = [
-            field.encode_name
-            for each in kinds
-            if isinstance(each, inspect.StructType)
-            for field in each.fields
-        ]
-        return f"{said} (expected {', '.join(names)})" if "unknown" in said and names else said
-    choices = [
-        str(word) for each in kinds if isinstance(each, inspect.LiteralType) for word in each.values
-    ]
+        inner_types = [inner for outer in types for inner in _inner_types(outer, part)]
+        types = [single for inner in inner_types for single in _single_types(inner)]
+        meaning = _meaning(inner_types) or meaning
+    if fault.startswith("object "):  # lacks a field, or has one too many
+        names = _field_names(types)
+        if "unknown" in fault and names:
+            return f"{fault} (expected {', '.join(names)})"
+        return fault
+    choices: list[str] = []
+    for kind in types:
+        if isinstance(kind, inspect.LiteralType):
+            choices += map(str, kind.values)
     if choices:
-        return (
-            f"expected {'one of ' * (len(choices) > 1)}{', '.join(choices)}, found {shown(value)}"
-        )
-    return f"{said.partition(', got ')[0]}, found {shown(value)}{meaning}"
+        one_of = ""
+        if len(choices) > 1:
+            one_of = "one of "
+        return f"expected {one_of}{', '.join(choices)}, found {json_excerpt(value)}"
+    return f"{fault.partition(', got ')[0]}, found {json_excerpt(value)}{meaning}"
 
 
-def _inner(kind: inspect.Type, part: str) -> Sequence[inspect.Type]:
-    """The kinds that a field or an entry of a value of a kind may have."""
-    if isinstance(kind, inspect.StructType):
-        return [each.type for each in kind.fields if each.encode_name == part] or [
-            inspect.LiteralType((kind.tag,))
-        ]
-    if isinstance(kind, inspect.TupleType):
-        return [kind.item_types[int(part)]]
-    return [kind.item_type] if isinstance(kind, inspect.ListType | inspect.VarTupleType) else []
+def _meaning(types: Sequence[inspect.Type]) -> str:
+    """Return the first description of types, in brackets; empty without any."""
+    for kind in types:
+        if isinstance(kind, inspect.Metadata):
+            schema = kind.extra_json_schema or {}
+            if "description" in schema:
+                return f" ({schema['description']})"
+    return ""
 
 
-def _single(kind: inspect.Type) -> list[inspect.Type]:
-    """The kinds that a kind joins, without notes on them."""
-    if isinstance(kind, inspect.Metadata):
-        return _single(kind.type)
-    return (
-        [part for each in kind.types for part in _single(each)]
-        if isinstance(kind, inspect.UnionType)
-        else [kind]
-    )
+def _field_names(types: Sequence[inspect.Type]) -> list[str]:
+    """Return the names of all fields of records."""
+    names = []
+    for kind in types:
+        if isinstance(kind, inspect.StructType):
+            names += [field.encode_name for field in kind.fields]
+    return names
+
+
+def _inner_types(outer: inspect.Type, part: str) -> Sequence[inspect.Type]:
+    """Return the possible types of a field, or of an entry, of a value of a type."""
+    if isinstance(outer, inspect.StructType):
+        types = [field.type for field in outer.fields if field.encode_name == part]
+        return types or [inspect.LiteralType((outer.tag,))]
+    if isinstance(outer, inspect.TupleType):
+        return [outer.item_types[int(part)]]
+    if isinstance(outer, inspect.ListType | inspect.VarTupleType):
+        return [outer.item_type]
+    return []
+
+
+def _single_types(joined: inspect.Type) -> list[inspect.Type]:
+    """Return the members of a union, without metadata."""
+    if isinstance(joined, inspect.Metadata):
+        return _single_types(joined.type)
+    if not isinstance(joined, inspect.UnionType):
+        return [joined]
+    members = []
+    for member in joined.types:
+        members += _single_types(member)
+    return members
 
 
 def json_meta(meta: object) -> dict[str, Any]:
-    """A copy of `meta` as JSON holds it; raises ContentError."""
+    """Return a copy of `meta` in JSON form; raises ContentError."""
     if not isinstance(meta, Mapping):
         raise ContentError(
             f"meta: expected a mapping of names to what JSON holds, found {type(meta).__name__}"
@@ -401,109 +440,108 @@ def json_meta(meta: object) -> dict[str, Any]:
         text = json.dumps(dict(meta), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
         raise ContentError(f"meta: cannot be written as JSON ({error})") from error
-    with at("meta"):
-        copied: dict[str, Any] = parsed_json(text.encode(), _MOST_LEVELS)
+    with locate_errors("meta"):
+        copied: dict[str, Any] = parsed_json(text.encode(), _MAX_META_LEVELS)
     return copied
 
 
 def check_token(token: object) -> str:
-    """A sample's token, if it could be one: words with `/` between; raises ContentError."""
+    """Return a sample's token; raises ContentError unless it is words separated by `/`."""
     if not isinstance(token, str):
-        raise ContentError(f"expected a sample's token, a text, found {shown(token)}")
-    good = len(token) <= _LONGEST_TOKEN and token.isprintable() and re.fullmatch(WORDS, token)
-    if not good or {".", ".."} & set(token.split("/")):
+        raise ContentError(f"expected a sample's token, a text, found {json_excerpt(token)}")
+    is_short = len(token) <= _MAX_TOKEN_LENGTH
+    has_words = is_short and token.isprintable() and re.fullmatch(WORDS, token)
+    if not has_words or {".", ".."} & set(token.split("/")):
         raise ContentError(
-            f"expected a sample's token, <scenario_type>/<name>/<agent>/<NNN>, found {shortened(token)!r}"
+            "expected a sample's token, <scenario_type>/<name>/<agent>/<NNN>, found "
+            f"{shortened(token)!r}"
         )
     return token
 
 
 class _Texts(msgspec.Struct):
-    """The entries of each sample, not yet read."""
+    """The raw entries of each sample."""
 
     results: dict[str, msgspec.Raw]
 
 
 def read_document(content: bytes, path: Path) -> tuple[ResultsFile, dict[str, Any]]:
-    """The records of a results file, and its meta; raises ContentError that names token and field, or ResultsError."""
+    """Return the records of a results file, and its meta.
+
+    Raises ContentError that names token and field, or ResultsError.
+    """
     try:
-        document: ResultsFile = decoded(content, ResultsFile)  # type: ignore[arg-type]  # a union is a kind too
+        document: ResultsFile = decode_record(content, ResultsFile)  # type: ignore[arg-type]  # a union is a type too
     except ContentError:
-        _tell(content, path)
+        _raise_located_fault(content, path)
         raise
     return document, json_meta(_strict_meta(content, document))
 
 
 def _strict_meta(content: bytes, document: ResultsFile) -> object:
-    """The meta of a document, where no name stands twice, and all that was not read is JSON as `parsed_json` has it.
+    """Return the meta of a document.
 
-    The records have as many names as the text has colons outside texts. Where it has more, the strict reader says why;
-    it takes four times as long.
+    No name in the document may be repeated, and all parts that were not decoded must be JSON for
+    `parsed_json`. The records have as many names as the text has colons outside texts. If the text
+    has more, the strict reader finds the fault; it takes four times as long.
     """
     if not isinstance(document, MotionFile):
-        record = ENTRY_RECORDS[document.task]
+        record_type = ENTRY_RECORDS[document.task]
+        fields = record_type.__struct_fields__
+        optional = fields[len(fields) - len(record_type.__struct_defaults__) :]
         entries = list(chain.from_iterable(document.results.values()))
-        optional = record.__struct_fields__[
-            len(record.__struct_fields__) - len(record.__struct_defaults__) :
-        ]
-        kinds = Counter(
-            chain.from_iterable(map(type, map(attrgetter(name), entries)) for name in optional)
-        )
-        ignored = (
-            [getattr(each, name) for each in entries for name in optional]
-            if kinds[msgspec.Raw]
-            else []
-        )
-        unread = b"[%s]" % b",".join(
-            [document.meta, *(each for each in ignored if isinstance(each, msgspec.Raw))]
-        )
+        values_by_field = (map(attrgetter(name), entries) for name in optional)
+        type_counts = Counter(chain.from_iterable(map(type, values) for values in values_by_field))
+        parts = [document.meta]
+        if type_counts[msgspec.Raw]:
+            optional_values = (getattr(entry, name) for entry in entries for name in optional)
+            parts += [value for value in optional_values if isinstance(value, msgspec.Raw)]
+        unread = b"[%s]" % b",".join(parts)
         # the file's own names, the task among them, those of samples, and those of entries
         names = (
-            len(document.__struct_fields__)
-            + 1
-            + len(document.results)
-            + len(entries) * len(record.__struct_fields__)
+            len(document.__struct_fields__) + 1 + len(document.results) + len(entries) * len(fields)
         )
+        present_names = names - type_counts[msgspec.UnsetType] + unread.count(b":")
         colons = np.count_nonzero(np.frombuffer(content, np.uint8) == ord(":"))
         with suppress(ContentError):
             meta, *_ = parsed_json(unread)
-            if names - kinds[msgspec.UnsetType] + unread.count(b":") == colons:
+            if present_names == colons:
                 return meta
     return parsed_json(content)["meta"]
 
 
-def _tell(content: bytes, path: Path) -> None:
-    """Say what is wrong with a results file, by its token or with its remedy, where that is known; raises."""
-    told = parsed_json(content)
-    if not isinstance(told, dict):
-        raise ContentError(f"expected a JSON object, found {shown(told)}")
-    if "format" not in told and "results" in told:
+def _raise_located_fault(content: bytes, path: Path) -> None:
+    """Raise the fault of a results file with its token or its remedy, where one is known."""
+    payload = parsed_json(content)
+    if not isinstance(payload, dict):
+        raise ContentError(f"expected a JSON object, found {json_excerpt(payload)}")
+    if "format" not in payload and "results" in payload:
         raise ContentError(
-            f'has no "format" (a nuScenes results file?); put "format": "{FORMAT}", "version": {FORMAT_VERSION} and '
-            '"task": "detection" before its "meta" and "results"'
+            f'has no "format" (a nuScenes results file?); put "format": "{FORMAT}", "version": '
+            f'{FORMAT_VERSION} and "task": "detection" before its "meta" and "results"'
         )
-    version = told.get("version")
-    if told.get("format") == FORMAT and type(version) is int and version != FORMAT_VERSION:
-        age, remedy = (
-            ("a newer", "update the devkit")
-            if version > FORMAT_VERSION
-            else ("an older", "write it again")
-        )
+    version = payload.get("version")
+    if payload.get("format") == FORMAT and type(version) is int and version != FORMAT_VERSION:
+        age, remedy = "an older", "write it again"
+        if version > FORMAT_VERSION:
+            age, remedy = "a newer", "update the devkit"
         raise ResultsError(
-            f"{path}: version: {age} results format ({shown(version)}, this devkit's is {FORMAT_VERSION}); {remedy}"
+            f"{path}: version: {age} results format ({json_excerpt(version)}, this devkit's is "
+            f"{FORMAT_VERSION}); {remedy}"
         )
-    record = ENTRY_RECORDS.get(str(told.get("task")))
-    if record is not None and isinstance(told.get("results"), dict):
-        for token, entries in decoded(content, _Texts).results.items():
-            with at(entry_place(token)):
-                read_entries(bytes(entries), record)
+    record_type = ENTRY_RECORDS.get(str(payload.get("task")))
+    if record_type is not None and isinstance(payload.get("results"), dict):
+        for token, entries in decode_record(content, _Texts).results.items():
+            with locate_errors(entry_place(token)):
+                read_entries(bytes(entries), record_type)
 
 
-def read_entries(content: bytes, record: type[Entry]) -> list[Entry]:
-    """A sample's entries; raises ContentError that names the number of the entry and the field."""
-    return decoded(content, list[record])  # type: ignore[valid-type]  # msgspec wants it so at run time
+def read_entries(content: bytes, record_type: type[Entry]) -> list[Entry]:
+    """Return a sample's entries; raises ContentError that names entry number and field."""
+    return decode_record(content, list[record_type])  # type: ignore[valid-type]  # a type at run time
 
 
 def entry_place(token: str, number: int | None = None) -> str:
-    """How errors name a sample's entries, or one of them."""
-    return f"results of {shortened(token)!r}" + ("" if number is None else f": [{number}]")
+    """Return how errors name a sample's entries, or one of them."""
+    suffix = "" if number is None else f": [{number}]"
+    return f"results of {shortened(token)!r}{suffix}"

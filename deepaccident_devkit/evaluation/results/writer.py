@@ -1,4 +1,4 @@
-"""`ResultsWriter`: writes predictions of many samples into a results file, completely or not at all."""
+"""`ResultsWriter` writes predictions of many samples to results, completely or not at all."""
 
 from __future__ import annotations
 
@@ -47,18 +47,21 @@ from deepaccident_devkit.support.reading import file_checksum, open_file, read_b
 from deepaccident_devkit.support.text import choice, counted, differing_text, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-# What is before and after the entries in a file; no line ends in the notes.
-_BODY, _END = ',\n"results": {', "\n}\n}\n"
-_FIRST_DATE: Final = (1980, 1, 1, 0, 0, 0)
-_MOST_SAMPLES: Final = 64
-MOST_BYTES: Final = 32 * 2**20
+# Texts before and after the entries in a file; the notes have no line ends.
+_BODY_START, _BODY_END = ',\n"results": {', "\n}\n}\n"
+# The earliest date of a zip archive.
+_ARCHIVE_DATE: Final = (1980, 1, 1, 0, 0, 0)
+# Number of samples, and of bytes, at which a shard is complete.
+_MAX_SHARD_SAMPLES: Final = 64
+MAX_SHARD_BYTES: Final = 32 * 2**20
 
 
 class ResultsWriter:
     """Writes results that `read_results` reads; used in a `with` statement.
 
-    The file, or for motion the folder, appears when the block ends well; after an exception there is nothing. Memory
-    does not grow with the samples, and the same predictions give the same bytes.
+    The file, or for motion the folder, appears when the block ends without an exception; otherwise
+    nothing does. Memory does not grow with the samples, and the same predictions give the same
+    bytes.
 
         with ResultsWriter("results/motion", "motion", meta={"method": "mine"}) as writer:
             for token in tokens:
@@ -79,33 +82,35 @@ class ResultsWriter:
         """Prepare to write; touches nothing.
 
         Args:
-            path: a file that is not there yet; for motion a folder that is not there, or empty.
-            task: of `RESULTS_NAMES`.
-            meta: what readers should know: method, training, author; as JSON holds it.
-            grid: of motion, that of all predictions; None takes the first one's.
-            step: of motion, seconds between two frames.
-            labels: of motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned from, which it is
-                compared with; None if it is not known.
-            store: of motion, `instances` keeps instance maps, some 30 KB a sample of five predictions; heads are
-                post-processed as the released evaluation of motion does (docs/released_code.md, Post-processing). The
-                released accident evaluation does that in its own way, and from instance maps its numbers differ
-                slightly. `heads` keeps the maps of the model as they are: 34 MB a sample of six predictions.
+            path: Path of a new file; for motion of a new or empty folder.
+            task: Name from `RESULTS_NAMES`.
+            meta: Notes for readers in JSON form: method, training, author.
+            grid: For motion, the BEV grid of all predictions; None for that of the first
+                prediction.
+            step: For motion, seconds between two frames.
+            labels: For motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned
+                from, which it is compared with; None if it is not known.
+            store: For motion, `instances` stores instance maps, about 30 KB a sample of five
+                predictions; heads are post-processed as in the released evaluation of motion
+                (docs/released_code.md, Post-processing). The released accident evaluation does that
+                in its own way, and from instance maps its numbers differ slightly. `heads` stores
+                the maps of the model unchanged: 34 MB a sample of six predictions.
 
         Raises:
             ChoiceError: no such task.
-            ResultsError: a value that cannot be written, or something stands at `path`.
+            ResultsError: a value that cannot be written, or something exists at `path`.
         """
         self.task = choice("task", task, get_args(ResultsTask))
         self.path = path_of(path).absolute()
         try:
-            told = json_meta({} if meta is None else meta)
+            notes = json_meta({} if meta is None else meta)
         except ContentError as error:
             raise ResultsError(str(error)) from error
         self._header = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
             "task": self.task,
-            "meta": told,
+            "meta": notes,
         }
         form = MotionForm(
             stored=store, grid=grid or BevGrid(), predictions=1, frames=1, step=step, labels=labels
@@ -122,13 +127,13 @@ class ResultsWriter:
         self._body: EntryWriter | ShardWriter | None = None
 
     def __repr__(self) -> str:
-        """Its task and path, and how many samples it has written."""
+        """Return its task and path, and how many samples it has written."""
         return f"ResultsWriter({self.task} to {self.path}: {counted(len(self._tokens), 'sample')})"
 
     def __enter__(self) -> ResultsWriter:
         """Begin beside the path; raises ResultsError if nothing can be written there."""
         self._check_free()
-        with _told(self.path), ExitStack() as stack:
+        with _naming_results(self.path), ExitStack() as stack:
             if self.task == "motion":
                 folder = stack.enter_context(replacing_folder(self.path))
                 self._body = ShardWriter(folder, self._header, **self._motion)
@@ -140,19 +145,20 @@ class ResultsWriter:
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        error_type: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Put the results in their place, or after an exception remove what was written."""
+        """Move the results to their path, or after an exception remove what was written."""
         body, self._body = self._body, None
-        if kind is not None:
-            self._stack.__exit__(kind, error, trace)
+        if error_type is not None:
+            self._stack.__exit__(error_type, error, trace)
             return
-        with _told(self.path), self._stack:
+        with _naming_results(self.path), self._stack:
             if body is None:
                 raise ResultsError(
-                    "a prediction could not be written, so that none is kept; write all of them again"
+                    "a prediction could not be written, so that none is kept; write all of them "
+                    "again"
                 )
             body.finish()
 
@@ -168,15 +174,15 @@ class ResultsWriter:
         """Write the prediction of a sample.
 
         Args:
-            token: of the sample; each one once. Whether the release has it is not known here: `check results
-                --dataroot` tells.
-            prediction: of motion a MotionOutput, all of one grid and number of frames; of accidents those that are
-                foreseen, [] for none; of detection the boxes, in the world frame; of planning one or more Plans; of
-                forecasting the Forecasts, one an actor.
+            token: Token of the sample, each once. It is not checked against the release:
+                `check results --dataroot` does that.
+            prediction: For motion a MotionOutput, all of one grid and number of frames; for
+                accidents the expected ones, [] for none; for detection the boxes, in the world
+                frame; for planning one or more Plans; for forecasting the Forecasts, one an actor.
 
         Raises:
-            ResultsError: the prediction is of another kind, grid or frame, the sample was added before, or nothing can
-                be written; the message begins with path and token.
+            ResultsError: the prediction is of another kind, grid or frame, the sample was added
+                before, or nothing can be written; the message begins with path and token.
         """
         body = self._opened()
         try:
@@ -188,66 +194,75 @@ class ResultsWriter:
             raise ResultsError(f"{self.path}: {token}: {error}") from error
         except OSError as error:
             self._body = None
-            raise _unwritten(self.path, error) from error
+            raise _write_error(self.path, error) from error
         self._tokens.add(token)
 
     def add_part(self, part: Results) -> None:
-        """Write all predictions of results that a `ResultsWriter` of the same arguments wrote, bytes as they are.
+        """Write all predictions of results that a `ResultsWriter` of the same arguments wrote.
+
+        The bytes are copied.
 
         Raises:
             ResultsError: nothing can be read or written.
         """
         body, self._body = self._opened(), None  # as `add` leaves it after an error of the system
-        with _told(self.path):
+        with _naming_results(self.path):
             body.add_part(part)
         self._body = body
         self._tokens.update(part.tokens)
 
     def _opened(self) -> EntryWriter | ShardWriter:
+        """Return the open writer; raises ResultsError outside a `with` statement."""
         if self._body is None:
             raise ResultsError(
-                f"{self.path}: is not open; add predictions inside `with ResultsWriter(…) as writer:`"
+                f"{self.path}: is not open; add predictions inside `with ResultsWriter(…) as "
+                "writer:`"
             )
         return self._body
 
     def _check_free(self) -> None:
-        with _told(self.path):
-            empty = self.task == "motion" and self.path.is_dir() and not any(self.path.iterdir())
-            if not empty and (self.path.exists() or self.path.is_symlink()):
+        """Raise ResultsError if anything but an empty folder for motion exists at the path."""
+        with _naming_results(self.path):
+            is_empty = self.task == "motion" and self.path.is_dir() and not any(self.path.iterdir())
+            if not is_empty and (self.path.exists() or self.path.is_symlink()):
                 raise ResultsError(
-                    f"{self.path}: is there already{self._other()}; choose another path, or remove it"
+                    f"{self.path}: is there already{self._existing_notes_text()}; choose another "
+                    "path, or remove it"
                 )
 
-    def _other(self) -> str:
-        """How the notes of results that are there differ, in brackets; empty where nothing is known."""
+    def _existing_notes_text(self) -> str:
+        """Return how the notes of existing results differ, in brackets; empty if there are none."""
         try:
-            there = read_results(self.path)
+            existing = read_results(self.path)
         except ResultsError:
             return ""
-        asked = self._header["meta"]
-        if there.meta.get("method") != asked.get("method"):  # all else differs with it
-            there_is, wanted = (shortened(repr(meta.get("method"))) for meta in (there.meta, asked))
-            return f" (of method {there_is}, not of {wanted})"
-        notes = (
-            {name: note for name, note in meta.items() if name != "bytes"}
-            for meta in (there.meta, asked)
-        )
-        return f" ({differing_text(*notes) or 'of other samples'})"  # bytes follow from the rest
+        old_meta, new_meta = existing.meta, self._header["meta"]
+        old_method, new_method = old_meta.get("method"), new_meta.get("method")
+        if old_method != new_method:  # all other notes differ with it
+            old_text, new_text = shortened(repr(old_method)), shortened(repr(new_method))
+            return f" (of method {old_text}, not of {new_text})"
+        text = differing_text(_without_bytes(old_meta), _without_bytes(new_meta))
+        return f" ({text or 'of other samples'})"
+
+
+def _without_bytes(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Return notes without `bytes`, which follow from the other notes."""
+    return {name: note for name, note in meta.items() if name != "bytes"}
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Raise ResultsError that names the results for an error of the system."""
+def _naming_results(path: Path) -> Iterator[None]:
+    """Turn errors of the system into a ResultsError that names the results."""
     try:
         yield
     except ResultsError as error:
         text = str(error)
         raise ResultsError(text if text.startswith(str(path)) else f"{path}: {text}") from error
     except OSError as error:
-        raise _unwritten(path, error) from error
+        raise _write_error(path, error) from error
 
 
-def _unwritten(path: Path, error: OSError) -> ResultsError:
+def _write_error(path: Path, error: OSError) -> ResultsError:
     return ResultsError(
         f"{path}: results cannot be written ({error}); make room there, or choose another path"
     )
@@ -258,33 +273,39 @@ class EntryWriter:
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
         """Begin a new file."""
-        self._entries, self._record = _ENTRIES[header["task"]], ENTRY_RECORDS[header["task"]]
+        task = header["task"]
+        self._make_entries, self._record_type = _ENTRIES[task], ENTRY_RECORDS[task]
         self._count = 0
         self._file = path.open("w", encoding="utf-8", newline="\n")
         for name, value in header.items():
-            self._file.write(
-                f"{',' if self._file.tell() else '{'}\n{json.dumps(name)}: {json.dumps(value)}"
-            )
-        self._file.write(_BODY)
+            separator = "," if self._file.tell() else "{"
+            self._file.write(f"{separator}\n{json.dumps(name)}: {json.dumps(value)}")
+        self._file.write(_BODY_START)
 
     def add(self, token: str, prediction: object) -> None:
-        """Write the entries of a sample; raises ResultsError or ContentError, and nothing of it is written then."""
-        entries = json.dumps(self._entries(token, prediction))
-        read_entries(entries.encode(), self._record)
-        self._file.write(f"{',' if self._count else ''}\n{json.dumps(token)}: {entries}")
+        """Write the entries of a sample.
+
+        Raises ResultsError or ContentError, and then writes nothing of the sample.
+        """
+        entries = json.dumps(self._make_entries(token, prediction))
+        read_entries(entries.encode(), self._record_type)
+        separator = "," if self._count else ""
+        self._file.write(f"{separator}\n{json.dumps(token)}: {entries}")
         self._count += 1
 
     def add_part(self, part: Results) -> None:
-        """Write the entries of a file that another of this class wrote."""
-        body = read_bytes(part.path, "results").decode().partition(_BODY)[2].removesuffix(_END)
-        self._file.write(f"{',' if self._count else ''}{body}")
+        """Copy the entries of a file that another writer of this class wrote."""
+        text = read_bytes(part.path, "results").decode()
+        body = text.partition(_BODY_START)[2].removesuffix(_BODY_END)
+        separator = "," if self._count else ""
+        self._file.write(f"{separator}{body}")
         self._count += len(part)
 
     def finish(self) -> None:
         """Write the end; raises ResultsError if nothing was added."""
         if not self._count:
             raise ResultsError("no prediction was added; results of no sample cannot be read")
-        self._file.write(_END)
+        self._file.write(_BODY_END)
         self.close()
 
     def close(self) -> None:
@@ -300,16 +321,17 @@ def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
         raise ResultsError(str(error)) from error
     if isinstance(accidents, MotionOutput):
         raise ResultsError(
-            "expected a list of Accidents, found a MotionOutput; write that to results of task 'motion'"
+            "expected a list of Accidents, found a MotionOutput; write that to results of task "
+            "'motion'"
         )
     return [
         {
-            "positions": each.positions.tolist(),
-            "time": each.time,
-            "score": each.score,
-            "ids": None if each.ids is None else list(each.ids),
+            "positions": accident.positions.tolist(),
+            "time": accident.time,
+            "score": accident.score,
+            "ids": None if accident.ids is None else list(accident.ids),
         }
-        for each in accidents
+        for accident in accidents
     ]
 
 
@@ -329,63 +351,73 @@ def _boxes(token: str, prediction: object) -> list[dict[str, Any]]:
 
 
 def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any]]:
-    """A sample's boxes as a file has them; they are in the world frame."""
+    """Return a sample's boxes, which are in the world frame, as entries of a file."""
     boxes = detected.boxes
+    columns = zip(
+        boxes.center.tolist(),
+        boxes.size[:, LENGTH_FIRST].tolist(),
+        boxes.rotation.tolist(),
+        boxes.velocity[:, :2].tolist(),
+        boxes.category.tolist(),
+        detected.scores.tolist(),
+        strict=True,
+    )
     return [
         {
             "sample_token": token,
             "translation": center,
             "size": size,
             "rotation": rotation,
-            "velocity": moving if all(map(math.isfinite, moving)) else None,
+            "velocity": velocity if all(map(math.isfinite, velocity)) else None,
             "detection_name": CATEGORIES[category],
             "detection_score": score,
         }
-        for center, size, rotation, moving, category, score in zip(
-            boxes.center.tolist(),
-            boxes.size[:, LENGTH_FIRST].tolist(),
-            boxes.rotation.tolist(),
-            boxes.velocity[:, :2].tolist(),
-            boxes.category.tolist(),
-            detected.scores.tolist(),
-            strict=True,
-        )
+        for center, size, rotation, velocity, category, score in columns
     ]
 
 
 def _plans(token: str, prediction: object) -> list[dict[str, Any]]:
     del token
-    return [
-        {"times": each.times.tolist(), "path": each.path.tolist(), "score": each.score}
-        | ({} if each.yaw is None else {"yaw": each.yaw.tolist()})
-        for each in _all_of(Plan, prediction)
-    ]
+    entries = []
+    for plan in _checked_list(Plan, prediction):
+        entry: dict[str, Any] = {
+            "times": plan.times.tolist(),
+            "path": plan.path.tolist(),
+            "score": plan.score,
+        }
+        if plan.yaw is not None:
+            entry["yaw"] = plan.yaw.tolist()
+        entries.append(entry)
+    return entries
 
 
 def _forecasts(token: str, prediction: object) -> list[dict[str, Any]]:
     del token
     return [
         {
-            "id": each.actor_id,
-            "times": each.times.tolist(),
-            "paths": each.paths.tolist(),
-            "probabilities": each.probabilities.tolist(),
+            "id": forecast.actor_id,
+            "times": forecast.times.tolist(),
+            "paths": forecast.paths.tolist(),
+            "probabilities": forecast.probabilities.tolist(),
         }
-        for each in _all_of(Forecast, prediction)
+        for forecast in _checked_list(Forecast, prediction)
     ]
 
 
-def _all_of(kind: type[Kind], prediction: object) -> list[Kind]:
-    given = list(prediction) if isinstance(prediction, Iterable) else [prediction]
-    others = [each for each in given if not isinstance(each, kind)]
-    if others:
-        raise ResultsError(
-            f"expected a list of {kind.__name__}s, found {type(others[0]).__name__} in it"
-        )
-    return [each for each in given if isinstance(each, kind)]
+def _checked_list(item_type: type[Kind], prediction: object) -> list[Kind]:
+    """Return the items of a prediction; raises ResultsError if one is of another type."""
+    items = list(prediction) if isinstance(prediction, Iterable) else [prediction]
+    checked = []
+    for item in items:
+        if not isinstance(item, item_type):
+            raise ResultsError(
+                f"expected a list of {item_type.__name__}s, found {type(item).__name__} in it"
+            )
+        checked.append(item)
+    return checked
 
 
-# Task → the entries of a sample as a file has them, of its token and prediction.
+# Task → function that makes the entries of a sample from its token and prediction.
 _ENTRIES: Final[Mapping[str, Callable[[str, object], list[dict[str, Any]]]]] = {
     "accident": _accidents,
     "detection": _boxes,
@@ -407,7 +439,7 @@ class ShardWriter:
         labels: str | None,
         store: Stored,
     ) -> None:
-        """Write into an empty folder; the other arguments are those of ResultsWriter."""
+        """Create the folder of shards in an empty folder; other arguments as in ResultsWriter."""
         self._folder, self._header = folder, header
         self._grid, self._step, self._labels, self._store = grid, step, labels, store
         self._frames = self._predictions = 0
@@ -417,7 +449,7 @@ class ShardWriter:
         (folder / "shards").mkdir()
 
     def add(self, token: str, prediction: object) -> None:
-        """Write the prediction of a sample; raises ResultsError, and nothing of it is written then."""
+        """Write the prediction of a sample; raises ResultsError, and then writes nothing of it."""
         output = self._checked(prediction)
         arrays = self._arrays(output)
         predictions, frames = next(iter(arrays.values())).shape[:2]
@@ -425,7 +457,7 @@ class ShardWriter:
             raise ResultsError(
                 f"expected {self._frames} frames as of the samples before, found {frames}"
             )
-        self._form(output.grid, predictions, frames)
+        self._form(output.grid, predictions, frames)  # raises for an invalid form
         self._grid, self._frames = output.grid, frames
         self._predictions = max(self._predictions, predictions)
         if self._archive is None:
@@ -433,21 +465,22 @@ class ShardWriter:
         for name, array in arrays.items():
             put_array(self._archive, MEMBER.format(token, name), array)
         self._in_shard.append(token)
-        written = sum(entry.compress_size for entry in self._archive.infolist())
-        if len(self._in_shard) >= _MOST_SAMPLES or written >= MOST_BYTES:
+        written_bytes = sum(entry.compress_size for entry in self._archive.infolist())
+        if len(self._in_shard) >= _MAX_SHARD_SAMPLES or written_bytes >= MAX_SHARD_BYTES:
             self._end_shard()
 
     def add_part(self, part: Results) -> None:
-        """Copy the shards of a folder that another of this class wrote, of the same grid and frames."""
+        """Copy the shards of a folder that another writer of this class wrote.
+
+        Its predictions are of the same grid and number of frames.
+        """
         self._end_shard()
         contents: Any = contents_of(part.path / RESULTS_FILE)[0]
         self._grid, self._frames = contents.form.grid, contents.form.frames
         self._predictions = max(self._predictions, contents.form.predictions)
         for shard in contents.shards:
-            with (
-                open_file(part.path / shard.file) as source,
-                (self._folder / self._file).open("wb") as target,
-            ):
+            target_path = self._folder / self._file
+            with open_file(part.path / shard.file) as source, target_path.open("wb") as target:
                 shutil.copyfileobj(source, target)
             self._shards.append(msgspec.structs.replace(shard, file=self._file))
 
@@ -456,12 +489,11 @@ class ShardWriter:
         self._end_shard()
         if self._grid is None or not self._shards:
             raise ResultsError("no prediction was added; results of no sample cannot be read")
-        told = {
-            **self._header,
-            "form": self._form(self._grid, self._predictions, self._frames).as_dict(),
-            "shards": msgspec.to_builtins(self._shards),
-        }
-        (self._folder / RESULTS_FILE).write_bytes(f"{json.dumps(told, indent=1)}\n".encode())
+        form = self._form(self._grid, self._predictions, self._frames)
+        shards = msgspec.to_builtins(self._shards)
+        manifest = {**self._header, "form": form.as_dict(), "shards": shards}
+        text = f"{json.dumps(manifest, indent=1)}\n"
+        (self._folder / RESULTS_FILE).write_bytes(text.encode())
 
     def close(self) -> None:
         """Close the archive that is being written, if any."""
@@ -491,7 +523,8 @@ class ShardWriter:
             )
         if self._grid not in (None, prediction.grid):
             raise ResultsError(
-                f"expected a prediction on {self._grid}, found one on {prediction.grid}; write others to other results"
+                f"expected a prediction on {self._grid}, found one on {prediction.grid}; write "
+                "others to other results"
             )
         return prediction
 
@@ -508,8 +541,8 @@ class ShardWriter:
             )
         if any(heads.ignore_index is not None for heads in output.heads):
             raise ResultsError(
-                "expected a model's heads, found those of labels, which hold values to ignore; write them with "
-                "store='instances'"
+                "expected a model's heads, found those of labels, which hold values to ignore; "
+                "write them with store='instances'"
             )
         return head_arrays(output)
 
@@ -530,19 +563,23 @@ class ShardWriter:
 
 
 def head_arrays(output: MotionOutput) -> dict[str, AnyArray]:
-    """The heads of a prediction, each (K, T, channels, H, W) float32."""
+    """Return the heads of a prediction, float32 arrays of shape (K, T, channels, H, W)."""
     heads = output.heads or ()
-    return {name: np.stack([getattr(each, name) for each in heads]) for name in HEADS}
+    return {name: np.stack([getattr(frame_heads, name) for frame_heads in heads]) for name in HEADS}
 
 
 def instance_arrays(output: MotionOutput) -> dict[str, AnyArray]:
-    """The instance maps of a prediction; heads are post-processed for them."""
+    """Return the instance maps of a prediction; heads are post-processed for them."""
     maps = output.instances
     if maps is None:
-        maps = np.stack([predict_instances(each, "motion").instance for each in output.heads or ()])
-    highest = int(maps.max(initial=0))
-    dtype = np.uint8 if highest < 2**8 else np.uint16 if highest < 2**16 else np.int32
-    return {"instance": maps.astype(dtype)}
+        predicted = [predict_instances(heads, "motion").instance for heads in output.heads or ()]
+        maps = np.stack(predicted)
+    max_id = int(maps.max(initial=0))
+    if max_id < 2**8:
+        return {"instance": maps.astype(np.uint8)}
+    if max_id < 2**16:
+        return {"instance": maps.astype(np.uint16)}
+    return {"instance": maps.astype(np.int32)}
 
 
 def put_array(archive: zipfile.ZipFile, member: str, array: AnyArray) -> None:
@@ -551,10 +588,9 @@ def put_array(archive: zipfile.ZipFile, member: str, array: AnyArray) -> None:
     np.lib.format.write_array(
         buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False
     )
-    entry = zipfile.ZipInfo(member, _FIRST_DATE)
+    entry = zipfile.ZipInfo(member, _ARCHIVE_DATE)
     entry.external_attr = 0o644 << 16
-    maps_of_floats = (
-        array.dtype.kind == "f" and array.ndim > 3
-    )  # noise: deflating takes a second and saves nothing
-    way = zipfile.ZIP_STORED if maps_of_floats else zipfile.ZIP_DEFLATED
-    archive.writestr(entry, buffer.getvalue(), way, compresslevel=6)
+    # maps of floats are noise: deflating them takes a second and saves nothing
+    is_noise = array.dtype.kind == "f" and array.ndim > 3
+    compression = zipfile.ZIP_STORED if is_noise else zipfile.ZIP_DEFLATED
+    archive.writestr(entry, buffer.getvalue(), compression, compresslevel=6)

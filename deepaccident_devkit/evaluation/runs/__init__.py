@@ -1,7 +1,7 @@
 """Whole evaluations: from a results file to a bundle of numbers that others can check and compare.
 
-`evaluate_results` makes an `EvaluationRun`, `save_run` writes it, `verify_bundle` makes it again, `compare_bundles`
-says which differences of two are real.
+`evaluate_results` makes an `EvaluationRun`, `save_run` writes it, `verify_bundle` makes it again,
+`compare_bundles` decides which differences between two are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import (

@@ -1,4 +1,4 @@
-"""Bundles: an evaluation's folder, from which others can check and compare its numbers: written, read and checked."""
+"""Bundles: folders of evaluations, with numbers that others can check and compare."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ FILES_FILE: Final = "files.json"
 RESULTS_FOLDER: Final = "results"
 SCENARIOS_FORMAT: Final = "DeepAccident scenario hashes"
 FILES_FORMAT: Final = "DeepAccident evaluation bundle"
-# A name, a path, a checksum: what shows in a terminal, in a line.
+# A name, a path or a checksum that a terminal can show in one line.
 Line = Annotated[
     str,
     msgspec.Meta(
@@ -63,8 +63,9 @@ Line = Annotated[
         pattern=r"^[^\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]*\Z",
     ),
 ]
-# Which threshold of an evaluation is taken: of the best F1; of at most one second a minute in false alarm; or of at
-# most one second a minute of braking for false alarms, which the evaluation of prevented accidents finds.
+# Rule that chooses a threshold: the best F1; at most one second a minute in false alarm; or at most
+# one second a minute of braking for false alarms, which the evaluation of prevented accidents
+# finds.
 Chooser = Literal["best_f1", "quiet", "braking"]
 _UNCLEAR: Final = "does not say what was evaluated: "
 _REMEDY: Final = "give a folder that `deepaccident evaluate … --out` wrote, or evaluate again"
@@ -93,7 +94,7 @@ class _Breakdown(msgspec.Struct):
 
 
 class _Summary(msgspec.Struct):
-    """Of `metrics_summary.json` all that is used, and not only compared."""
+    """The parts of `metrics_summary.json` that are used, and not only compared."""
 
     task: Line
     protocol: Line
@@ -112,25 +113,25 @@ class _Summary(msgspec.Struct):
 
 
 class _Scenarios(msgspec.Struct):
-    """Of `scenarios.json`: scenario → hashes of its label, meta and calib files."""
+    """Content of `scenarios.json`: scenario → hashes of its label, meta and calib files."""
 
     scenarios: dict[Line, ScenarioHashes]
 
 
 class _Files(msgspec.Struct):
-    """Of `files.json`: file → checksum."""
+    """Content of `files.json`: file → checksum."""
 
     files: dict[Line, Line]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bundle(ShortRepr):
-    """What `deepaccident evaluate … --out DIR` wrote, by its summary; the other files are read when needed.
+    """Output of `deepaccident evaluate … --out DIR`: the summary; other files are read when needed.
 
     Attributes:
-        folder: where.
-        summary: of `metrics_summary.json`.
-        selection: which samples.
+        folder: Folder of the bundle.
+        summary: Content of `metrics_summary.json`.
+        selection: The evaluated samples.
     """
 
     folder: Path
@@ -139,7 +140,7 @@ class Bundle(ShortRepr):
 
     @property
     def setup(self) -> EvaluationSetup:
-        """Return the task and its rules; raises ResultsError if the plug-in that has the task is not installed."""
+        """Task and rules; raises ResultsError if the plug-in that has the task is not installed."""
         return _stated_setup(self.folder / SUMMARY_FILE, self.summary)
 
     @property
@@ -154,46 +155,50 @@ class Bundle(ShortRepr):
 
     @property
     def results_path(self) -> Path:
-        """The results: the copy in the bundle where there is one, else where they were.
+        """Path of the results: the copy in the bundle if there is one, otherwise the original.
 
         Raises:
-            ResultsError: a copy is not what it should be.
+            ResultsError: the copy is invalid.
         """
         return self.results_copy() or Path(self.summary["results"]["path"])
 
     def outside_paths(self) -> dict[str, str]:
-        """The paths in the summary that lead out of the bundle, and that `verify_bundle` opens only if it is told to.
+        """Return the paths in the summary that lead out of the bundle.
+
+        `verify_bundle` opens them only if they are passed as arguments.
 
         Returns:
-            `dataroot`; `results`, where the bundle has no copy of them; `split`, where it is a split file.
+            `dataroot`; `results`, where the bundle has no copy of them; `split`, where it is a
+                split file.
 
         Raises:
-            ResultsError: a copy of the results is not what it should be.
+            ResultsError: the copy of the results is invalid.
         """
-        named = {"dataroot": self.dataroot}
+        paths = {"dataroot": self.dataroot}
         if self.results_copy() is None:
-            named["results"] = self.summary["results"]["path"]
+            paths["results"] = self.summary["results"]["path"]
         if self.summary["split"] not in SPLIT_CHOICES:
-            named["split"] = self.summary["split"]
-        return named
+            paths["split"] = self.summary["split"]
+        return paths
 
     def scenarios(self) -> dict[str, ScenarioHashes]:
-        """Return the hashes of each scenario's label, meta and calib files by token; raises ResultsError."""
-        return _stated(self.folder / SCENARIOS_FILE, SCENARIOS_FORMAT, _Scenarios).scenarios
+        """Return the hashes of each scenario's label, meta and calib files; raises ResultsError."""
+        return _read_record(self.folder / SCENARIOS_FILE, SCENARIOS_FORMAT, _Scenarios).scenarios
 
     def checksums(self) -> dict[str, str]:
-        """File → checksum of all that was written, except the list itself; raises ResultsError."""
-        return _stated(self.folder / FILES_FILE, FILES_FORMAT, _Files).files
+        """Return file → checksum of all files except the list itself; raises ResultsError."""
+        return _read_record(self.folder / FILES_FILE, FILES_FORMAT, _Files).files
 
     def counts(self) -> dict[str, Any]:
-        """Token → the counts of a sample, as they are stored; raises ResultsError."""
-        counts = read_json(self.folder / COUNTS_FILE, None).get("counts")
+        """Return token → stored counts of the sample; raises ResultsError."""
+        path = self.folder / COUNTS_FILE
+        counts = read_json(path, None).get("counts")
         if not isinstance(counts, dict):
-            raise ResultsError(f"{self.folder / COUNTS_FILE}: holds no counts; {_REMEDY}")
+            raise ResultsError(f"{path}: holds no counts; {_REMEDY}")
         return counts
 
     def rows(self) -> dict[str, Row]:
-        """Token → the row of a sample; raises ResultsError."""
+        """Return token → row of the sample; raises ResultsError."""
         path = own_file(self.folder / ROWS_FILE)
         rows, _ = read_rows(path)
         if any(not isinstance(row.get("token"), str) for row in rows):
@@ -201,7 +206,7 @@ class Bundle(ShortRepr):
         return {row["token"]: row for row in rows}
 
     def evaluator(self) -> Evaluator[Any]:
-        """All counts, of which a result can be computed; raises ResultsError or EvaluationError."""
+        """Return all counts, to compute results from; raises ResultsError or EvaluationError."""
         path = own_file(self.folder / COUNTS_FILE)
         evaluator = self.setup.evaluator().resume(path)
         try:
@@ -209,17 +214,17 @@ class Bundle(ShortRepr):
                 check_token(token)
             evaluator.compute()
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            told = f"{type(error).__name__}: {shortened(str(error))}"
+            fault = f"{type(error).__name__}: {shortened(str(error))}"
             raise ResultsError(
-                f"{path}: does not hold counts of its protocol ({told}); evaluate again"
+                f"{path}: does not hold counts of its protocol ({fault}); evaluate again"
             ) from error
         return evaluator
 
     def results_copy(self) -> Path | None:
-        """The copy of the results in the bundle; None without one.
+        """Return the copy of the results in the bundle; None without one.
 
         Raises:
-            ResultsError: it is not what it should be, or has links or pipes in it.
+            ResultsError: the copy is invalid, or has links or pipes in it.
         """
         copies = self.folder / RESULTS_FOLDER
         if not os.path.lexists(copies):
@@ -227,131 +232,138 @@ class Bundle(ShortRepr):
         for name, irregular in entries_in(self.folder).items():
             if irregular and name.split("/")[0] == RESULTS_FOLDER:
                 raise ResultsError(f"{self.folder}: {shortened(name)} is {irregular}; {_REMEDY}")
-        inside = sorted(copies.iterdir()) if copies.is_dir() else []
-        if len(inside) != 1:
+        paths = sorted(copies.iterdir()) if copies.is_dir() else []
+        if len(paths) != 1:
             raise ResultsError(
-                f"{copies}: expected one results file or folder, found {len(inside)}; {_REMEDY}"
+                f"{copies}: expected one results file or folder, found {len(paths)}; {_REMEDY}"
             )
-        return inside[0]
+        return paths[0]
 
 
 def read_bundle(folder: Path) -> Bundle:
     """Open a bundle; raises ResultsError if there is none that this devkit can read.
 
-    A bundle whose task is one of a plug-in that is not installed opens, too: `summary["task"]` names it.
+    A bundle also opens if its task belongs to a plug-in that is not installed: `summary["task"]`
+    names the task.
     """
     folder = path_of(folder)
     if not folder.is_dir():
         raise ResultsError(f"{folder}: no such folder; {_REMEDY}")
     path = folder / SUMMARY_FILE
     summary = read_json(path, SUMMARY_FORMAT)
-    _record(path, summary, _Summary, _UNCLEAR)
+    _as_record(path, summary, _Summary, _UNCLEAR)
     if is_task(summary["task"]):
         _stated_setup(path, summary)
-    with _stating(path):
-        selection = SampleSelection(
-            agents=None if summary["agents"] is None else tuple(summary["agents"]),
-            **{name: summary[name] for name in ("split", "samples", "scope", "horizon")},
-        )
+    names = ("split", "samples", "scope", "horizon")
+    with _naming_summary(path):
+        agents = None if summary["agents"] is None else tuple(summary["agents"])
+        selection = SampleSelection(agents=agents, **{name: summary[name] for name in names})
     return Bundle(folder=folder, summary=summary, selection=selection)
 
 
 def _stated_setup(path: Path, summary: Mapping[str, Any]) -> EvaluationSetup:
-    """Return the setup that a summary states; raises ResultsError."""
-    with _stating(path):
-        return EvaluationSetup(
-            **{name: summary[name] for name in ("task", "protocol", "switches", "horizon")}
-        )
+    """Return the setup in a summary; raises ResultsError."""
+    names = ("task", "protocol", "switches", "horizon")
+    with _naming_summary(path):
+        return EvaluationSetup(**{name: summary[name] for name in names})
 
 
 @contextmanager
-def _stating(path: Path) -> Iterator[None]:
+def _naming_summary(path: Path) -> Iterator[None]:
     """Turn errors of impossible values into a ResultsError that names the summary."""
+    # all errors that the value of a switch can cause
+    errors = (ArithmeticError, LookupError, TypeError, ValueError)
     try:
         yield
-    except (
-        ArithmeticError,
-        LookupError,
-        TypeError,
-        ValueError,
-    ) as error:  # whatever a switch's value can cause
-        raise ResultsError(
-            f"{path}: {_UNCLEAR}{shortened(str(error), MOST_TOLD)}; {_REMEDY}"
-        ) from error
+    except errors as error:
+        fault = shortened(str(error), MOST_TOLD)
+        raise ResultsError(f"{path}: {_UNCLEAR}{fault}; {_REMEDY}") from error
 
 
 def chosen_threshold(folder: Path, by: Chooser, tokens: Iterable[str]) -> float:
-    """The threshold for some samples that an evaluation of warnings of another split found best for who is involved.
+    """Return the threshold for samples that an evaluation of warnings of another split chose.
 
-    A car does not know whether it will be involved, so that there is one threshold for all groups.
+    It is the best threshold for involved agents. A car does not know whether it will be involved,
+    so there is a single threshold for all groups.
 
     Raises:
         ResultsError: there is no bundle.
-        EvaluationError: it is of another task or protocol, has a scenario of these samples or its twin, or found no
-            threshold.
+        EvaluationError: it is of another task or protocol, has a scenario of these samples or its
+            twin, or found no threshold.
     """
     bundle = read_bundle(folder)
     kind = bundle.setup.task, bundle.setup.protocol
     if kind != ("warning", "clean"):
         raise EvaluationError(
-            f"{folder}: is an evaluation of {' '.join(kind)}; expected one of warning, protocol clean"
+            f"{folder}: is an evaluation of {' '.join(kind)}; expected one of warning, protocol "
+            "clean"
         )
-    own = {cluster_of(scenario) for scenario in bundle.scenarios()}
-    shared = sorted(
-        {scenario for scenario in map(scenario_of, tokens) if cluster_of(scenario) in own}
-    )
+    clusters = set(map(cluster_of, bundle.scenarios()))
+    scenarios = set(map(scenario_of, tokens))
+    shared = sorted(scenario for scenario in scenarios if cluster_of(scenario) in clusters)
     if shared:
         raise EvaluationError(
-            f"{folder}: is an evaluation of {shared[0]} or its twin, too; a threshold that is chosen on the recordings "
-            "it is tried on flatters: give one of another split, such as train or val"
+            f"{folder}: is an evaluation of {shared[0]} or its twin, too; a threshold that is "
+            "chosen on the recordings it is tried on flatters: give one of another split, such as "
+            "train or val"
         )
-    try:
-        groups: Mapping[str, Any] = bundle.summary["prevented" if by == "braking" else "metrics"][
-            "groups"
-        ]
-        group = next((name for name in GROUPS if name in groups), None)
-        threshold = (
-            None if group is None else groups[group]["quiet_braking" if by == "braking" else by]
-        )
-    except (LookupError, TypeError) as error:
-        what, how = (
-            ("prevented accidents", " with --prevented")
-            if by == "braking"
-            else ("metrics of warnings", "")
-        )
-        raise ResultsError(f"{folder}: its summary has no {what}; evaluate again{how}") from error
+    threshold = _stored_threshold(bundle, folder, by)
     if not isinstance(threshold, float) or not math.isfinite(threshold):
         raise EvaluationError(
-            f"{folder}: found no threshold by {by}; choose another, or give one with --switch threshold=…"
+            f"{folder}: found no threshold by {by}; choose another, or give one with --switch "
+            "threshold=…"
         )
     return threshold
 
 
-def _stated(path: Path, form: str, kind: type[Record]) -> Record:
-    """What one of a bundle's JSON files states; raises ResultsError."""
-    return _record(path, read_json(path, form), kind)
-
-
-def _record(path: Path, content: object, kind: type[Record], told: str = "") -> Record:
+def _stored_threshold(bundle: Bundle, folder: Path, by: Chooser) -> Any:
+    """Return the stored threshold, which may be of any type; raises ResultsError."""
+    part, key, missing, option = "metrics", str(by), "metrics of warnings", ""
+    if by == "braking":
+        part, key = "prevented", "quiet_braking"
+        missing, option = "prevented accidents", " with --prevented"
     try:
-        return as_record(content, kind)
+        groups: Mapping[str, Any] = bundle.summary[part]["groups"]
+        group = next((name for name in GROUPS if name in groups), None)
+        if group is None:
+            return None
+        return groups[group][key]
+    except (LookupError, TypeError) as error:
+        raise ResultsError(
+            f"{folder}: its summary has no {missing}; evaluate again{option}"
+        ) from error
+
+
+def _read_record(path: Path, form: str, record_type: type[Record]) -> Record:
+    """Return the content of a bundle's JSON file; raises ResultsError."""
+    return _as_record(path, read_json(path, form), record_type)
+
+
+def _as_record(path: Path, content: object, record_type: type[Record], prefix: str = "") -> Record:
+    """Return parsed JSON as a record; raises ResultsError, with the prefix before the fault."""
+    try:
+        return as_record(content, record_type)
     except ValueError as error:
-        raise ResultsError(f"{path}: {told}{error}; {_REMEDY}") from error
+        raise ResultsError(f"{path}: {prefix}{error}; {_REMEDY}") from error
 
 
 def own_file(path: Path) -> Path:
-    """The path of a bundle's file, which must not be a link; raises ResultsError."""
+    """Return the path of a bundle's file; raises ResultsError if it is a link."""
     if path.is_symlink():
         raise ResultsError(f"{path}: is a link, which is not followed; {_REMEDY}")
     return path
 
 
 def read_json(path: Path, expected: str | None) -> dict[str, Any]:
-    """One of a bundle's JSON files, of a format; None for the counts. Raises ResultsError."""
+    """Return a JSON file of a bundle; raises ResultsError.
+
+    Args:
+        path: Path of the file.
+        expected: Its format; None for the counts.
+    """
     try:
-        content = parsed_json(
-            read_bytes(own_file(path), "bundle" if expected else "results"), constants=not expected
-        )
+        text = read_bytes(own_file(path), "bundle" if expected else "results")
+        content = parsed_json(text, constants=not expected)
     except FileNotFoundError as error:
         raise ResultsError(f"{path}: is missing; {_REMEDY}") from error
     except (OSError, ValueError) as error:
@@ -360,62 +372,73 @@ def read_json(path: Path, expected: str | None) -> dict[str, Any]:
         raise ResultsError(f"{path}: {fault_text(error)}; {_REMEDY}") from error
     if not isinstance(content, dict):
         raise ResultsError(f"{path}: expected an object, found {type(content).__name__}; {_REMEDY}")
-    found = content.get("format")
-    if expected is None:
-        return content
-    if found != expected:
-        raise ResultsError(
-            f"{path}: expected the format {expected!r}, found {shortened(repr(found))}; {_REMEDY}"
-        )
-    if content.get("version") != SUMMARY_VERSION:
-        version, writer = (
-            shortened(repr(content.get(name))) for name in ("version", "devkit_version")
-        )
-        raise ResultsError(
-            f"{path}: is of version {version}, this devkit reads {SUMMARY_VERSION}; use the devkit that wrote it "
-            f"({writer})"
-        )
+    if expected is not None:
+        _check_format(path, content, expected)
     return content
 
 
+def _check_format(path: Path, content: Mapping[str, Any], expected: str) -> None:
+    """Raise ResultsError unless a file is of the expected format and of this devkit's version."""
+    stored_format = content.get("format")
+    if stored_format != expected:
+        raise ResultsError(
+            f"{path}: expected the format {expected!r}, found {shortened(repr(stored_format))}; "
+            f"{_REMEDY}"
+        )
+    if content.get("version") != SUMMARY_VERSION:
+        version = shortened(repr(content.get("version")))
+        writer = shortened(repr(content.get("devkit_version")))
+        raise ResultsError(
+            f"{path}: is of version {version}, this devkit reads {SUMMARY_VERSION}; use the devkit "
+            f"that wrote it ({writer})"
+        )
+
+
 def entries_in(folder: Path) -> dict[str, str | None]:
-    """What is in a folder and in those below it, by its path there, in order → what it is (`a link`) if it is no file.
+    """Return all files in a folder and in its folders, sorted by their relative paths.
 
     Links are not followed.
+
+    Returns:
+        Relative path → what it is (`a link`) if it is not a regular file, otherwise None.
     """
-    found = {}
-    for place, folders, files in os.walk(folder):
+    entries = {}
+    for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
-            path = Path(place, name)
+            path = Path(parent, name)
             mode = path.lstat().st_mode
             if not stat.S_ISDIR(mode):
                 irregular = "a link" if stat.S_ISLNK(mode) else irregular_text(mode)
-                found[path.relative_to(folder).as_posix()] = irregular
-    return dict(sorted(found.items()))
+                entries[path.relative_to(folder).as_posix()] = irregular
+    return dict(sorted(entries.items()))
 
 
 def checksums_of(folder: Path, listed: Collection[str] | None = None) -> dict[str, str]:
-    """File, as of `entries_in` → checksum, of all but the list of files itself.
+    """Return the checksum of each file of `entries_in`, except the list of files itself.
 
-    Listed files are opened, or all if None; a word stands for the checksum of others, links, pipes, and what cannot be
-    read.
+    Args:
+        folder: Folder of the bundle.
+        listed: Files that are opened; None for all. For other files, links, pipes, and unreadable
+            files, words stand for the checksum.
     """
-    found = {}
+    checksums = {}
     for name, irregular in entries_in(folder).items():
         if name == FILES_FILE:
             continue
+        path = folder / name
         if listed is None:
-            found[name] = file_checksum(folder / name)
+            checksums[name] = file_checksum(path)
+        elif irregular:
+            checksums[name] = irregular
         else:
-            found[name] = irregular or (
-                _checksum(folder / name) if name in listed else "a file that is not listed"
-            )
-    return found
+            checksums[name] = _checksum(path) if name in listed else "a file that is not listed"
+    return checksums
 
 
 def _checksum(path: Path) -> str:
+    """Return the checksum of a file, or why it cannot be read."""
     try:
-        check_size(path.stat().st_size, "results")  # the largest that it can hold
+        check_size(path.stat().st_size, "results")  # the largest kind of file in a bundle
         return file_checksum(path)
     except OSError as error:
         return fault_text(error)
@@ -429,21 +452,25 @@ def save_run(
     overwrite: bool = False,
     extras: Sequence[Callable[[Path], object]] = (),
 ) -> Path:
-    """Write a bundle: the folder then has all of it, or stays as it was; returns its path.
+    """Write a bundle and return its path; if it fails, the folder stays as it was.
 
-    It holds `metrics_summary.json` (`EvaluationRun.summary`), `counts.json` (the evaluator's, by sample),
-    `samples.parquet` (`sample_rows`), `scenarios.json` (hashes of the truth), `files.json` (checksums of all these) and
-    what the extras add. Each says the devkit's version, the protocol, and whether it is partial.
+    The bundle holds `metrics_summary.json` (`EvaluationRun.summary`), `counts.json` (the
+    evaluator's, by sample), `samples.parquet` (`sample_rows`), `scenarios.json` (hashes of the
+    truth), `files.json` (checksums of all these) and the output of the extras. Each file has the
+    devkit's version, the protocol, and whether it is partial.
 
     Args:
-        run: the evaluation.
-        folder: where; new, empty, or with `overwrite` an earlier bundle.
-        include_results: whether to copy the results into its folder `results`, so that it can be checked by itself.
-        overwrite: whether an earlier bundle there is replaced. Another folder never is.
-        extras: called one after another with the folder that is being written, to add a report or pictures.
+        run: The evaluation.
+        folder: Folder of the bundle: new, empty, or with `overwrite` an earlier bundle.
+        include_results: Whether to copy the results into its folder `results`, so that it can be
+            checked by itself.
+        overwrite: Whether to replace an earlier bundle. Other folders are never replaced.
+        extras: Functions that are called in turn with the folder that is being written, to add a
+            report or pictures.
 
     Raises:
-        ResultsError: something else lies there, it cannot be written, or the results to copy are gone.
+        ResultsError: the folder holds something else or cannot be written, or the results to copy
+            are missing.
     """
     target = checked_target(folder, overwrite=overwrite)
     before: Path | None = None
@@ -452,10 +479,9 @@ def save_run(
             _write(run, temporary, include_results=include_results)
             for extra in extras:
                 extra(temporary)
-            _write_json(
-                temporary / FILES_FILE, FILES_FORMAT, run, {"files": checksums_of(temporary)}
-            )
-            before = _moved_aside(target)
+            files = {"files": checksums_of(temporary)}
+            _write_json(temporary / FILES_FILE, FILES_FORMAT, run, files)
+            before = _move_aside(target)
     except OSError as error:
         raise ResultsError(
             f"{target}: cannot be written ({error}); make room there, or choose another"
@@ -473,71 +499,79 @@ def checked_target(
     folder: str | os.PathLike[str],
     *,
     overwrite: bool = False,
-    asked: Mapping[str, Any] | None = None,
+    requested: Mapping[str, Any] | None = None,
 ) -> Path:
-    """The path of a folder that a bundle can be written to; changes nothing.
+    """Return the path of a folder that a bundle can be written to; changes nothing.
 
-    `asked` are values of the new summary: a message says which of them differ from those of the bundle that is there.
+    Args:
+        folder: The folder.
+        overwrite: Whether an earlier bundle may be replaced.
+        requested: Values of the new summary; a message names the ones that differ from the
+            earlier bundle.
 
     Raises:
-        ResultsError: something lies there that is no bundle, or one that is not to be replaced, or one with files that
-            are not its own.
+        ResultsError: the folder holds something other than a bundle, a bundle that must not be
+            replaced, or a bundle with foreign files.
     """
     target = path_of(folder, "out: expected a folder", error=ResultsError).absolute()
     if not target.exists():
         return target
     if not target.is_dir():
         raise ResultsError(f"{target}: is a file; choose a folder that is new")
-    found = entries_in(target)
-    if not found:
+    entries = entries_in(target)
+    if not entries:
         return target
     try:
         bundle = read_bundle(target)
-        own = {*bundle.checksums(), FILES_FILE}
+        own_names = {*bundle.checksums(), FILES_FILE}
     except ResultsError as error:
         raise ResultsError(
             f"{target}: is not empty and holds no evaluation ({error}); choose a new folder"
         ) from error
-    foreign = [name for name in found if name not in own]
+    foreign = [name for name in entries if name not in own_names]
     if foreign:
         raise ResultsError(
-            f"{target}: holds {foreign[0]}, which is not of its evaluation; move it, or choose another"
+            f"{target}: holds {foreign[0]}, which is not of its evaluation; move it, or choose "
+            "another"
         )
     if not overwrite:
-        there = {**bundle.summary, "results": bundle.summary["results"]["path"]}
-        text = differing_text({name: there[name] for name in asked or {}}, asked or {})
+        requested = requested or {}
+        stored = {**bundle.summary, "results": bundle.summary["results"]["path"]}
+        text = differing_text({name: stored[name] for name in requested}, requested)
         raise ResultsError(
-            f"{target}: holds an evaluation{f' ({text})' if text else ''}; pass overwrite=True (--overwrite) to "
-            "replace it, or choose another folder"
+            f"{target}: holds an evaluation{f' ({text})' if text else ''}; pass overwrite=True "
+            "(--overwrite) to replace it, or choose another folder"
         )
     return target
 
 
-def _moved_aside(target: Path) -> Path | None:
-    """Where an earlier bundle now lies, beside its place; None if there is none."""
+def _move_aside(target: Path) -> Path | None:
+    """Rename an earlier bundle and return its new path; None if there is none."""
     if not target.is_dir() or not any(target.iterdir()):
         return None
     return target.rename(temporary_path(target))
 
 
 def _write(run: EvaluationRun, folder: Path, *, include_results: bool) -> None:
-    (folder / SUMMARY_FILE).write_text(
-        json.dumps(run.summary(), indent=1, ensure_ascii=False), encoding="utf-8"
-    )
-    run.evaluator.save(folder / COUNTS_FILE)
-    counts = json.loads((folder / COUNTS_FILE).read_text(encoding="utf-8"))
-    (folder / COUNTS_FILE).write_text(json.dumps(run.stamp | counts), encoding="utf-8")
+    """Write all files of a bundle except the list of its files."""
+    summary = json.dumps(run.summary(), indent=1, ensure_ascii=False)
+    (folder / SUMMARY_FILE).write_text(summary, encoding="utf-8")
+    counts_path = folder / COUNTS_FILE
+    run.evaluator.save(counts_path)
+    counts = json.loads(counts_path.read_text(encoding="utf-8"))
+    counts_path.write_text(json.dumps(run.stamp | counts), encoding="utf-8")
     write_rows(folder / ROWS_FILE, sample_rows(run), run.stamp)
-    _write_json(
-        folder / SCENARIOS_FILE, SCENARIOS_FORMAT, run, {"scenarios": dict(run.release.scenarios)}
-    )
+    scenarios = {"scenarios": dict(run.release.scenarios)}
+    _write_json(folder / SCENARIOS_FILE, SCENARIOS_FORMAT, run, scenarios)
     if include_results:
         _copy(Path(run.results.path), folder / RESULTS_FOLDER)
 
 
-def _write_json(path: Path, name: str, run: EvaluationRun, content: Mapping[str, Any]) -> None:
-    stated = {"format": name, "version": SUMMARY_VERSION, **run.stamp, **content}
-    path.write_text(json.dumps(stated, indent=1, default=asdict), encoding="utf-8")
+def _write_json(
+    path: Path, format_name: str, run: EvaluationRun, content: Mapping[str, Any]
+) -> None:
+    payload = {"format": format_name, "version": SUMMARY_VERSION, **run.stamp, **content}
+    path.write_text(json.dumps(payload, indent=1, default=asdict), encoding="utf-8")
 
 
 def _copy(source: Path, folder: Path) -> None:

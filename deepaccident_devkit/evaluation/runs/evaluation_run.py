@@ -1,4 +1,4 @@
-"""`evaluate_results`: from a results file and a release to an `EvaluationRun`, its numbers and what they depend on."""
+"""`evaluate_results`: from results and a release to an `EvaluationRun` with its numbers."""
 
 from __future__ import annotations
 
@@ -68,28 +68,31 @@ BREAKDOWNS: Final = (
     "trajectory_type",
     "collision_status",
 )
-"""What results are broken down by if nothing else is asked for; `all` for intervals of the result itself."""
+"""Default attributes of breakdowns; `all` for intervals of the result itself."""
+# Libraries whose arithmetic affects the numbers; a summary holds their versions.
+_LIBRARIES: Final = ("numpy", "scipy")
 
 
 def breakdowns_of(task: str) -> tuple[str, ...]:
-    """What a task's results are broken down by if nothing else is asked for: warnings by whole recordings alone."""
-    whole = evaluator_class(task).needs_whole_recordings
-    return tuple(name for name in BREAKDOWNS if not (whole and name in WITHIN_RECORDINGS))
+    """Return the default attributes of a task's breakdowns.
 
-
-# Whose versions stand in a summary: arithmetic is theirs.
-_LIBRARIES: Final = ("numpy", "scipy")
+    Warnings are evaluated on whole recordings and have no attributes within recordings.
+    """
+    names = BREAKDOWNS
+    if evaluator_class(task).needs_whole_recordings:
+        return tuple(name for name in names if name not in WITHIN_RECORDINGS)
+    return names
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Partial:
-    """How many of the expected samples were not evaluated.
+    """Numbers of expected samples that were and were not evaluated.
 
     Attributes:
-        missing: samples without a prediction.
-        extra: predictions that are left out: of other samples, or of none.
-        expected: samples that should be evaluated.
-        evaluated: those that were.
+        missing: Number of samples without a prediction.
+        extra: Number of predictions that are left out: of other samples, or of no sample.
+        expected: Number of samples that should be evaluated.
+        evaluated: Number of samples that were evaluated.
     """
 
     missing: int
@@ -98,23 +101,25 @@ class Partial:
     evaluated: int
 
     def text(self) -> str:
-        """The mark that every number bears: `PARTIAL: 120 of 180 samples`."""
-        left_out = f", {counted(self.extra, 'prediction')} left out" if self.extra else ""
+        """Return the mark that every number bears: `PARTIAL: 120 of 180 samples`."""
+        left_out = ""
+        if self.extra:
+            left_out = f", {counted(self.extra, 'prediction')} left out"
         return f"PARTIAL: {self.evaluated} of {counted(self.expected, 'sample')}{left_out}"
 
     def as_dict(self) -> dict[str, Any]:
-        """By name, with the text as `mark`."""
+        """Return the values by name, with the text as `mark`."""
         return asdict(self) | {"mark": self.text()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseInfo(ShortRepr):
-    """Of which release the truth is.
+    """The release that the ground truth comes from.
 
     Attributes:
-        dataroot: its folder.
+        dataroot: Its folder.
         version: `v1` or `v1-mini`.
-        scenarios: hashes of the label, meta and calib files of each scenario evaluated.
+        scenarios: Hashes of the label, meta and calib files of each evaluated scenario.
     """
 
     dataroot: str
@@ -123,20 +128,20 @@ class ReleaseInfo(ShortRepr):
 
     @property
     def fingerprint(self) -> str:
-        """One hash over all these."""
+        """A single hash over all these hashes."""
         return fingerprint(self.scenarios)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultsInfo(ShortRepr):
-    """Of which results the predictions are.
+    """The results that were evaluated.
 
     Attributes:
-        path: of their file or folder.
-        task: what they hold: `motion`, `accident` or `detection`.
-        fingerprint: a hash over all of them.
-        meta: what their maker says of them.
-        form: of motion, how they are stored, as JSON holds it; None for others.
+        path: Path of their file or folder.
+        task: Kind of predictions: `motion`, `accident` or `detection`.
+        fingerprint: Hash over all predictions.
+        meta: Notes of their author.
+        form: How predictions of motion are stored, in JSON form; None for other results.
     """
 
     path: str
@@ -148,22 +153,24 @@ class ResultsInfo(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EvaluationRun:
-    """An evaluation that is done.
+    """A finished evaluation.
 
     Attributes:
-        setup: task and rules.
-        selection: which samples.
-        evaluator: with the counts of each sample.
-        result: of all samples, as the task's evaluator computes it.
-        partial: what is missing; None for nothing.
-        left_out: how many predictions of other samples the results have.
-        attributes: of each sample evaluated, by token.
-        times_to_impact: seconds from each of them to the recorded impact; None where there is none, or none is known.
-        breakdowns: results by attribute; `all` has the intervals of the result itself.
-        release: whose labels are the truth.
-        results: whose predictions they are.
-        sanity: what the sanity check says, as JSON holds it; None without.
-        further: name → a further result (`further.with_further`), as one group `all` with intervals.
+        setup: Task and rules.
+        selection: The samples that were selected.
+        evaluator: Evaluator with the counts of each sample.
+        result: Result of all samples, as computed by the task's evaluator.
+        partial: What is missing; None if nothing is.
+        left_out: Number of predictions of other samples that the results have.
+        attributes: Token → attributes of the sample, for each evaluated sample.
+        times_to_impact: Token → seconds to the recorded impact; None where there is none, or none
+            is known.
+        breakdowns: Results by attribute; `all` has the intervals of the result itself.
+        release: The release that the ground truth comes from.
+        results: The results that were evaluated.
+        sanity: Report of the sanity check in JSON form; None without a check.
+        further: Name → a further result (`further.with_further`), as a single group `all` with
+            intervals.
     """
 
     setup: EvaluationSetup
@@ -181,18 +188,21 @@ class EvaluationRun:
     further: Mapping[str, Breakdown[Any]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Task, protocol, whether it is partial, and the first headlines."""
-        mark = "" if self.partial is None else f", {self.partial.text()}"
-        return f"EvaluationRun({self.setup.task}, protocol {self.setup.protocol}{mark}: {self.result!r})"
+        """Return task, protocol, whether it is partial, and the first headlines."""
+        mark = ""
+        if self.partial is not None:
+            mark = f", {self.partial.text()}"
+        protocol = f"protocol {self.setup.protocol}{mark}"
+        return f"EvaluationRun({self.setup.task}, {protocol}: {self.result!r})"
 
     @property
     def prevented(self) -> Breakdown[Any] | None:
-        """Of warnings, the accidents that they would have prevented; None without (`with_prevented`)."""
+        """Accidents that warnings would have prevented; None without (`with_prevented`)."""
         return self.further.get("prevented")
 
     @property
     def stamp(self) -> dict[str, Any]:
-        """The stamp of every file: devkit, task, protocol, and whether it is partial."""
+        """Stamp of every file: version of the devkit, task, protocol, and the mark if partial."""
         return {
             "devkit_version": __version__,
             "task": self.setup.task,
@@ -204,38 +214,33 @@ class EvaluationRun:
         self,
         by: Sequence[str] | None = None,
         resampling: Resampling | None = None,
-        **how: Unpack[Engine],
+        **engine: Unpack[Engine],
     ) -> EvaluationRun:
-        """The same run with results by these attributes, in place of those it has.
+        """Return the same run with results by these attributes, which replace its breakdowns.
 
         Args:
-            by: of `breakdowns.ATTRIBUTES`; one that is given twice counts once. None for `breakdowns_of` the task.
-            resampling: how intervals are made; None for the defaults.
-            **how: `workers` (1 if not given), `executor` and `progress`, as `parallel.Engine` says.
+            by: Names of `breakdowns.ATTRIBUTES`; repeated names count once. None for
+                `breakdowns_of` the task.
+            resampling: How intervals are made; None for the defaults.
+            **engine: `workers` (1 by default), `executor` and `progress`, see `parallel.Engine`.
 
         Raises:
             ChoiceError: no such attribute.
         """
-        chosen = breakdowns_of(self.setup.task) if by is None else map(attribute_name, by)
+        names = breakdowns_of(self.setup.task) if by is None else map(attribute_name, by)
         work = partial(breakdown, self.evaluator, dict(self.attributes), resampling=resampling)
-        how = {"workers": 1, **how}
-        found = run_batch(work, list(dict.fromkeys(chosen)), **how)
-        return replace(self, breakdowns=tuple(found))
+        engine = {"workers": 1, **engine}
+        breakdowns = run_batch(work, list(dict.fromkeys(names)), **engine)
+        return replace(self, breakdowns=tuple(breakdowns))
 
     def summary(self) -> dict[str, Any]:
-        """All numbers except those of single samples, and what they depend on, as JSON holds it."""
-        from importlib.metadata import version as installed_version
-
-        made = {
+        """Return all numbers except for single samples, and what they depend on, as JSON."""
+        values = {
             "format": SUMMARY_FORMAT,
             "version": SUMMARY_VERSION,
             **self.stamp,
-            **{
-                name: each
-                for name, each in self.setup.as_dict().items()
-                if name not in ("task", "protocol")
-            },
-            **{name: each for name, each in self.selection.as_dict().items() if name != "horizon"},
+            **_without(self.setup.as_dict(), "task", "protocol"),
+            **_without(self.selection.as_dict(), "horizon"),
             "counts": {
                 "samples": len(self.evaluator),
                 "scenarios": len(set(map(scenario_of, self.evaluator.tokens))),
@@ -247,68 +252,76 @@ class EvaluationRun:
                 "fingerprint": self.release.fingerprint,
             },
             "results": self.results,
-            "headlines": [{**asdict(each), "text": each.text()} for each in headlines(self.result)],
+            "headlines": [{**asdict(line), "text": line.text()} for line in headlines(self.result)],
             "metrics": self.result.as_dict(),
-            "breakdowns": {each.by: self._breakdown(each) for each in self.breakdowns},
-            "environment": {
-                "python": platform.python_version(),
-                **{name: installed_version(name) for name in _LIBRARIES},
-            },
+            "breakdowns": {table.by: _breakdown_values(table) for table in self.breakdowns},
+            "environment": _environment(),
             "sanity": self.sanity,
-            **{name: _further(each) for name, each in self.further.items()},
+            **{name: _further_values(table) for name, table in self.further.items()},
         }
-        plain_form: dict[str, Any] = json.loads(json.dumps(plain(made)))
+        plain_form: dict[str, Any] = json.loads(json.dumps(plain(values)))
         return plain_form
 
-    def _breakdown(self, given: Breakdown[Any]) -> dict[str, Any]:
-        return {
-            "resampling": plain(given.resampling),
-            "groups": self._groups(given.groups),
-            "without_infrastructure": self._groups(given.without_infrastructure),
-        }
 
-    def _groups(self, groups: Sequence[Group[Any]]) -> list[dict[str, Any]]:
-        return [
-            {
-                "value": group.value,
-                "samples": group.samples,
-                "scenarios": group.scenarios,
-                "clusters": group.clusters,
-                "headlines": {each.path: each.value for each in headlines(group.result)},
-                "metrics": group.result.as_dict(),
-                "intervals": plain(group.intervals),
-                "notes": list(group.notes),
-            }
-            for group in groups
-        ]
+def _without(values: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name not in names}
 
 
-def _further(given: Breakdown[Any]) -> dict[str, Any]:
-    (group,) = given.groups
+def _environment() -> dict[str, str]:
+    """Return the versions of Python and of the libraries."""
+    from importlib.metadata import version as installed_version
+
+    versions = {name: installed_version(name) for name in _LIBRARIES}
+    return {"python": platform.python_version(), **versions}
+
+
+def _breakdown_values(table: Breakdown[Any]) -> dict[str, Any]:
+    return {
+        "resampling": plain(table.resampling),
+        "groups": list(map(_group_values, table.groups)),
+        "without_infrastructure": list(map(_group_values, table.without_infrastructure)),
+    }
+
+
+def _group_values(group: Group[Any]) -> dict[str, Any]:
+    return {
+        "value": group.value,
+        "samples": group.samples,
+        "scenarios": group.scenarios,
+        "clusters": group.clusters,
+        "headlines": {line.path: line.value for line in headlines(group.result)},
+        "metrics": group.result.as_dict(),
+        "intervals": plain(group.intervals),
+        "notes": list(group.notes),
+    }
+
+
+def _further_values(table: Breakdown[Any]) -> dict[str, Any]:
+    (group,) = table.groups
     return {
         **group.result.as_dict(),
-        "resampling": plain(given.resampling),
+        "resampling": plain(table.resampling),
         "intervals": plain(group.intervals),
         "interval_notes": list(group.notes),
     }
 
 
 @dataclass(frozen=True, eq=False)
-class _AttributesWhenAsked(Mapping[str, SampleAttributes]):
-    """`sample_attributes`, made when one is asked for: an evaluation that is not broken down needs none."""
+class _LazyAttributes(Mapping[str, SampleAttributes]):
+    """`sample_attributes`, computed on first use: only evaluations with breakdowns need them."""
 
     dataset: Dataset
     tokens: Sequence[str]
 
     @cached_property
-    def _made(self) -> dict[str, SampleAttributes]:
+    def _attributes(self) -> dict[str, SampleAttributes]:
         return sample_attributes(self.dataset, self.tokens)
 
     def __getitem__(self, token: str) -> SampleAttributes:
-        return self._made[token]
+        return self._attributes[token]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._made)
+        return iter(self._attributes)
 
     def __len__(self) -> int:
         return len(self.tokens)
@@ -323,76 +336,77 @@ def evaluate_results(
     *,
     allow_partial: bool = False,
     out: str | os.PathLike[str] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> EvaluationRun:
-    """Evaluate a results file. It is checked wholly before any long work; any number of workers gives the same bits.
+    """Evaluate a results file, which is fully checked before any long work.
+
+    Any number of workers gives the same bits.
 
     Args:
-        dataset: the release.
-        results: opened, or their path.
-        setup: task and rules.
-        selection: which samples; the name of a split for what `default_selection` has of it.
-        allow_partial: whether to evaluate the samples that are in both where the results lack some, or have others;
-            if some are missing, all output is marked as partial.
-        out: the folder that the run will be saved to (`save_run`): counts are kept beside it, a run that broke off goes
-            on with them if nothing that they depend on has changed, and several processes that are given it share the
-            samples. None for no such counts.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        results: The opened results, or their path.
+        setup: Task and rules.
+        selection: The samples; the name of a split stands for its `default_selection`.
+        allow_partial: Whether to evaluate the samples common to both where the results lack some,
+            or have others; if some are missing, all output is marked as partial.
+        out: The folder that the run will be saved to (`save_run`). Counts are stored beside it: an
+            interrupted run continues with them if nothing that they depend on has changed, and
+            several processes with the same folder share the samples. None for no such counts.
+        **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
 
     Returns:
         The run, without breakdowns: `EvaluationRun.broken_down` adds them.
 
     Raises:
-        ResultsError: the results cannot be read, an entry is wrong, they are of other recordings (`check_recordings`),
-            or they do not have the samples of the selection.
-        EvaluationError: they are of another kind than the task is evaluated from or look less far ahead, scenarios lack
-            the meta that the task needs, or samples cannot be evaluated.
+        ResultsError: the results cannot be read, an entry is wrong, they are of other recordings
+            (`check_recordings`), or they do not have the samples of the selection.
+        EvaluationError: they are of another kind than the task is evaluated from or look less far
+            ahead, scenarios lack the meta that the task needs, or samples cannot be evaluated.
         ChoiceError: no such split.
         NotAvailableError: the release has no such samples.
         IndexStoreError: files of these scenarios have changed since the index was made.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    chosen = (
-        selection if isinstance(selection, SampleSelection) else default_selection(setup, selection)
-    )
-    loader = SampleLoader(
-        dataset, results if isinstance(results, Results) else read_results(results), setup
-    )
-    check_recordings(loader.results, dataset)
-    covered = coverage(dataset, loader.results.tokens, chosen, explain=not allow_partial)
-    tokens = _covered_tokens(dataset, loader.results, chosen, covered, allow_partial=allow_partial)
+    if not isinstance(selection, SampleSelection):
+        selection = default_selection(setup, selection)
+    opened = results if isinstance(results, Results) else read_results(results)
+    loader = SampleLoader(dataset, opened, setup)
+    check_recordings(opened, dataset)
+    covered = coverage(dataset, opened.tokens, selection, explain=not allow_partial)
+    tokens = _covered_tokens(dataset, opened, selection, covered, allow_partial=allow_partial)
     if evaluator_class(setup.task).needs_meta:
-        check_metas(dataset, tokens, chosen.split)
-    how = {"workers": None, **how}
-    loader.results.check(**how)
+        check_metas(dataset, tokens, selection.split)
+    engine = {"workers": None, **engine}
+    opened.check(**engine)
+    scenarios = set(map(scenario_of, tokens))
     hashes = scenario_hashes(
-        dataset, set(map(scenario_of, tokens)), workers=how["workers"], executor=how.get("executor")
+        dataset, scenarios, workers=engine["workers"], executor=engine.get("executor")
     )
-    prints = {"results": loader.results.fingerprint, "release": fingerprint(hashes)}
+    prints = {"results": opened.fingerprint, "release": fingerprint(hashes)}
     checkpoint = None if out is None else checkpoint_path(out, setup, tokens, prints)
     samples = {token: token for token in tokens}
     evaluator = evaluate_samples(
-        setup.evaluator(), samples, loader, checkpoint=checkpoint, places=loader.places, **how
+        setup.evaluator(), samples, loader, checkpoint=checkpoint, places=loader.places, **engine
     )
     return EvaluationRun(
         setup=setup,
-        selection=chosen,
+        selection=selection,
         evaluator=evaluator,
         result=evaluator.compute(),
         partial=partial_of(covered),
         left_out=len(covered.extra) + len(covered.unknown),
-        attributes=_AttributesWhenAsked(dataset, tokens),
+        attributes=_LazyAttributes(dataset, tokens),
         times_to_impact={token: dataset.get("sample", token)["time_to_impact"] for token in tokens},
         breakdowns=(),
         release=ReleaseInfo(
             dataroot=str(dataset.dataroot), version=dataset.version, scenarios=hashes
         ),
-        results=results_info(loader.results),
+        results=results_info(opened),
     )
 
 
 def results_info(results: Results) -> ResultsInfo:
-    """The facts on its results that a run keeps."""
+    """Return the metadata of the results that a run stores."""
     return ResultsInfo(
         path=os.fspath(Path(results.path).absolute()),
         task=results.task,
@@ -410,14 +424,17 @@ def _covered_tokens(
     *,
     allow_partial: bool,
 ) -> list[str]:
+    """Return the samples to evaluate; raises ResultsError if samples differ or there are none."""
     if not covered.is_complete and not allow_partial:
         remedy = (
-            "; give results of these samples, choose the list that they are of (--split, --agents, --samples, --scope, "
-            "--horizon; in Python a SampleSelection), or evaluate the samples that have a prediction with "
-            "allow_partial=True (--allow-partial), which marks every number as partial"
+            "; give results of these samples, choose the list that they are of (--split, "
+            "--agents, --samples, --scope, --horizon; in Python a SampleSelection), or evaluate "
+            "the samples that have a prediction with allow_partial=True (--allow-partial), which "
+            "marks every number as partial"
         )
-        is_enough = covered.options or not (covered.missing or covered.unknown)
-        raise ResultsError(f"{results.path}: {covered.to_text()}{'' if is_enough else remedy}")
+        if covered.options or not (covered.missing or covered.unknown):
+            remedy = ""  # the text of the coverage has a better one
+        raise ResultsError(f"{results.path}: {covered.to_text()}{remedy}")
     tokens = [token for token in selection.tokens(dataset) if token in results]
     if not tokens:
         raise ResultsError(f"{results.path}: {covered.to_text()}; nothing is left to evaluate")
@@ -425,22 +442,33 @@ def _covered_tokens(
 
 
 def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
-    """Raise EvaluationError, which counts them, if scenarios of samples have no meta file: it names the pair."""
+    """Raise EvaluationError if scenarios of samples have no meta file, which names the pair.
+
+    The message has the number of such scenarios.
+    """
     scenarios = list(dict.fromkeys(map(scenario_of, tokens)))
-    silent = [token for token in scenarios if dataset.get("scenario", token)["weather"] is None]
-    if silent:
-        of_split = f" --where split={split}" if split in SPLITS else ""
+    without_meta = [
+        token for token in scenarios if dataset.get("scenario", token)["weather"] is None
+    ]
+    if without_meta:
+        of_split = ""
+        if split in SPLITS:
+            of_split = f" --where split={split}"
+        more = ""
+        if len(without_meta) > 3:
+            more = ", …"
         raise EvaluationError(
-            f"{len(silent)} of {len(scenarios)} scenarios have no meta file, which names the colliding pair, so that "
-            f"accidents cannot be evaluated there: {', '.join(silent[:3])}{', …' if len(silent) > 3 else ''}; unpack "
-            f"their meta folders, or leave them out with a split file of your own: deepaccident split "
-            f"{shlex.quote(str(dataset.dataroot))}{of_split} --where 'weather!=unknown' --out mine.txt, then "
-            "--split mine.txt"
+            f"{len(without_meta)} of {len(scenarios)} scenarios have no meta file, which names the "
+            "colliding pair, so that accidents cannot be evaluated there: "
+            f"{', '.join(without_meta[:3])}{more}; unpack their meta folders, or leave them out "
+            "with a split file of your own: deepaccident split "
+            f"{shlex.quote(str(dataset.dataroot))}{of_split} --where 'weather!=unknown' --out "
+            "mine.txt, then --split mine.txt"
         )
 
 
 def partial_of(covered: Coverage) -> Partial | None:
-    """The mark of a run; predictions of other samples alone change no number."""
+    """Return the mark of a run; None if only predictions of other samples are left out."""
     missing = len(covered.missing)
     if not missing:
         return None

@@ -1,4 +1,4 @@
-"""Extra results of a run: numbers beside those of its task, which a plug-in computes from the same counts."""
+"""Extra results of a run: numbers that a plug-in computes from the same counts as its task."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Json = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExtraResult:
-    """What a plug-in adds to runs, under its name in `Plugin.extra_results` and in summaries.
+    """Extra result of a plug-in, under its name in `Plugin.extra_results` and in summaries.
 
     Attributes:
-        title: heading of its numbers.
-        evaluator: what computes them: of a dataset, a run's evaluator, and `parallel.Engine`.
-        tables: of the numbers as a summary holds them.
-        figures: Draws the computed result; imports what draws when it is called.
+        title: Heading of its numbers.
+        evaluator: Returns the evaluator for a dataset, a run's evaluator, and `parallel.Engine`.
+        tables: Returns the tables of the numbers in a summary.
+        figures: Draws the computed result; imports the drawing library when it is called.
     """
 
     title: str
@@ -39,10 +39,13 @@ class ExtraResult:
     tables: Callable[[Json], list[Table]]
     figures: Callable[[Any], Iterable[Any]]
 
-    def text(self, told: Json) -> str:
-        """All tables and the notes of what a summary holds, as aligned lines."""
-        notes = ["\n".join(told["notes"])] if told["notes"] else []
-        return "\n\n".join([*(each.to_text() for each in self.tables(told)), *notes])
+    def text(self, numbers: Json) -> str:
+        """Return all tables and notes of the numbers in a summary as aligned lines."""
+        blocks = [table.to_text() for table in self.tables(numbers)]
+        notes = numbers["notes"]
+        if notes:
+            blocks.append("\n".join(notes))
+        return "\n\n".join(blocks)
 
 
 def extra_result(name: str) -> ExtraResult:
@@ -62,36 +65,34 @@ def with_further(
     name: str,
     dataset: Dataset,
     resampling: Resampling | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> EvaluationRun:
-    """The same run with a further result, and intervals of its numbers.
+    """Return the same run with a further result, and intervals of its numbers.
 
     Raises:
         MissingPluginError: its plug-in is not installed.
         EvaluationError: the run is of another task or protocol than it needs.
         WorkerError: a worker was killed, or cannot do the work.
     """
-    evaluator = extra_result(name).evaluator(dataset, run.evaluator, **{"workers": 1, **how})
-    found = breakdown(evaluator, run.attributes, EVERYTHING, resampling)
-    groups = tuple(replace(each, result=evaluator.compute()) for each in found.groups)
-    made = replace(found, groups=groups, without_infrastructure=())
-    return replace(run, further={**run.further, name: made})
+    evaluator = extra_result(name).evaluator(dataset, run.evaluator, **{"workers": 1, **engine})
+    table = breakdown(evaluator, run.attributes, EVERYTHING, resampling)
+    groups = tuple(replace(group, result=evaluator.compute()) for group in table.groups)
+    complete_table = replace(table, groups=groups, without_infrastructure=())
+    return replace(run, further={**run.further, name: complete_table})
 
 
 def further_results(summary: Json) -> Iterator[tuple[ExtraResult, Json]]:
-    """The further results that a summary holds, and their numbers; raises MissingPluginError."""
+    """Yield the further results of a summary with their numbers; raises MissingPluginError."""
     for name in further_names(summary):
         yield extra_result(name), summary[name]
 
 
 def further_names(summary: Json) -> list[str]:
-    """The names of the further results that a summary holds."""
-    own = offers(lambda plugin: plugin.extra_results, own=True).by_name
-    found = {
-        name
-        for name, value in summary.items()
-        if isinstance(value, Mapping) and "interval_notes" in value
-    }
-    return [
-        name for name in summary if name in found or (name in own and summary[name] is not None)
-    ]
+    """Return the names of the further results of a summary."""
+    installed = offers(lambda plugin: plugin.extra_results, own=True).by_name
+    names = []
+    for name, value in summary.items():
+        has_intervals = isinstance(value, Mapping) and "interval_notes" in value
+        if has_intervals or (name in installed and value is not None):
+            names.append(name)
+    return names

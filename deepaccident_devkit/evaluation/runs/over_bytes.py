@@ -1,21 +1,21 @@
-"""`over_bytes`: headline numbers of evaluations over the bytes that partners send, which their results note."""
+"""`over_bytes`: headline numbers of evaluations over the bytes that partners send."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of
-from deepaccident_devkit.evaluation.runs.bundles import read_bundle
+from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.comparison import comparable
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.task import Unit, headlines, value_text
@@ -23,14 +23,17 @@ from deepaccident_devkit.support.reports import Report, Row, record_rows
 from deepaccident_devkit.support.text import columns_text, counted, path_of
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
+# Number of headlines that are compared.
+_MAX_HEADLINES: Final = 4
+
 
 class SentBytes(msgspec.Struct, kw_only=True, frozen=True):
-    """What partners send, by the notes of results (`v2x.messages.traffic_note`).
+    """The bytes that partners send, as noted in results (`v2x.messages.traffic_note`).
 
     Attributes:
-        payload: the kind of data, or the bytes of every message.
-        mean: bytes a sample, from all partners together.
-        partners: how many they are, on average.
+        payload: Kind of data, or the bytes of every message.
+        mean: Mean bytes a sample, from all partners together.
+        partners: Mean number of partners.
     """
 
     payload: int | Annotated[str, msgspec.Meta(pattern=r"^[\w +-]{1,40}\Z")]
@@ -38,17 +41,19 @@ class SentBytes(msgspec.Struct, kw_only=True, frozen=True):
     partners: Annotated[float, msgspec.Meta(ge=0)]
 
     def text(self) -> str:
-        """In a line; also as a power of 2, and as what a radio has to carry."""
+        """Return one line, with the bytes also as a power of 2 and as the load of a radio."""
+        power = ""
+        if self.mean:
+            power = f" (2^{math.log2(self.mean):.1f})"
+        megabits = self.mean * 8e-6 / FRAME_PERIOD
         return (
-            f"{self.mean:,.0f} a sample"
-            + (f" (2^{math.log2(self.mean):.1f})" if self.mean else "")
-            + f", {self.mean * 8e-6 / FRAME_PERIOD:,.2f} Mbit/s at 10 Hz, {self.partners:.1f} partners"
-            + f", payload {self.payload}"
+            f"{self.mean:,.0f} a sample{power}, {megabits:,.2f} Mbit/s at 10 Hz, "
+            f"{self.partners:.1f} partners, payload {self.payload}"
         )
 
 
 def sent_bytes(summary: Mapping[str, Any]) -> SentBytes | None:
-    """What the results of an evaluation note, by its summary; None if they note nothing, or something else."""
+    """Return the bytes that the results of a summary note; None without a valid note."""
     try:
         return msgspec.convert(summary["results"]["meta"]["bytes"], SentBytes)
     except (LookupError, TypeError, msgspec.ValidationError):
@@ -60,13 +65,14 @@ class BytesPoint:
     """A headline number of one evaluation.
 
     Attributes:
-        evaluation: its folder, by its name where that is enough; `(partial)` where it is.
-        bytes: a sample, from all partners together.
-        headline: the number's short name.
-        unit: of the number.
-        value: of the number.
-        low: where its interval begins; None for no interval.
-        high: where it ends.
+        evaluation: Name of its folder, or its path if names repeat; with `(partial)` if it is
+            partial.
+        bytes: Mean bytes a sample, from all partners together.
+        headline: Short name of the number.
+        unit: Unit of the number.
+        value: The number.
+        low: Lower end of its interval; None for no interval.
+        high: Upper end.
     """
 
     evaluation: str
@@ -83,11 +89,11 @@ class OverBytes(Report):
     """Evaluations of the same samples by the same rules.
 
     Attributes:
-        task: of all.
-        protocol: of all.
-        samples: evaluated.
-        resampling: how intervals were made.
-        points: by headline, four at most, and by evaluation, as they were given.
+        task: Task of all.
+        protocol: Protocol of all.
+        samples: Number of samples evaluated.
+        resampling: How intervals were made.
+        points: Points by headline, four at most, and by evaluation in the order of the arguments.
     """
 
     task: str
@@ -97,33 +103,20 @@ class OverBytes(Report):
     points: tuple[BytesPoint, ...]
 
     def to_text(self) -> str:
-        """A line for each headline of each evaluation."""
-        rows = [
-            (
-                "number",
-                "evaluation",
-                "bytes a sample",
-                "value",
-                f"{self.resampling.confidence:.0%} interval",
-            ),
-            *(
-                (
-                    each.headline,
-                    each.evaluation,
-                    f"{each.bytes:,.0f}",
-                    value_text(each.value, each.unit),
-                    "–"
-                    if each.low is None or each.high is None
-                    else f"[{each.low:.3f}, {each.high:.3f}]",
-                )
-                for each in self.points
-            ),
-        ]
+        """Return a line for each headline of each evaluation."""
+        interval_title = f"{self.resampling.confidence:.0%} interval"
+        rows = [("number", "evaluation", "bytes a sample", "value", interval_title)]
+        for point in self.points:
+            interval = "–"
+            if point.low is not None and point.high is not None:
+                interval = f"[{point.low:.3f}, {point.high:.3f}]"
+            value = value_text(point.value, point.unit)
+            rows.append((point.headline, point.evaluation, f"{point.bytes:,.0f}", value, interval))
         head = f"{self.task}, protocol {self.protocol}: {counted(self.samples, 'sample')}"
         return f"{head}\n\n{columns_text(rows, left=2)}"
 
     def named_tables(self) -> dict[str, list[Row]]:
-        """A line a point."""
+        """Return a table with a row for each point."""
         return {"numbers": record_rows(BytesPoint, self.points)}
 
 
@@ -133,62 +126,79 @@ def over_bytes(
     *,
     common: bool = False,
 ) -> OverBytes:
-    """The headlines that all of some bundles have, over the bytes that partners sent for them.
+    """Return the headlines that all bundles have, over the bytes that partners sent for them.
 
     Args:
-        folders: of the bundles, as `save_run` writes them.
-        resampling: how intervals are made; None for the defaults.
-        common: whether to take only the samples that all have, if they differ; bytes stay those of all.
+        folders: Folders of the bundles, as written by `save_run`.
+        resampling: How intervals are made; None for the defaults.
+        common: Whether to use only the samples common to all, if they differ; the bytes stay the
+            mean over all samples of a bundle.
 
     Raises:
         ResultsError: one of them is no bundle.
-        EvaluationError: results do not note the bytes; or as of `compare_bundles`.
+        EvaluationError: results do not note the bytes; or as in `compare_bundles`.
     """
-    bundles, chosen = (
-        [read_bundle(path_of(folder)) for folder in folders],
-        resampling or Resampling(),
-    )
-    sent = [each for bundle in bundles if (each := sent_bytes(bundle.summary))]
-    if len(sent) < len(bundles):
-        raise EvaluationError(
-            f"{next(bundle.folder for bundle in bundles if sent_bytes(bundle.summary) is None)}: its results do not "
-            "note how many bytes partners send; predict again into a new folder (deepaccident predict … --out), and "
-            "evaluate those results"
-        )
-    runs, tokens = comparable(bundles, common=common)
-    task, points = bundles[0].setup.task, list[BytesPoint]()
-    clusters = dict(
-        sorted(((token, cluster_of(scenario_of(token))) for token in tokens), key=itemgetter(1))
-    )
-    names = [bundle.folder.name for bundle in bundles]
-    for name, bundle, by, run in zip(names, bundles, sent, runs, strict=True):
-        result = run.compute(tokens)
-        ends = intervals_of(run, run.clustered(clusters), result, chosen).ends
-        points += [
-            BytesPoint(
-                evaluation=f"{name if names.count(name) == 1 else bundle.folder}"
-                f"{' (partial)' * bool(bundle.summary['partial'])}",
-                bytes=by.mean,
-                headline=each.name,
-                unit=each.unit,
-                value=each.value,
-                low=ends[each.path][0] if each.path in ends else None,
-                high=ends[each.path][1] if each.path in ends else None,
-            )
-            for each in headlines(result)
-            if each.value is not None
-        ]
-    shown = [
+    bundles = [read_bundle(path_of(folder)) for folder in folders]
+    resampling = resampling or Resampling()
+    traffic = list(map(_noted_bytes, bundles))
+    evaluators, tokens = comparable(bundles, common=common)
+    pairs = [(token, cluster_of(scenario_of(token))) for token in tokens]
+    clusters = dict(sorted(pairs, key=itemgetter(1)))
+    folder_names = [bundle.folder.name for bundle in bundles]
+    points = list[BytesPoint]()
+    for bundle, sent, evaluator in zip(bundles, traffic, evaluators, strict=True):
+        name = bundle.folder.name
+        label = name if folder_names.count(name) == 1 else str(bundle.folder)
+        if bundle.summary["partial"]:
+            label += " (partial)"
+        result = evaluator.compute(tokens)
+        intervals = intervals_of(evaluator, evaluator.clustered(clusters), result, resampling)
+        points += _points(label, sent, result, intervals.ends)
+    shared = [
         name
-        for name, count in Counter(each.headline for each in points).items()
+        for name, count in Counter(point.headline for point in points).items()
         if count == len(bundles)
     ]
+    shared_points = []
+    for headline in shared[:_MAX_HEADLINES]:
+        shared_points += [point for point in points if point.headline == headline]
     return OverBytes(
-        task=task,
+        task=bundles[0].setup.task,
         protocol=bundles[0].setup.protocol,
         samples=len(tokens),
-        resampling=chosen,
-        points=tuple(
-            each for headline in shown[:4] for each in points if each.headline == headline
-        ),
+        resampling=resampling,
+        points=tuple(shared_points),
     )
+
+
+def _noted_bytes(bundle: Bundle) -> SentBytes:
+    """Return the bytes that the results of a bundle note; raises EvaluationError."""
+    sent = sent_bytes(bundle.summary)
+    if sent is None:
+        raise EvaluationError(
+            f"{bundle.folder}: its results do not note how many bytes partners send; predict "
+            "again into a new folder (deepaccident predict … --out), and evaluate those results"
+        )
+    return sent
+
+
+def _points(
+    evaluation: str,
+    sent: SentBytes,
+    result: Any,
+    ends: Mapping[str, tuple[float | None, float | None]],
+) -> Iterator[BytesPoint]:
+    """Yield a point for each headline of a result that has a value."""
+    for headline in headlines(result):
+        if headline.value is None:
+            continue
+        low, high = ends.get(headline.path, (None, None))
+        yield BytesPoint(
+            evaluation=evaluation,
+            bytes=sent.mean,
+            headline=headline.name,
+            unit=headline.unit,
+            value=headline.value,
+            low=low,
+            high=high,
+        )

@@ -1,4 +1,4 @@
-"""What is evaluated: by which rules (`EvaluationSetup`), and at which samples (`SampleSelection`)."""
+"""The rules of an evaluation (`EvaluationSetup`), and its samples (`SampleSelection`)."""
 
 from __future__ import annotations
 
@@ -51,22 +51,29 @@ __all__ = ["TASKS", "EvaluationSetup", "SampleLoader", "evaluator_class", "is_ta
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
-# Samples that a message names.
-_SHOWN: Final = 3
-# Seconds from one sample of a list to the next.
+# Number of samples that a message names.
+_MAX_NAMED_SAMPLES: Final = 3
+# Seconds between samples of a list.
 LIST_STEP: Final = 0.5
+# Tolerance of a horizon in steps.
+_STEP_TOLERANCE: Final = 1e-6
+# In seconds; recordings are shorter.
+_MAX_HORIZON_S: Final = 100
+# Folder of an unfinished evaluation's counts.
+_COUNTS_FOLDER: Final = "counts"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleSelection:
-    """A list of samples, as `motion.samples` makes it.
+    """A list of samples, as made by `motion.samples`.
 
     Attributes:
         split: `train`, `val`, … or the path of a split file.
-        samples: `evaluate` for those within the horizon before the end, `all` for two a second of whole scenarios.
-        scope: `accident` for scenarios designed to end in one, `all` for the normal ones, too.
-        agents: whose samples, in the order of `taxonomy.AGENTS`; None for all.
-        horizon: seconds before the end; only to `evaluate`.
+        samples: `evaluate` for samples within the horizon before the end, `all` for two a second
+            over the full scenarios.
+        scope: `accident` for scenarios designed to end in an accident, `all` for normal ones, too.
+        agents: Agents of the samples, in the order of `taxonomy.AGENTS`; None for all.
+        horizon: Seconds before the end; used only by `evaluate`.
     """
 
     split: str
@@ -76,93 +83,101 @@ class SampleSelection:
     horizon: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check and put the agents in order; raises ChoiceError."""
+        """Check the choices and put the agents in order; raises ChoiceError."""
         object.__setattr__(self, "split", spelled(os.fspath(self.split), SPLIT_CHOICES))
         settle_choices(self, {"samples": get_args(SampleList), "scope": get_args(ScopeName)})
         if self.agents is not None:
             object.__setattr__(self, "agents", _agents(self.agents))
 
     def tokens(self, dataset: Dataset) -> list[str]:
-        """The samples' tokens by scenario, agent and time.
+        """Return the samples' tokens ordered by scenario, agent and time.
 
         Raises:
             ChoiceError: no such split.
-            ConfigError: `evaluate` with a horizon that is no number of steps of 0.5 s.
+            ConfigError: `evaluate` with a horizon that is not a multiple of 0.5 s.
             NotAvailableError: this release has no such samples with labels.
         """
         horizon = self.horizon if self.samples == "evaluate" else LIST_STEP
         steps = horizon / LIST_STEP
-        if abs(steps - round(steps)) > 1e-6:
+        if abs(steps - round(steps)) > _STEP_TOLERANCE:
             raise ConfigError(
-                f"horizon: samples to evaluate are {LIST_STEP} s apart, so that {horizon:g} s does not say which; "
-                f"choose a multiple, or samples='all'"
+                f"horizon: samples to evaluate are {LIST_STEP} s apart, so that {horizon:g} s "
+                "does not say which; choose a multiple, or samples='all'"
             )
-        listed = samples(
+        tokens = samples(
             dataset, self.split, self.samples, "paper", horizon=horizon, scope=self.scope
         )
         if self.samples == "all" and self.scope == "accident":
-            listed = [token for token in listed if token.partition("/")[0].endswith("_accident")]
-        chosen = [
-            token for token in listed if self.agents is None or agent_of(token) in self.agents
-        ]
-        if not chosen:
-            whose = "" if self.agents is None else f" of {', '.join(self.agents)}"
+            tokens = [token for token in tokens if token.partition("/")[0].endswith("_accident")]
+        if self.agents is not None:
+            tokens = [token for token in tokens if agent_of(token) in self.agents]
+        if not tokens:
+            of_agents = ""
+            if self.agents is not None:
+                of_agents = f" of {', '.join(self.agents)}"
             raise NotAvailableError(
-                f"{self.split}: this release has no labelled samples{whose} there ({self.text()}); "
-                f"{no_samples_text(dataset, self.split, self.scope)}"
+                f"{self.split}: this release has no labelled samples{of_agents} there "
+                f"({self.text()}); {no_samples_text(dataset, self.split, self.scope)}"
             )
-        return chosen
+        return tokens
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, as JSON holds it."""
+        """Return all choices in JSON form."""
         return asdict(self) | {"agents": None if self.agents is None else list(self.agents)}
 
     def text(self) -> str:
-        """In words: `split val, samples evaluate (the last 2 s), scope accident, all agents`."""
-        within = f" (the last {self.horizon:g} s)" if self.samples == "evaluate" else ""
-        whose = "all agents" if self.agents is None else f"agents {', '.join(self.agents)}"
-        return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {whose}"
+        """Return the selection in words.
+
+        An example is `split val, samples evaluate (the last 2 s), scope accident, all agents`.
+        """
+        within = ""
+        if self.samples == "evaluate":
+            within = f" (the last {self.horizon:g} s)"
+        agents = "all agents" if self.agents is None else f"agents {', '.join(self.agents)}"
+        return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {agents}"
 
 
 def label_rules(task: str) -> dict[str, str]:
-    """What to say of the name of a protocol of labels that is given as a protocol of a task."""
-    given = (
-        "; choose the labels by the switch labels={0!r} (--switch labels={0})"
-        if task == "motion"
-        else ""
-    )
-    return {
-        name: f"; {name!r} is a protocol of labels{given.format(name)}" for name in LABEL_PROTOCOLS
-    }
+    """Return hints for protocols of labels that are given as a protocol of a task, by name."""
+    hints = {}
+    for name in LABEL_PROTOCOLS:
+        remedy = ""
+        if task == "motion":
+            remedy = f"; choose the labels by the switch labels={name!r} (--switch labels={name})"
+        hints[name] = f"; {name!r} is a protocol of labels{remedy}"
+    return hints
 
 
 def scenario_of(token: str) -> str:
-    """The scenario's token in a sample's."""
+    """Return the scenario's token of a sample's token."""
     return token.rsplit("/", 2)[0]
 
 
 def agent_of(token: str) -> str:
-    """The agent's name in a sample's token; empty if it is no sample's token."""
-    return token.rsplit("/", 2)[1] if token.count("/") > 1 else ""
+    """Return the agent's name in a sample's token; empty if it is not a sample's token."""
+    if token.count("/") > 1:
+        return token.rsplit("/", 2)[1]
+    return ""
 
 
-def _agents(given: Sequence[str]) -> tuple[str, ...]:
-    names = choices("agents", given, AGENTS)
+def _agents(requested: Sequence[str]) -> tuple[str, ...]:
+    names = choices("agents", requested, AGENTS)
     return tuple(name for name in AGENTS if name in names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coverage(ShortRepr):
-    """Results against the list of samples that are evaluated; tokens in order.
+    """Results compared with the list of samples that are evaluated; tokens are in order.
 
     Attributes:
-        expected: how many samples the list has.
-        missing: of the list, without a prediction.
-        extra: samples of this release with a prediction that are not in the list.
-        unknown: tokens of predictions that are no samples of this release.
-        splits: that the predictions are of.
-        agents: likewise, in the order of `taxonomy.AGENTS`.
-        options: of `deepaccident evaluate`, by which exactly the predicted samples are evaluated; empty if unknown.
+        expected: Number of samples in the list.
+        missing: Samples of the list without a prediction.
+        extra: Samples of this release with a prediction that are not in the list.
+        unknown: Tokens of predictions that are no samples of this release.
+        splits: Splits of the predictions.
+        agents: Agents of the predictions, in the order of `taxonomy.AGENTS`.
+        options: Options of `deepaccident evaluate` that select exactly the predicted samples; empty
+            if unknown.
     """
 
     expected: int
@@ -175,143 +190,149 @@ class Coverage(ShortRepr):
 
     @property
     def is_complete(self) -> bool:
-        """Whether the results have each sample of the list, and no other."""
+        """Whether the results have each sample of the list, and no others."""
         return not (self.missing or self.extra or self.unknown)
 
     def to_text(self) -> str:
-        """Say which options are missing; if that is unknown, how many samples, with three of each. Or that all fit."""
+        """Return which options are missing, or how many samples, with three of each kind."""
         if self.is_complete:
             return f"all {self.expected} samples have a prediction, and nothing else has"
-        parts = [
-            _named(
-                self.missing,
-                f"without a prediction: {len(self.missing)} of {counted(self.expected, 'sample')}",
-            ),
-            _named(
-                self.extra,
-                f"{counted(len(self.extra), 'prediction')} of samples that are not evaluated",
-            ),
-            _named(
-                self.unknown,
-                f"{counted(len(self.unknown), 'prediction')} of no sample of this release",
-            ),
-        ]
+        parts = self._counts()
         if self.options:
             remedy = "evaluate with these options, too, or predict again without them"
             parts = [f"the predictions are of the samples of {self.options}: {remedy}"]
         elif self.agents:
-            parts.append(
-                f"the predictions are of --split {', '.join(self.splits)} --agents {','.join(self.agents)}"
-            )
+            splits, agents = ", ".join(self.splits), ",".join(self.agents)
+            parts.append(f"the predictions are of --split {splits} --agents {agents}")
         if self.extra and not (self.missing or self.unknown):
             parts.append(
-                "leave them out with --allow-partial (allow_partial=True), or evaluate whole scenarios with --samples "
-                "all; no sample lacks a prediction, so the numbers are not partial then"
+                "leave them out with --allow-partial (allow_partial=True), or evaluate whole "
+                "scenarios with --samples all; no sample lacks a prediction, so the numbers are "
+                "not partial then"
             )
-        return "; ".join(part for part in parts if part)
+        return "; ".join(filter(None, parts))
+
+    def _counts(self) -> list[str]:
+        """Return how many samples are missing, extra or unknown, and some names; empty for none."""
+        expected = counted(self.expected, "sample")
+        extra = counted(len(self.extra), "prediction")
+        unknown = counted(len(self.unknown), "prediction")
+        return [
+            _named(self.missing, f"without a prediction: {len(self.missing)} of {expected}"),
+            _named(self.extra, f"{extra} of samples that are not evaluated"),
+            _named(self.unknown, f"{unknown} of no sample of this release"),
+        ]
 
 
 def coverage(
     dataset: Dataset, results: Collection[str], selection: SampleSelection, *, explain: bool = True
 ) -> Coverage:
-    """Compare the tokens of results with the samples that a selection has.
+    """Compare the tokens of results with the samples of a selection.
 
     Args:
-        dataset: the release.
-        results: tokens of the predictions.
-        selection: what is to be evaluated.
-        explain: whether to look for `Coverage.options`, which lists the release's samples many times. It is done anyway
-            if no sample has a prediction.
+        dataset: The release.
+        results: Tokens of the predictions.
+        selection: The samples to evaluate.
+        explain: Whether to look for `Coverage.options`, which lists the release's samples many
+            times. This is always done if no sample has a prediction.
 
     Raises:
-        ChoiceError: as of `SampleSelection.tokens`, of the selection itself.
+        ChoiceError: as in `SampleSelection.tokens`, for the selection itself.
         ConfigError: likewise.
         NotAvailableError: likewise.
     """
-    expected, given = selection.tokens(dataset), set(results)
-    others = given.difference(expected)
-    unknown = {token for token in others if not _is_sample(dataset, token)}
-    present = set(map(agent_of, given - unknown))
-    of_scenarios = {
-        dataset.get("scenario", name)["split"] for name in set(map(scenario_of, given - unknown))
-    }
-    splits = tuple(name for name in SPLITS if name in of_scenarios)
-    agents = tuple(name for name in AGENTS if name in present)
-    is_sought = explain or given.isdisjoint(expected)
-    is_known = given and not unknown and given != set(expected)
+    expected, predicted = selection.tokens(dataset), set(results)
+    unexpected = predicted.difference(expected)
+    unknown = {token for token in unexpected if not _is_sample(dataset, token)}
+    samples_of_release = predicted - unknown
+    scenarios = set(map(scenario_of, samples_of_release))
+    predicted_agents = set(map(agent_of, samples_of_release))
+    predicted_splits = {dataset.get("scenario", name)["split"] for name in scenarios}
+    splits = tuple(name for name in SPLITS if name in predicted_splits)
+    agents = tuple(name for name in AGENTS if name in predicted_agents)
+    options = ""
+    if explain or predicted.isdisjoint(expected):
+        if predicted and not unknown and predicted != set(expected):
+            options = _missing_options(dataset, predicted, selection, splits, agents)
     return Coverage(
         expected=len(expected),
-        missing=tuple(token for token in expected if token not in given),
-        extra=tuple(sorted(others - unknown)),
+        missing=tuple(token for token in expected if token not in predicted),
+        extra=tuple(sorted(unexpected - unknown)),
         unknown=tuple(sorted(unknown)),
         splits=splits,
         agents=agents,
-        options=_missing_options(dataset, given, selection, splits, agents)
-        if is_sought and is_known
-        else "",
+        options=options,
     )
 
 
 def _missing_options(
     dataset: Dataset,
     tokens: set[str],
-    asked: SampleSelection,
+    requested: SampleSelection,
     splits: Iterable[str],
     agents: tuple[str, ...],
 ) -> str:
-    """Return the options that select exactly these samples, where they differ; empty if there are none."""
+    """Return the options that select exactly these samples, where they differ; empty for none."""
     horizon = max(dataset.get("sample", token)["time_to_end"] for token in tokens)
-    possible: dict[str, tuple[Any, ...]] = {
-        "split": (asked.split, *splits),
+    values_by_option: dict[str, tuple[Any, ...]] = {
+        "split": (requested.split, *splits),
         "samples": get_args(SampleList),
         "scope": get_args(ScopeName),
-        "agents": (asked.agents, agents),
-        "horizon": (asked.horizon, horizon),
+        "agents": (requested.agents, agents),
+        "horizon": (requested.horizon, horizon),
     }
-    for values in product(*map(dict.fromkeys, possible.values())):
-        made = replace(asked, **dict(zip(possible, values, strict=True)))
+    for values in product(*map(dict.fromkeys, values_by_option.values())):
+        selection = replace(requested, **dict(zip(values_by_option, values, strict=True)))
         with suppress(ConfigError, NotAvailableError):
-            if set(made.tokens(dataset)) == tokens:
-                changed = asdict(made).items() - asdict(asked).items()
-                texts = {
-                    name: ",".join(value) if name == "agents" else value
-                    for name, value in sorted(changed)
-                }
-                return " ".join(f"--{name} {text}" for name, text in texts.items())
+            if set(selection.tokens(dataset)) == tokens:
+                changed = asdict(selection).items() - asdict(requested).items()
+                return _options_text(changed)
     return ""
 
 
+def _options_text(options: Iterable[tuple[str, Any]]) -> str:
+    """Return options as on a command line, in order of their names."""
+    texts = []
+    for name, value in sorted(options):
+        text = ",".join(value) if name == "agents" else value
+        texts.append(f"--{name} {text}")
+    return " ".join(texts)
+
+
 def release_note(dataset: Dataset, scenarios: Iterable[str]) -> dict[str, Any]:
-    """What results note of their release, in `meta` under `release`.
+    """Return the note on the release that results have in `meta` under `release`.
 
     Args:
-        dataset: the release that was predicted.
-        scenarios: tokens of the scenarios that have a prediction.
+        dataset: The release that was predicted.
+        scenarios: Tokens of the scenarios that have a prediction.
     """
-    recordings = dataset.recordings(scenarios)
     return {
         "version": dataset.version,
         "index": dataset.tables_folder.name,
-        "recordings": recordings,
+        "recordings": dataset.recordings(scenarios),
     }
 
 
 def check_recordings(results: Results, dataset: Dataset) -> None:
-    """Raise ResultsError if results are of other recordings than the release has under these names.
+    """Raise ResultsError if results are of other recordings than the release has under their names.
 
-    Results without such a note, and scenarios that one of the two does not know, are not compared.
+    Results without such a note, and scenarios that are unknown to one of the two, are not compared.
     """
     note = results.meta.get("release")
-    if not isinstance(note, dict) or not isinstance(stated := note.get("recordings"), dict):
+    if not isinstance(note, dict):
         return
-    here = dataset.recordings(stated)
-    others = [token for token, hashed in here.items() if hashed != stated[token]]
-    if others:
+    noted_hashes = note.get("recordings")
+    if not isinstance(noted_hashes, dict):
+        return
+    hashes = dataset.recordings(noted_hashes)
+    changed = [token for token, digest in hashes.items() if digest != noted_hashes[token]]
+    if changed:
         raise ResultsError(
-            f"{results.path}: are of other recordings than {dataset.dataroot} has ({dataset.version}; results of "
-            f"{note.get('version')}) for {len(others)} of {len(here)} scenarios, such as {others[0]}, although "
-            "they have the same names; evaluate with the release that was predicted, or predict this one. If files of "
-            f"the release were restored or edited, the index may be out of date: {INDEX_REMEDY}"
+            f"{results.path}: are of other recordings than {dataset.dataroot} has "
+            f"({dataset.version}; results of {note.get('version')}) for {len(changed)} of "
+            f"{len(hashes)} scenarios, such as {changed[0]}, although they have the same names; "
+            "evaluate with the release that was predicted, or predict this one. If files of the "
+            f"release were restored or edited, the index may be out of date: {INDEX_REMEDY}"
         )
 
 
@@ -323,11 +344,14 @@ def _is_sample(dataset: Dataset, token: str) -> bool:
     return True
 
 
-def _named(tokens: Sequence[str], what: str) -> str:
+def _named(tokens: Sequence[str], text: str) -> str:
+    """Return a text with some of the tokens it is about; empty without tokens."""
     if not tokens:
         return ""
-    more = ", …" if len(tokens) > _SHOWN else ""
-    return f"{what} ({', '.join(tokens[:_SHOWN])}{more})"
+    more = ""
+    if len(tokens) > _MAX_NAMED_SAMPLES:
+        more = ", …"
+    return f"{text} ({', '.join(tokens[:_MAX_NAMED_SAMPLES])}{more})"
 
 
 TASKS: Final[dict[str, type[Evaluator[Any]]]] = {
@@ -341,7 +365,7 @@ TASKS: Final[dict[str, type[Evaluator[Any]]]] = {
         ForecastingEvaluator,
     )
 }
-"""The devkit's own tasks by name; a new one has a line here. Plug-ins add theirs: ask `evaluator_class`."""
+"""The devkit's own tasks by name. Plug-ins have further tasks: call `evaluator_class`."""
 
 
 def is_task(name: str) -> bool:
@@ -353,38 +377,35 @@ def evaluator_class(task: str) -> type[Evaluator[Any]]:
     """Return the evaluator of a task, of the devkit or of a plug-in.
 
     Raises:
-        ChoiceError: no such task; if it is one of a plug-in that is not installed, or left out, the message says so.
+        ChoiceError: no such task; the message names a plug-in with this task that is not installed
+            or left out.
     """
     name = spelled(task, TASKS)
     if name in TASKS:
         return TASKS[name]
-    found = offers(lambda plugin: plugin.tasks, TASKS)
-    names = (*TASKS, *found.by_name)
-    remedy = f"; if a plug-in has this task, install it. {found.refusals_text()}".rstrip()
+    offered = offers(lambda plugin: plugin.tasks, TASKS)
+    names = (*TASKS, *offered.by_name)
+    remedy = f"; if a plug-in has this task, install it. {offered.refusals_text()}".rstrip()
     hint = meant_text(str(task), names) or remedy
-    evaluator = found.by_name[
-        choice("task", task, names, elsewhere={str(task).lower(): hint})
-    ].load()
+    plugin_task = choice("task", task, names, elsewhere={str(task).lower(): hint})
+    evaluator = offered.by_name[plugin_task].load()
     if not evaluator.protocols:
         raise ConfigError(
-            f"{evaluator.__name__}: has no protocols; give it one, such as an empty frozen dataclass"
+            f"{evaluator.__name__}: has no protocols; give it one, such as an empty frozen "
+            "dataclass"
         )
     return evaluator
 
 
-# Seconds; recordings are shorter.
-_LONGEST_HORIZON: Final = 100
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSetup:
-    """What is evaluated, and by which rules; two of equal ones give comparable numbers.
+    """Task and rules of an evaluation; equal setups give comparable numbers.
 
     Attributes:
         task: Name of a task, of the devkit or of a plug-in.
         protocol: Name of one of the task's `protocols`.
-        switches: choices of the protocol that are changed, by name (`task.switch_names`).
-        horizon: seconds that the predictions look ahead; detection has none.
+        switches: Changed choices of the protocol, by name (`task.switch_names`).
+        horizon: Seconds that the predictions look ahead; not used by detection.
     """
 
     task: str
@@ -393,7 +414,7 @@ class EvaluationSetup:
     horizon: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check; raises ChoiceError or ConfigError."""
+        """Check all values; raises ChoiceError or ConfigError."""
         task = evaluator_class(self.task)
         object.__setattr__(self, "task", task.task)
         protocols = task.protocols
@@ -401,24 +422,25 @@ class EvaluationSetup:
             f"protocol of {self.task}", self.protocol, protocols, elsewhere=label_rules(self.task)
         )
         object.__setattr__(self, "protocol", protocol)
-        if not 0 < self.horizon <= _LONGEST_HORIZON:
+        if not 0 < self.horizon <= _MAX_HORIZON_S:
             raise ConfigError(
-                f"horizon: expected seconds above 0, at most {_LONGEST_HORIZON}, found {self.horizon!r}"
+                f"horizon: expected seconds above 0, at most {_MAX_HORIZON_S}, found "
+                f"{self.horizon!r}"
             )
         object.__setattr__(self, "switches", FrozenDict(self.switches))
-        switched(protocols[protocol], self.switches)  # refuses impossible choices
+        switched(protocols[protocol], self.switches)  # raises for impossible choices
 
     @property
     def rules(self) -> Any:
-        """The protocol itself, with the switches."""
+        """The protocol with the switches applied."""
         return switched(evaluator_class(self.task).protocols[self.protocol], self.switches)
 
     def evaluator(self) -> Evaluator[Any]:
-        """A new evaluator of these rules."""
+        """Return a new evaluator with these rules."""
         return evaluator_class(self.task)(self.rules)
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, as JSON holds it, with the evaluator's own `settings`: every choice."""
+        """Return all values in JSON form, with the evaluator's own `settings`: every choice."""
         return asdict(self) | {
             "switches": dict(self.switches),
             "settings": self.evaluator().settings,
@@ -433,27 +455,26 @@ def default_selection(
     scope: ScopeName | None = None,
     agents: Sequence[str] | None = None,
 ) -> SampleSelection:
-    """The samples that a setup is evaluated at.
+    """Return the samples that a setup is evaluated at.
 
     Args:
-        setup: its task and horizon.
+        setup: Its task and horizon are used.
         split: `train`, `val`, … or the path of a split file.
-        samples: None for `all` of tasks that follow whole recordings, and else `evaluate`.
-        scope: None for `all` where all samples are evaluated, and else `accident`.
-        agents: whose; None for all that the task is for.
+        samples: None for `all` if the task follows full recordings, otherwise `evaluate`.
+        scope: None for `all` where all samples are evaluated, otherwise `accident`.
+        agents: Agents of the samples; None for all agents of the task.
 
     Raises:
         ChoiceError: no such list, scope or agent.
     """
-    if agents is None and evaluator_class(setup.task).vehicles_only:
+    task = evaluator_class(setup.task)
+    if agents is None and task.vehicles_only:
         agents = VEHICLE_AGENTS
-    listed: SampleList = samples or (
-        "all" if evaluator_class(setup.task).needs_whole_recordings else "evaluate"
-    )
+    sample_list: SampleList = samples or ("all" if task.needs_whole_recordings else "evaluate")
     return SampleSelection(
         split=os.fspath(split),
-        samples=listed,
-        scope=scope or ("all" if listed == "all" else "accident"),
+        samples=sample_list,
+        scope=scope or ("all" if sample_list == "all" else "accident"),
         agents=None if agents is None else _agents(agents),
         horizon=setup.horizon,
     )
@@ -464,9 +485,9 @@ class SampleLoader:
     """Makes the arguments of a setup's evaluator for a sample, except the token; cheap to pickle.
 
     Attributes:
-        dataset: where the truth is.
-        results: where the predictions are; of a kind that the task is evaluated from.
-        setup: the rules.
+        dataset: Dataset with the ground truth.
+        results: Results with the predictions, of a kind that the task is evaluated from.
+        setup: The rules.
     """
 
     dataset: Dataset
@@ -474,39 +495,40 @@ class SampleLoader:
     setup: EvaluationSetup
 
     def __post_init__(self) -> None:
-        """Check that the results are of a kind that the rules take, and look far enough; raises EvaluationError."""
+        """Raise EvaluationError if the rules do not take the results, or if they end too early."""
         kinds = evaluator_class(self.setup.task).result_kinds
         if self.results.task not in kinds:
             raise EvaluationError(
-                f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is evaluated from "
-                f"{' or '.join(kinds)} results"
+                f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is "
+                f"evaluated from {' or '.join(kinds)} results"
             )
         if self.results.task == "accident" and getattr(self.setup.rules, "maps_alone", False):
             raise EvaluationError(
-                f"{self.results.path}: holds explicit accidents; the protocol {self.setup.protocol!r} compares motion: "
-                "give motion results, or choose protocol 'paper' or 'boxes'"
+                f"{self.results.path}: holds explicit accidents; the protocol "
+                f"{self.setup.protocol!r} compares motion: give motion results, or choose "
+                "protocol 'paper' or 'boxes'"
             )
         form = self.results.form
-        if (
-            form is not None
-            and (ahead := (form.frames - 1) * form.step) < self.setup.horizon - FRAME_PERIOD / 2
-        ):
+        if form is None:
+            return
+        seconds = (form.frames - 1) * form.step
+        if seconds < self.setup.horizon - FRAME_PERIOD / 2:
             raise EvaluationError(
-                f"{self.results.path}: its predictions look {ahead:g} s ahead "
-                f"({form.frames} frames, {form.step:g} s apart, from the present on), less than the horizon of "
-                f"{self.setup.horizon:g} s; add the present frame if it is missing, or evaluate with a shorter horizon"
+                f"{self.results.path}: its predictions look {seconds:g} s ahead ({form.frames} "
+                f"frames, {form.step:g} s apart, from the present on), less than the horizon of "
+                f"{self.setup.horizon:g} s; add the present frame if it is missing, or evaluate "
+                "with a shorter horizon"
             )
 
     @property
     def places(self) -> Places:
-        """What workers must see."""
+        """The paths that workers must be able to read."""
         return Places(reads=(*self.dataset.places, self.results.path))
 
     def __call__(self, token: str) -> tuple[Any, ...]:
-        """Return the prediction of a sample and its truth, which the evaluator's `update` takes."""
-        truth = self.setup.evaluator().truth(
-            self.dataset, token, self.results.form, self.setup.horizon
-        )
+        """Return a sample's prediction and truth: the arguments of the evaluator's `update`."""
+        evaluator = self.setup.evaluator()
+        truth = evaluator.truth(self.dataset, token, self.results.form, self.setup.horizon)
         return self.prediction(token), *truth
 
     def prediction(self, token: str) -> Any:
@@ -514,23 +536,23 @@ class SampleLoader:
         return self.setup.evaluator().read(self.results, self.dataset, token)
 
     def label(self, token: str) -> MotionLabels | None:
-        """The sample's motion labels that the results are compared with; None where there is none."""
+        """Return the motion labels that a sample's results are compared with; None without any."""
         return compared_labels(
             self.dataset, token, self.setup.rules, self.results.form, self.setup.horizon
         )
 
 
-_COUNTS: Final = "counts"
-
-
 def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
-    """The store beside `out`: who has its lock alone writes the evaluation, once all samples are counted.
+    """Return the store beside `out`; only the process with its lock writes the evaluation.
 
-    `command` says which evaluation that is.
+    It does so once all samples are counted.
+
+    Args:
+        out: Folder of the evaluation.
+        command: Digest that identifies the evaluation.
     """
-    return Store(
-        unfinished_folder(path_of(out)), path_of(out), "evaluates for it", ResultsError, command
-    )
+    target = path_of(out)
+    return Store(unfinished_folder(target), target, "evaluates for it", ResultsError, command)
 
 
 def checkpoint_path(
@@ -539,16 +561,17 @@ def checkpoint_path(
     tokens: Collection[str],
     fingerprints: Mapping[str, str],
 ) -> Path:
-    """The folder beside `out` in which such a run keeps its counts.
+    """Return the folder beside `out` in which a run stores its counts.
 
-    Its name is a digest of all that affects the counts: another setup, other samples, other predictions, other labels
-    and another devkit have another folder, and so never go on with these counts.
+    Its name is a digest of everything that affects the counts: another setup, other samples, other
+    predictions, other labels or another devkit have another folder, and so never continue with
+    these counts.
 
     Args:
-        out: the folder that the finished evaluation goes to.
-        setup: task and rules.
-        tokens: the samples.
-        fingerprints: of the predictions and of the labels.
+        out: Folder of the finished evaluation.
+        setup: Task and rules.
+        tokens: The samples.
+        fingerprints: Fingerprints of the predictions and of the labels.
     """
     name = digest_of(
         {
@@ -558,11 +581,11 @@ def checkpoint_path(
             "fingerprints": dict(fingerprints),
         }
     )
-    return evaluation_store(out).folder / _COUNTS / name
+    return evaluation_store(out).folder / _COUNTS_FOLDER / name
 
 
 def remove_checkpoints(out: str | os.PathLike[str]) -> None:
-    """Remove all such folders beside `out`, once what they were for is written."""
+    """Remove all such folders beside `out`, once the evaluation is written."""
     store = evaluation_store(out)
-    remove_in(store.folder, _COUNTS)
+    remove_in(store.folder, _COUNTS_FOLDER)
     store.remove()

@@ -1,4 +1,4 @@
-"""`verify_bundle`: an evaluation run again, and how what its bundle says differs (`differing`)."""
+"""`verify_bundle` repeats an evaluation, and `find_differences` lists how its bundle differs."""
 
 from __future__ import annotations
 
@@ -40,20 +40,24 @@ if TYPE_CHECKING:
 
 
 # Stands for a missing value.
-ABSENT: Final = "absent"
-# Characters of a value that a line shows.
-_LONGEST: Final = 60
-_LONGEST_PLACE: Final = 300
+ABSENT_TEXT: Final = "absent"
+# Number of characters of a value, and of its path, that a line shows.
+_MAX_VALUE_LENGTH: Final = 60
+_MAX_PATH_LENGTH: Final = 300
+# Number of differences that the text lists.
+_MAX_DIFFERENCES: Final = 20
+# Paths in a summary that notes report, or that only name locations.
+_NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/path")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference(ShortRepr):
-    """What a bundle says, and what was found.
+    """A value in a bundle that differs from the value found.
 
     Attributes:
-        where: its file and its place there, such as `metrics_summary.json: metrics/apa`.
-        stored: what the bundle says.
-        found: what was found.
+        where: File and path in it, such as `metrics_summary.json: metrics/apa`.
+        stored: Value in the bundle.
+        found: Value of the repeated evaluation.
     """
 
     where: str
@@ -61,61 +65,65 @@ class Difference(ShortRepr):
     found: Any
 
     def text(self) -> str:
-        """In a line."""
-        where = shortened(
-            self.where if self.where.isprintable() else ascii(self.where), _LONGEST_PLACE
-        )
-        return f"{where}: stored {_short(self.stored)}, found {_short(self.found)}"
+        """Return the difference in one line."""
+        where = self.where if self.where.isprintable() else ascii(self.where)
+        path = shortened(where, _MAX_PATH_LENGTH)
+        return f"{path}: stored {_short(self.stored)}, found {_short(self.found)}"
 
 
-def differing(
-    stored: Any, found: Any, *, without: Collection[str] = (), path: str = ""
+def find_differences(
+    stored: Any, actual: Any, *, without: Collection[str] = (), path: str = ""
 ) -> Iterator[tuple[str, Any, Any]]:
-    """The paths at which two values differ that JSON can hold, and what is there; numbers must be exactly equal.
+    """Yield path, stored value and actual value wherever two values of JSON differ.
 
-    `without` are paths that do not count, with all below them; `path` is that of both values.
+    Numbers must be exactly equal.
+
+    Args:
+        stored: Value that was stored.
+        actual: Value to compare with it.
+        without: Paths that are skipped, with everything below them.
+        path: Path of both values.
     """
     if path in without:
         return
+    stored, actual = _as_json(stored), _as_json(actual)
     parts: Mapping[Any, tuple[Any, Any]] = {}
-    stored, found = (
-        value.as_dict() if isinstance(value, ScenarioHashes) else value for value in (stored, found)
-    )
-    if isinstance(stored, Mapping) and isinstance(found, Mapping):
+    if isinstance(stored, Mapping) and isinstance(actual, Mapping):
         parts = {
-            name: (stored.get(name, ABSENT), found.get(name, ABSENT))
-            for name in {**stored, **found}
+            name: (stored.get(name, ABSENT_TEXT), actual.get(name, ABSENT_TEXT))
+            for name in {**stored, **actual}
         }
-    elif isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
-        parts = dict(enumerate(zip(stored, found, strict=True)))
-    elif type(stored) is not type(found) or stored != found:
-        yield path, stored, found
-    for name, (one, other) in parts.items():
-        yield from differing(
-            one, other, without=without, path=f"{path}/{name}" if path else str(name)
-        )
+    elif isinstance(stored, list) and isinstance(actual, list) and len(stored) == len(actual):
+        parts = dict(enumerate(zip(stored, actual, strict=True)))
+    elif type(stored) is not type(actual) or stored != actual:
+        yield path, stored, actual
+    for name, (stored_part, actual_part) in parts.items():
+        part_path = f"{path}/{name}" if path else str(name)
+        yield from find_differences(stored_part, actual_part, without=without, path=part_path)
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, ScenarioHashes):
+        return value.as_dict()
+    return value
 
 
 def _short(value: Any) -> str:
-    text = value if value == ABSENT else repr(value)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
-
-
-# Differences that the text lists.
-_SHOWN: Final = 20
-# Of a summary: what is told in notes, or says where things were.
-_NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/path")
+    text = value if value == ABSENT_TEXT else repr(value)
+    if len(text) <= _MAX_VALUE_LENGTH:
+        return text
+    return f"{text[: _MAX_VALUE_LENGTH - 1]}…"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verification(Report):
-    """A bundle against its evaluation made again.
+    """A bundle compared with its evaluation repeated.
 
     Attributes:
-        folder: of the bundle.
-        samples: how many were evaluated again.
-        differences: all that were found, file by file.
-        notes: sentences on what is not compared, or explains differences.
+        folder: Folder of the bundle.
+        samples: Number of samples that were evaluated again.
+        differences: All differences, file by file.
+        notes: Sentences on what is not compared, or that explain differences.
     """
 
     folder: Path
@@ -129,27 +137,32 @@ class Verification(Report):
         return not self.differences
 
     def to_text(self) -> str:
-        """A line a difference, the first ones, and how many more there are."""
+        """Return a line for each of the first differences, and how many more there are."""
         again = f"{counted(self.samples, 'sample')} evaluated again"
-        found = f"{counted(len(self.differences), 'difference')}; {again}"
-        same = f"the same; {again}, all numbers are equal"
-        lines = [f"{self.folder}: {same if self.is_same else found}"]
-        lines += [f"  {each.text()}" for each in self.differences[:_SHOWN]]
-        lines += [f"  and {len(self.differences) - _SHOWN} more"] * (len(self.differences) > _SHOWN)
-        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+        if self.is_same:
+            head = f"the same; {again}, all numbers are equal"
+        else:
+            head = f"{counted(len(self.differences), 'difference')}; {again}"
+        lines = [f"{self.folder}: {head}"]
+        lines += [f"  {difference.text()}" for difference in self.differences[:_MAX_DIFFERENCES]]
+        hidden = len(self.differences) - _MAX_DIFFERENCES
+        if hidden > 0:
+            lines.append(f"  and {hidden} more")
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it, as JSON holds it."""
+        """Return all values in JSON form."""
         return {
             "folder": os.fspath(self.folder),
             "same": self.is_same,
             "samples": self.samples,
-            "differences": [asdict(each) for each in self.differences],
+            "differences": [asdict(difference) for difference in self.differences],
             "notes": list(self.notes),
         }
 
     def named_tables(self) -> dict[str, list[Row]]:
-        """A line a difference."""
+        """Return a table with a row for each difference."""
         return {"differences": record_rows(Difference, self.differences)}
 
 
@@ -159,86 +172,95 @@ def verify_bundle(
     *,
     results: Results | str | os.PathLike[str] | None = None,
     split: str | os.PathLike[str] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> Verification:
-    """Evaluate again what a bundle is of, and compare everything with it; numbers must be equal to the bit.
+    """Repeat the evaluation of a bundle and compare everything; numbers must be equal to the bit.
 
-    A bundle may come from anyone. So no path in it that leads out of it is opened (`Bundle.outside_paths`), and no link
-    in it is followed; files that do not belong to it are named, not opened.
+    A bundle may come from anyone. So paths that lead out of it (`Bundle.outside_paths`) are not
+    opened, and links in it are not followed. Files that do not belong to it are named, not opened.
 
     Args:
-        folder: of the bundle.
-        dataset: the release; where `read_bundle(folder).dataroot` says, or another copy of it.
-        results: the predictions; None for the bundle's own copy.
-        split: the split file, if the bundle is of one; else None.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        folder: Folder of the bundle.
+        dataset: The release at `read_bundle(folder).dataroot`, or another copy of it.
+        results: The predictions; None for the bundle's own copy.
+        split: The split file, if the bundle was evaluated on one; otherwise None.
+        **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
 
     Raises:
-        ResultsError: there is no bundle of this devkit's format, no results to evaluate, or a path must be given.
+        ResultsError: there is no bundle of this devkit's format, no results to evaluate, or a path
+            must be given.
     """
     bundle = read_bundle(path_of(folder))
     check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
-    given = bundle.results_path if results is None else results
-    opened = given if isinstance(given, Results) else read_results(given)
-    found = list(_compared(FILES_FILE, bundle.checksums, partial(checksums_of, bundle.folder)))
+    source = bundle.results_path if results is None else results
+    opened = source if isinstance(source, Results) else read_results(source)
+    differences = list(
+        _compare_file(FILES_FILE, bundle.checksums, partial(checksums_of, bundle.folder))
+    )
     notes, run = [], None
     try:
-        run = _again(bundle, dataset, opened, split, how)
+        run = _repeat(bundle, dataset, opened, split, engine)
     except DeepAccidentError as error:
-        found.append(Difference(where="all numbers", stored="evaluated", found=ABSENT))
+        differences.append(Difference(where="all numbers", stored="evaluated", found=ABSENT_TEXT))
         notes.append(f"cannot be evaluated again: {error}")
     else:
-        found += _differences(bundle, run)
-        notes += [
-            f"evaluated with {name} {stored}, verified with {now}"
-            for name, stored, now in differing(
-                bundle.summary["environment"], run.summary()["environment"]
-            )
-        ]
+        differences += _differences(bundle, run)
+        environments = bundle.summary["environment"], run.summary()["environment"]
+        for name, stored, actual in find_differences(*environments):
+            notes.append(f"evaluated with {name} {stored}, verified with {actual}")
     if bundle.summary.get("sanity") is not None:
         notes.append("the sanity check is not made again")
     return Verification(
         folder=bundle.folder,
         samples=0 if run is None else len(run.evaluator),
-        differences=tuple(found),
+        differences=tuple(differences),
         notes=tuple(notes),
     )
 
 
-def check_repeated(bundle: Bundle, given: Mapping[str, object]) -> None:
-    """Raise ResultsError unless all `Bundle.outside_paths` are given; it says how to give them as they are there."""
+def check_repeated(bundle: Bundle, arguments: Mapping[str, object]) -> None:
+    """Raise ResultsError unless all `Bundle.outside_paths` are given; the message has the command.
+
+    Args:
+        bundle: The bundle.
+        arguments: Name of a path → the argument for it, or None.
+    """
     outside = bundle.outside_paths()
-    if any(given[name] is None for name in outside):
+    if any(arguments[name] is None for name in outside):
         options = " ".join(f"--{name} {shlex.quote(path)}" for name, path in outside.items())
         raise ResultsError(
-            f"{bundle.folder}: names paths outside of it, which are opened only if you give them: deepaccident "
-            f"check bundle {shlex.quote(os.fspath(bundle.folder))} {options}"
+            f"{bundle.folder}: names paths outside of it, which are opened only if you give them: "
+            f"deepaccident check bundle {shlex.quote(os.fspath(bundle.folder))} {options}"
         )
 
 
-def _again(
+def _repeat(
     bundle: Bundle,
     dataset: Dataset,
     results: Results,
     split: str | os.PathLike[str] | None,
-    how: Engine,
+    engine: Engine,
 ) -> EvaluationRun:
+    """Return the bundle's evaluation, made again with its breakdowns and further results."""
     summary, selection = bundle.summary, bundle.selection
     if split is not None:
         selection = replace(selection, split=os.fspath(split))
-    partly = summary["partial"] is not None or bool(summary["counts"]["left_out"])
-    run = evaluate_results(dataset, results, bundle.setup, selection, allow_partial=partly, **how)
+    is_partial = summary["partial"] is not None or bool(summary["counts"]["left_out"])
+    run = evaluate_results(
+        dataset, results, bundle.setup, selection, allow_partial=is_partial, **engine
+    )
     breakdowns = summary["breakdowns"]
-    how = {"workers": None, **how, "progress": False}
+    engine = {"workers": None, **engine, "progress": False}
     if breakdowns:
-        run = run.broken_down(list(breakdowns), _resampling(next(iter(breakdowns.values()))), **how)
+        resampling = _resampling(next(iter(breakdowns.values())))
+        run = run.broken_down(list(breakdowns), resampling, **engine)
     for name in further_names(summary):
-        run = with_further(run, name, dataset, _resampling(summary[name]), **how)
+        run = with_further(run, name, dataset, _resampling(summary[name]), **engine)
     return run
 
 
 def _resampling(part: Any) -> Resampling:
-    """How intervals of a part of a summary were made; raises ResultsError."""
+    """Return how the intervals of a part of a summary were made; raises ResultsError."""
     try:
         return Resampling(**part["resampling"])
     except (LookupError, TypeError) as error:
@@ -248,37 +270,39 @@ def _resampling(part: Any) -> Resampling:
 
 
 def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
-    """Of all files but their list."""
-    elsewhere = ("split",) if "split" in bundle.outside_paths() else ()
+    """Yield the differences of all files except their list."""
+    skipped = ("split",) if "split" in bundle.outside_paths() else ()
     truth, summary = dict(run.release.scenarios), run.summary()
-    with suppress(ResultsError):  # is a difference of the file, below
-        truth |= {
-            token: hashes
-            for token, hashes in bundle.scenarios().items()
-            if hashes.is_like(truth.get(token))
-        }
+    with suppress(ResultsError):  # is reported as a difference of the file, below
+        for token, hashes in bundle.scenarios().items():
+            if hashes.is_like(truth.get(token)):
+                truth[token] = hashes
         summary["release"]["fingerprint"] = fingerprint(truth)
-    for where, stored, found in differing(
-        bundle.summary, summary, without=(*_NOT_COMPARED, *elsewhere)
-    ):
-        yield Difference(where=f"{SUMMARY_FILE}: {where}", stored=stored, found=found)
-    rows = {
-        row["token"]: row for row in rows_table(sample_rows(run)).to_pylist()
-    }  # as a file would have them
-    yield from _compared(SCENARIOS_FILE, bundle.scenarios, lambda _: truth)
-    yield from _compared(COUNTS_FILE, bundle.counts, lambda _: dict(run.evaluator.counts))
-    yield from _compared(ROWS_FILE, bundle.rows, lambda _: rows)
+    compared = find_differences(bundle.summary, summary, without=(*_NOT_COMPARED, *skipped))
+    for path, stored, actual in compared:
+        yield Difference(where=f"{SUMMARY_FILE}: {path}", stored=stored, found=actual)
+    row_list = rows_table(sample_rows(run)).to_pylist()  # with the types that a file would have
+    rows = {row["token"]: row for row in row_list}
+    yield from _compare_file(SCENARIOS_FILE, bundle.scenarios, lambda _: truth)
+    yield from _compare_file(COUNTS_FILE, bundle.counts, lambda _: dict(run.evaluator.counts))
+    yield from _compare_file(ROWS_FILE, bundle.rows, lambda _: rows)
 
 
-def _compared(
-    name: str, read: Callable[[], Any], again: Callable[[Any], Any]
+def _compare_file(
+    name: str, read: Callable[[], Any], recompute: Callable[[Any], Any]
 ) -> Iterator[Difference]:
-    """The differences of a bundle's file; one if it cannot be read."""
+    """Yield the differences of a bundle's file; a single one if it cannot be read.
+
+    Args:
+        name: Name of the file.
+        read: Reads the stored content.
+        recompute: Returns the actual content for the stored one.
+    """
     try:
         stored = read()
     except ResultsError as error:
         reason = str(error).split(f"{name}: ", 1)[-1]  # without the folder, which would fill a line
         yield Difference(where=name, stored="readable", found=reason)
         return
-    for where, one, other in differing(stored, again(stored)):
-        yield Difference(where=f"{name}: {where}", stored=one, found=other)
+    for path, stored_value, actual_value in find_differences(stored, recompute(stored)):
+        yield Difference(where=f"{name}: {path}", stored=stored_value, found=actual_value)

@@ -1,4 +1,6 @@
-"""A scenario as one MCAP file, which Foxglove and rerun open as an interactive 3D scene (the extra `mcap`).
+"""A scenario as one MCAP file, which Foxglove and rerun open as an interactive 3D scene.
+
+It needs the extra `mcap`.
 
     from deepaccident_devkit import DeepAccident
     from deepaccident_devkit.export.mcap import export_mcap
@@ -6,8 +8,8 @@
     da = DeepAccident(dataroot="data/DeepAccident")
     export_mcap(da, da.scenario[0], "accident.mcap")
 
-docs/pictures.md lists the topics and says how to view them. Only this package imports mcap, and only when
-`export_mcap` is called.
+docs/pictures.md lists the topics and describes how to view them. Only this package imports mcap,
+and only when `export_mcap` is called.
 """
 
 from __future__ import annotations
@@ -31,8 +33,10 @@ from deepaccident_devkit.v2x import Agents
 __all__ = ["EPOCH", "McapConfig", "Predictions", "export_mcap"]
 
 EPOCH: Final = 1_704_067_200
-"""Unix seconds of every scenario's first frame: recordings have no date, but viewers need one (2024-01-01 UTC)."""
+"""Unix seconds of each scenario's first frame (2024-01-01 UTC), since viewers need a date."""
 EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
+# Modules of the extra `mcap`.
+_EXTRA_MODULES: Final = ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google")
 Predictions = Results | Mapping[str, Prediction]
 """Predictions by sample token."""
 
@@ -46,20 +50,24 @@ def export_mcap(
     progress: bool = False,
     **choices: Any,
 ) -> Path:
-    """Write a scenario into an MCAP file: poses, images, point clouds, boxes and labels of all agents on one timeline.
+    """Write a scenario into an MCAP file, with all agents on one timeline.
 
-    Messages are Foxglove's, as protobuf. Images have the bytes of their files; LiDAR coordinates are rounded to 1/32 m
-    and intensities to 1/32, so that they compress. The same release and choices give the same bytes, with the same
-    versions of the libraries. The file is written completely or not at all, and after it, beside it, a layout for
-    Foxglove (`.foxglove.json`) and a script that opens it in rerun with a blueprint (`.rerun.py`).
+    The file has poses, images, point clouds, boxes and labels. Messages are Foxglove's, as
+    protobuf. Images have the bytes of their files; LiDAR coordinates are rounded to 1/32 m and
+    intensities to 1/32, so that they compress. The same release and choices give the same bytes,
+    with the same versions of the libraries. The file is written completely or not at all, and after
+    it, beside it, a layout for Foxglove (`.foxglove.json`) and a script that opens it in rerun with
+    a blueprint (`.rerun.py`).
 
     Args:
-        dataset: the release.
-        scenario: token or record.
-        path: path of the file; an existing file is replaced.
-        prediction: results, or a mapping from sample token to prediction; rendered in addition to the labels.
-        progress: whether to show a bar.
-        **choices: the fields of `McapConfig`: `agents`, `channels`, `frames`, `points`, `motion_labels`.
+        dataset: The release.
+        scenario: Token or record.
+        path: Path of the file; an existing file is replaced.
+        prediction: Results, or a mapping from sample token to prediction; rendered in addition to
+            the labels.
+        progress: Whether to show a progress bar.
+        **choices: The fields of `McapConfig`: `agents`, `channels`, `frames`, `points`,
+            `motion_labels`.
 
     Returns:
         The path.
@@ -68,7 +76,8 @@ def export_mcap(
         MissingExtraError: the extra `mcap` is not installed.
         TokenError: no such scenario.
         ChoiceError: no such choice, agent, channel or frame, or the path is a folder.
-        NotAvailableError: an agent is not in this (partial) release, or no sample in the file has a prediction.
+        NotAvailableError: an agent is not in this (partial) release, or no sample in the file has a
+            prediction.
         SensorFileError: a sensor file cannot be read.
     """
     config = McapConfig.of(**choices)
@@ -80,12 +89,8 @@ def export_mcap(
     try:
         from deepaccident_devkit.export.mcap.scenario import write_scenario
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in (
-            "mcap",
-            "mcap_protobuf",
-            "foxglove_schemas_protobuf",
-            "google",
-        ):
+        package = (error.name or "").partition(".")[0]
+        if package not in _EXTRA_MODULES:
             raise
         raise MissingExtraError(
             f"the MCAP export needs {error.name}: in a checkout, pip install '.[mcap]'"
@@ -97,15 +102,16 @@ def export_mcap(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class McapConfig:
-    """Which parts of a scenario go into the file; checked when made.
+    """Parts of a scenario in the file; checked on creation.
 
     Attributes:
-        agents: agents to export: their names, a configuration as seen from the ego vehicle, or None for all that are
-            there (`v2x.Agents`).
-        channels: sensors to export: cameras and `lidar01`; None for all of these.
-        frames: numbers of frames, from 1; None for all.
+        agents: Agents to export: their names, a configuration as seen from the ego vehicle, or None
+            for all agents of the scenario (`v2x.Agents`).
+        channels: Sensors to export: cameras and `lidar01`; None for all of them.
+        frames: Numbers of frames, from 1; None for all.
         points: n for every n-th point of a cloud; 1 for all.
-        motion_labels: configuration of motion labels, or the name of a preset (`motion.PRESETS`); None for none.
+        motion_labels: Configuration of motion labels, or the name of a preset (`motion.PRESETS`);
+            None for none.
     """
 
     agents: Agents = None
@@ -115,7 +121,7 @@ class McapConfig:
     motion_labels: MotionLabelConfig | str | None = None
 
     def __post_init__(self) -> None:
-        """Check; raises ChoiceError."""
+        """Check the fields; raises ChoiceError."""
         object.__setattr__(self, "channels", _channel_names(self.channels))
         object.__setattr__(self, "frames", _frame_numbers(self.frames))
         if checked_whole("points", self.points, "n for every n-th point", ChoiceError) < 1:
@@ -127,7 +133,7 @@ class McapConfig:
 
     @classmethod
     def of(cls, **choices: Any) -> McapConfig:
-        """A configuration with these fields; raises ChoiceError."""
+        """Return a configuration with these fields; raises ChoiceError."""
         names = [field.name for field in fields(cls)]
         for name in choices:
             if name not in names:
@@ -137,36 +143,37 @@ class McapConfig:
         return cls(**choices)
 
     def frame_numbers(self, last: int) -> tuple[int, ...]:
-        """The wanted frames of a scenario with `last` frames, ascending; raises ChoiceError if one is not there."""
+        """Return the selected frames of a scenario with `last` frames, ascending.
+
+        Raises ChoiceError if a frame does not exist.
+        """
         if self.frames is None:
             return tuple(range(1, last + 1))
-        chosen = tuple(self.frames)
-        for number in chosen:
+        numbers = tuple(self.frames)
+        for number in numbers:
             if not 1 <= number <= last:
                 raise ChoiceError(f"frames: expected numbers from 1 to {last}, found {number}")
-        return chosen
+        return numbers
 
 
-def _channel_names(given: object) -> tuple[str, ...]:
-    """Names of channels in the order of `EXPORTED_CHANNELS`; raises ChoiceError."""
-    if given is None:
+def _channel_names(channels: object) -> tuple[str, ...]:
+    """Return names of channels in the order of `EXPORTED_CHANNELS`; raises ChoiceError."""
+    if channels is None:
         return EXPORTED_CHANNELS
-    named = choices("channels", given, EXPORTED_CHANNELS, empty=True)
-    return tuple(name for name in EXPORTED_CHANNELS if name in named)
+    names = choices("channels", channels, EXPORTED_CHANNELS, empty=True)
+    return tuple(name for name in EXPORTED_CHANNELS if name in names)
 
 
-def _frame_numbers(given: object) -> tuple[int, ...] | None:
-    """Frame numbers, each once, ascending; None for all; raises ChoiceError."""
-    if given is None:
+def _frame_numbers(frames: object) -> tuple[int, ...] | None:
+    """Return frame numbers, each once, ascending; None for all; raises ChoiceError."""
+    if frames is None:
         return None
-    if isinstance(given, str) or not isinstance(given, Iterable):
+    if isinstance(frames, str) or not isinstance(frames, Iterable):
         raise ChoiceError(
-            f"frames: expected frame numbers from 1, such as range(1, 11), found {given!r}"
+            f"frames: expected frame numbers from 1, such as range(1, 11), found {frames!r}"
         )
     meaning = "whole numbers from 1"
-    numbers = tuple(
-        sorted({checked_whole("frames", number, meaning, ChoiceError) for number in given})
-    )
+    numbers = {checked_whole("frames", number, meaning, ChoiceError) for number in frames}
     if not numbers:
         raise ChoiceError("frames: expected at least one frame number, found none")
-    return numbers
+    return tuple(sorted(numbers))

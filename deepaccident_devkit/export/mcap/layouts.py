@@ -1,4 +1,4 @@
-"""What viewers show at first of a file: a layout for Foxglove, and a script that opens it in rerun with a blueprint."""
+"""Initial views of a file: a layout for Foxglove, and a script for rerun with a blueprint."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.taxonomy import LIDAR
 
-_RERUN = '''"""Open the recording beside this script in rerun (0.41) with a layout; needs: pip install rerun-sdk."""
+_RERUN_TEMPLATE = '''\
+"""Open the recording beside this script in rerun (0.41) with a layout; needs: pip install \
+rerun-sdk."""
 
 from pathlib import Path
 
@@ -19,11 +21,13 @@ from rerun import blueprint as show
 from rerun.blueprint import encodings
 
 scene = show.Spatial3DView(
-    name="scene", contents={scene}, spatial_information=show.SpatialInformation(target_frame="world")
+    name="scene", contents={scene}, \
+spatial_information=show.SpatialInformation(target_frame="world")
 )
 cameras = [
     show.Spatial2DView(
-        name=each, origin=each, spatial_information=show.SpatialInformation(target_frame=f"{{each[1:-6]}}_image_plane")
+        name=each, origin=each, \
+spatial_information=show.SpatialInformation(target_frame=f"{{each[1:-6]}}_image_plane")
     )
     for each in {cameras}
 ]
@@ -34,8 +38,10 @@ number = encodings.VisualizerComponentMapping(
     selector=".value",
 )
 curves = {{each: rerun.SeriesLines().visualizer(mappings=[number]) for each in {values}}}
-values = show.TimeSeriesView(name="speeds (m/s), time to impact (s)", contents=list(curves), overrides=curves)
-blueprint = show.Blueprint(show.Horizontal(scene, show.Vertical(*cameras, values), column_shares=[3, 2]))
+values = show.TimeSeriesView(name="speeds (m/s), time to impact (s)", contents=list(curves), \
+overrides=curves)
+blueprint = show.Blueprint(show.Horizontal(scene, show.Vertical(*cameras, values), \
+column_shares=[3, 2]))
 if __name__ == "__main__":
     rerun.init("deepaccident", spawn=True, default_blueprint=blueprint)
     rerun.log_file_from_path(Path(__file__).with_name({file!a}))
@@ -43,9 +49,10 @@ if __name__ == "__main__":
 
 
 def write_layouts(path: Path, topics: Sequence[str]) -> None:
-    """Write the layouts beside an MCAP file with these topics: `.foxglove.json` and `.rerun.py` in place of its suffix.
+    """Write the layouts beside an MCAP file with these topics.
 
-    They show the road, clouds and actors, the front cameras, and the speeds and the time to the impact as curves.
+    They have the suffixes `.foxglove.json` and `.rerun.py`, which replace its own. They show the
+    road, clouds and actors, the front cameras, and the speeds and the time to the impact as curves.
     """
     clouds = [topic for topic in topics if topic.endswith(f"/{LIDAR}/points")]
     cameras = [topic for topic in topics if topic.endswith("/Camera_Front/image")][:2]
@@ -80,5 +87,5 @@ def write_layouts(path: Path, topics: Sequence[str]) -> None:
     foxglove = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": layout}
     write_bytes(path.with_suffix(".foxglove.json"), json.dumps(foxglove, indent=1).encode())
     scene = ["/road/points", "/actors/points", "/tf", *clouds]
-    text = _RERUN.format(file=path.name, scene=scene, cameras=cameras, values=values)
+    text = _RERUN_TEMPLATE.format(file=path.name, scene=scene, cameras=cameras, values=values)
     write_bytes(path.with_suffix(".rerun.py"), text.encode())

@@ -1,8 +1,9 @@
-"""An MCAP file being written on the timeline of a scenario, and Foxglove's messages from the devkit's own types.
+"""An MCAP file on the timeline of a scenario, and Foxglove's messages from the devkit's own types.
 
-`McapRecording` writes messages frame by frame; a `Moment` is a frame of the agents that are exported. Boxes are scene
-entities (cubes and lines), and coloured points for viewers without these: rerun shows point clouds but no SceneUpdate,
-so every rendering is there again as points, on a topic that ends in `/points`.
+`McapRecording` writes messages frame by frame; a `Moment` is a frame of the exported agents. Boxes
+are scene entities (cubes and lines), and coloured points for viewers without these: rerun shows
+point clouds but no SceneUpdate, so every rendering is repeated as points, on a topic that ends in
+`/points`.
 """
 
 from __future__ import annotations
@@ -63,31 +64,32 @@ _NUMERIC_TYPES: Final = {
     np.dtype("<i4"): PackedElementField.INT32,
     np.dtype("<f4"): PackedElementField.FLOAT32,
 }
-_NO_TURN: Final = np.array([1.0, 0.0, 0.0, 0.0])
+_NO_ROTATION: Final = np.array([1.0, 0.0, 0.0, 0.0])
 _FACE_ALPHA: Final = 0.4
 _LINE_PIXELS: Final = 2.0
 _TEXT_PIXELS: Final = 14.0
-# Metres from a box's top to its text.
-_TEXT_ABOVE: Final = 0.6
+# Distance from a box's top to its text.
+_TEXT_OFFSET_M: Final = 0.6
 POINT_SPACING: Final = 0.25
 """Metres between the points of a rendered line."""
 
 
 def frame_nanoseconds(index: int) -> int:
-    """The time of frame number `index` (from 1) on the file's timeline, nanoseconds."""
+    """Return the time of frame number `index` (from 1) on the file's timeline, in nanoseconds."""
     return EPOCH * _SECOND_NANOSECONDS + (index - 1) * _FRAME_NANOSECONDS
 
 
 def protobuf_timestamp(index: int) -> Any:
-    """The same as a protobuf Timestamp."""
+    """Return the same time as a protobuf Timestamp."""
     seconds, nanos = divmod(frame_nanoseconds(index), _SECOND_NANOSECONDS)
     return Timestamp(seconds=seconds, nanos=nanos)
 
 
 class McapRecording:
-    """Writes messages frame by frame; a topic and its schema are added with the first message of the topic.
+    """Writes messages frame by frame; a topic and its schema are added with its first message.
 
-    Chunks are compressed (zstd), and chunks, messages and metadata are indexed, so that viewers can seek.
+    Chunks are compressed (zstd), and chunks, messages and metadata are indexed, so that viewers can
+    seek.
     """
 
     def __init__(self, stream: IO[bytes]) -> None:
@@ -103,7 +105,7 @@ class McapRecording:
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        error_type: type[BaseException] | None,
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
@@ -128,7 +130,7 @@ class McapRecording:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Those that have a message."""
+        """Topics that have a message."""
         return tuple(self._topics)
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
@@ -151,9 +153,9 @@ class Moment:
     """A frame and its samples.
 
     Attributes:
-        scenario: token.
-        index: frame number from 1.
-        samples: agent → sample token, in the order of `taxonomy.AGENTS`.
+        scenario: Token of the scenario.
+        index: Frame number from 1.
+        samples: Agent → sample token, in the order of `taxonomy.AGENTS`.
     """
 
     scenario: str
@@ -167,133 +169,154 @@ class Moment:
 
 
 def moment_of(scenario: str, index: int, agents: tuple[str, ...]) -> Moment:
-    """Frame number `index` of some agents."""
+    """Return frame number `index` of the agents."""
     samples = {agent: sample_token(scenario, agent, index) for agent in agents}
     return Moment(scenario=scenario, index=index, samples=samples)
 
 
 def exported_agents(dataset: Dataset, scenario: str, agents: Agents) -> tuple[str, ...]:
-    """The agents that an `agents=` argument means, in usual order; raises ChoiceError and NotAvailableError."""
-    chosen = cooperating_agents(
+    """Return the agents of an `agents=` argument, in usual order.
+
+    Raises ChoiceError and NotAvailableError.
+    """
+    names = cooperating_agents(
         dataset, sample_token(scenario, agents_of(dataset, scenario)[0], 1), agents
     )
-    return tuple(agent for agent in AGENTS if agent in chosen)
+    return tuple(agent for agent in AGENTS if agent in names)
 
 
 class Roles:
-    """The colliding pair, the vehicles that record, and all others."""
+    """The colliding pair, the recording vehicles, and all other actors."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
         """Read the roles of a scenario from its meta."""
         collision = dataset.get("scenario", scenario)["collision"]
-        self.pair: frozenset[int] = (
-            frozenset() if collision is None else frozenset(collision["ids"])
-        )
+        self.pair: frozenset[int] = frozenset()
+        if collision is not None:
+            self.pair = frozenset(collision["ids"])
         self.agents: Mapping[int, str] = recorders_of(dataset, scenario)
 
     def role(self, actor: int) -> str:
-        """The role of an actor, such as `ego_vehicle, collides`; empty for most actors."""
-        words = [self.agents[actor]] if actor in self.agents else []
-        return ", ".join([*words, "collides"] if actor in self.pair else words)
+        """Return the role of an actor, such as `ego_vehicle, collides`; empty for most actors."""
+        words = []
+        if actor in self.agents:
+            words.append(self.agents[actor])
+        if actor in self.pair:
+            words.append("collides")
+        return ", ".join(words)
 
 
 def frame_id(agent: str, frame: str) -> str:
-    """The name of a sample's coordinate frame: `world`; for `ego` the agent's name; for a sensor `agent/channel`."""
+    """Return the name of a sample's coordinate frame.
+
+    It is `world`; the agent's name for `ego`; `agent/channel` for a sensor.
+    """
     if frame == "world":
         return frame
-    return agent if frame == "ego" else f"{agent}/{LIDAR if frame == 'lidar' else frame}"
+    if frame == "ego":
+        return agent
+    return f"{agent}/{LIDAR if frame == 'lidar' else frame}"
 
 
 def transform_message(parent: str, child: str, parent_from_child: SE3, index: int) -> Any:
-    """A FrameTransform: the pose of one coordinate frame in another."""
+    """Return a FrameTransform: the pose of one coordinate frame in another."""
+    rotation = quaternions.single_from_matrix(parent_from_child.rotation)
     return FrameTransform(
         timestamp=protobuf_timestamp(index),
         parent_frame_id=parent,
         child_frame_id=child,
         translation=vector(parent_from_child.translation),
-        rotation=quaternion(np.array(quaternions.single_from_matrix(parent_from_child.rotation))),
+        rotation=quaternion(np.array(rotation)),
     )
 
 
 def pose(center: FloatArray, rotation: FloatArray) -> Any:
-    """A Pose of a centre (3,), metres, and a unit quaternion (4,) w, x, y, z."""
+    """Return the Pose of a centre (3,), in metres, and a unit quaternion (4,) w, x, y, z."""
     return Pose(position=vector(center), orientation=quaternion(rotation))
 
 
 def vector(values: FloatArray) -> Any:
-    """A Vector3 of (3,)."""
+    """Return the Vector3 of an array (3,)."""
     x, y, z = values.tolist()
     return Vector3(x=x, y=y, z=z)
 
 
 def quaternion(rotation: FloatArray) -> Any:
-    """A Quaternion of (4,) w, x, y, z."""
+    """Return the Quaternion of an array (4,) w, x, y, z."""
     w, x, y, z = rotation.tolist()
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def points3(points: FloatArray) -> list[Any]:
-    """Point3s of (N, 3)."""
+    """Return the Point3s of an array (N, 3)."""
     return [Point3(x=x, y=y, z=z) for x, y, z in points.tolist()]
 
 
 def rgb(color: str) -> ByteArray:
-    """(3,) uint8 of a colour of `render.styles`, such as `#9a9a9a`."""
+    """Return a colour of `render.styles`, such as `#9a9a9a`, as (3,) uint8."""
     return np.frombuffer(bytes.fromhex(color[1:]), dtype=np.uint8)
 
 
 def color_message(color: str, alpha: float = 1.0) -> Any:
-    """A `Color` of a colour of `render.styles`."""
+    """Return a colour of `render.styles` as a `Color`."""
     red, green, blue = (rgb(color) / 255).tolist()
     return Color(r=red, g=green, b=blue, a=alpha)
 
 
 def cloud_message(points: AnyArray, frame: str, index: int) -> Any:
-    """A PointCloud of a structured array (N,), with a message field for each of its fields (x, y, z and others)."""
+    """Return the PointCloud of a structured array (N,).
+
+    It has a message field for each field of the array (x, y, z and others).
+    """
     columns: Mapping[str, Any] = points.dtype.fields or {}
+    fields = []
+    for name in points.dtype.names or ():
+        dtype, offset = columns[name][:2]
+        fields.append(PackedElementField(name=name, offset=offset, type=_NUMERIC_TYPES[dtype]))
     return PointCloud(
         timestamp=protobuf_timestamp(index),
         frame_id=frame,
-        pose=pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])),
+        pose=pose(np.zeros(3), _NO_ROTATION),
         point_stride=points.dtype.itemsize,
-        fields=[
-            PackedElementField(
-                name=name, offset=columns[name][1], type=_NUMERIC_TYPES[columns[name][0]]
-            )
-            for name in points.dtype.names or ()
-        ],
+        fields=fields,
         data=points.tobytes(),
     )
 
 
 def scene_update(entities: Sequence[Any], index: int) -> Any:
-    """A SceneUpdate that shows these entities and removes all others of its topic."""
-    everything = SceneEntityDeletion(
+    """Return a SceneUpdate that shows these entities and removes all others of its topic."""
+    deletion = SceneEntityDeletion(
         timestamp=protobuf_timestamp(index), type=SceneEntityDeletion.ALL
     )
-    return SceneUpdate(deletions=[everything], entities=entities)
+    return SceneUpdate(deletions=[deletion], entities=entities)
 
 
 def entity(
     name: str, frame: str, index: int, facts: Mapping[str, str], **primitives: Sequence[Any]
 ) -> Any:
-    """A SceneEntity in a coordinate frame: its primitives, and facts that the viewer shows after a click on it."""
+    """Return a SceneEntity in a coordinate frame.
+
+    Args:
+        name: Id of the entity.
+        frame: Id of the coordinate frame.
+        index: Frame number.
+        facts: Facts that the viewer shows after a click on the entity.
+        **primitives: Lists of its primitives.
+    """
     seconds = (index - 1) * FRAME_PERIOD
+    metadata = {**facts, "seconds": f"{seconds:.1f}"}
     return SceneEntity(
         timestamp=protobuf_timestamp(index),
         frame_id=frame,
         id=name,
         frame_locked=False,
-        metadata=[
-            KeyValuePair(key=key, value=value)
-            for key, value in {**facts, "seconds": f"{seconds:.1f}"}.items()
-        ],
+        metadata=[KeyValuePair(key=key, value=value) for key, value in metadata.items()],
         **primitives,
     )
 
 
 def cube(boxes: Boxes, row: int, color: str) -> Any:
-    """One of some boxes as a transparent CubePrimitive."""
+    """Return one of the boxes as a transparent CubePrimitive."""
     return CubePrimitive(
         pose=pose(boxes.center[row], boxes.rotation[row]),
         size=vector(boxes.size[row]),
@@ -302,19 +325,19 @@ def cube(boxes: Boxes, row: int, color: str) -> Any:
 
 
 def lines(segments: FloatArray, color: str) -> Any:
-    """Segments (N, 2, 3) as a LinePrimitive, equally thick at all distances."""
+    """Return segments (N, 2, 3) as a LinePrimitive, equally thick at all distances."""
     return _line(LinePrimitive.LINE_LIST, segments.reshape(-1, 3), color)
 
 
 def strip(points: FloatArray, color: str) -> Any:
-    """A line through points (N, 3) as a LinePrimitive."""
+    """Return a line through points (N, 3) as a LinePrimitive."""
     return _line(LinePrimitive.LINE_STRIP, points, color)
 
 
-def label(text: str, place: FloatArray, color: str) -> Any:
-    """Words at a place (3,) as a TextPrimitive, equally large at all distances."""
+def label(text: str, position: FloatArray, color: str) -> Any:
+    """Return a text at a position (3,) as a TextPrimitive, equally large at all distances."""
     return TextPrimitive(
-        pose=pose(place, _NO_TURN),
+        pose=pose(position, _NO_ROTATION),
         billboard=True,
         font_size=_TEXT_PIXELS,
         scale_invariant=True,
@@ -324,41 +347,43 @@ def label(text: str, place: FloatArray, color: str) -> Any:
 
 
 def box_segments(boxes: Boxes) -> FloatArray:
-    """(N, 13, 2, 3): the twelve edges of each box and, on the floor, a line from its middle to its front."""
+    """Return the segments of N boxes, shape (N, 13, 2, 3).
+
+    They are the twelve edges of each box and, on the floor, a line from its middle to its front.
+    """
     corners, floor = boxes.corners(), boxes.bottom_corners()
     edges = corners[:, np.array(EDGES)]
-    front = np.stack([floor.mean(axis=1), floor[:, :2].mean(axis=1)], axis=1)
-    return np.concatenate([edges, front[:, None]], axis=1)
+    middle, front = floor.mean(axis=1), floor[:, :2].mean(axis=1)
+    return np.concatenate([edges, np.stack([middle, front], axis=1)[:, None]], axis=1)
 
 
-def above(boxes: Boxes, row: int) -> FloatArray:
-    """(3,) the place of a box's text."""
-    return np.asarray(
-        boxes.center[row] + np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_ABOVE])
-    )
+def text_position(boxes: Boxes, row: int) -> FloatArray:
+    """Return the position (3,) of a box's text."""
+    offset = np.array([0.0, 0.0, boxes.size[row, 2] / 2 + _TEXT_OFFSET_M])
+    return np.asarray(boxes.center[row] + offset)
 
 
 def segment_points(segments: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
-    """Points (M,) of `COLORED_POINT` along segments (N, 2, 3), ends included."""
+    """Return points (M,) of `COLORED_POINT` along segments (N, 2, 3), ends included."""
     if not len(segments):
         return np.zeros(0, dtype=COLORED_POINT)
     lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     counts = np.ceil(lengths / POINT_SPACING).astype(np.int64) + 1
-    which = np.repeat(np.arange(len(segments)), counts)
-    step = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-    share = (step / np.maximum(counts - 1, 1)[which])[:, None]
-    return colored_points(
-        segments[which, 0] * (1 - share) + segments[which, 1] * share, color, alpha
-    )
+    rows = np.repeat(np.arange(len(segments)), counts)
+    starts = np.repeat(np.cumsum(counts) - counts, counts)
+    step = np.arange(len(rows)) - starts
+    share = (step / np.maximum(counts - 1, 1)[rows])[:, None]
+    xyz = segments[rows, 0] * (1 - share) + segments[rows, 1] * share
+    return colored_points(xyz, color, alpha)
 
 
 def strip_points(points: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
-    """Points of `COLORED_POINT` along a line through points (N, 3)."""
+    """Return points of `COLORED_POINT` along a line through points (N, 3)."""
     return segment_points(np.stack([points[:-1], points[1:]], axis=1), color, alpha)
 
 
 def colored_points(xyz: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
-    """Points (N, 3) as (N,) `COLORED_POINT` of one colour."""
+    """Return points (N, 3) as (N,) `COLORED_POINT` of one colour."""
     points = np.zeros(len(xyz), dtype=COLORED_POINT)
     points["x"], points["y"], points["z"] = xyz.T
     points["red"], points["green"], points["blue"] = rgb(color).tolist()
@@ -366,15 +391,15 @@ def colored_points(xyz: FloatArray, color: str, alpha: float = 1.0) -> AnyArray:
     return points
 
 
-def joined(parts: Sequence[AnyArray]) -> AnyArray:
-    """Points of several renderings in one array."""
+def join_points(parts: Sequence[AnyArray]) -> AnyArray:
+    """Return the points of several renderings in one array."""
     return np.concatenate([np.zeros(0, dtype=COLORED_POINT), *parts])
 
 
 def _line(kind: int, points: FloatArray, color: str) -> Any:
     return LinePrimitive(
         type=kind,
-        pose=pose(np.zeros(3), _NO_TURN),
+        pose=pose(np.zeros(3), _NO_ROTATION),
         thickness=_LINE_PIXELS,
         scale_invariant=True,
         points=points3(points),

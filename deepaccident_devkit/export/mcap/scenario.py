@@ -1,9 +1,9 @@
-"""A scenario's messages, moment by moment: words, poses, sensor files and actors."""
+"""A scenario's messages, moment by moment: log texts, poses, sensor files and actors."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +25,6 @@ from deepaccident_devkit.export.mcap.messages import (
     McapRecording,
     Moment,
     Roles,
-    above,
     box_segments,
     cloud_message,
     colored_points,
@@ -33,7 +32,7 @@ from deepaccident_devkit.export.mcap.messages import (
     entity,
     exported_agents,
     frame_id,
-    joined,
+    join_points,
     label,
     lines,
     moment_of,
@@ -42,6 +41,7 @@ from deepaccident_devkit.export.mcap.messages import (
     segment_points,
     strip,
     strip_points,
+    text_position,
     transform_message,
 )
 from deepaccident_devkit.export.mcap.predicted import MotionMapMessages, PredictedScenes
@@ -72,59 +72,67 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 METADATA: Final = "deepaccident_devkit"
-# Frames (0.1 s) between two lines of the countdown.
-_LOG_EVERY: Final = 5
-_SHOWN: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
+# Number of frames (0.1 s) between two lines of the countdown.
+_LOG_INTERVAL_FRAMES: Final = 5
+# Fields of a scenario in the log and the metadata.
+_SCENARIO_FIELDS: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
 LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
-# Into how many steps LiDAR coordinates are rounded in a metre, and intensities from 0 to 1.
-_LIDAR_STEPS, _INTENSITIES = 32, 32
-# Cells of a BEV camera from one point of the road to the next.
-_ROAD_STEP: Final = 5
+# Number of steps a metre for rounded LiDAR coordinates, and of rounded intensities from 0 to 1.
+_LIDAR_STEPS, _INTENSITY_STEPS = 32, 32
+# Number of BEV camera cells between points of the road.
+_ROAD_STEP_CELLS: Final = 5
 TRAIL_FRAMES: Final = 20
-"""How many frames (2 s) an actor's trail goes back, and its path goes ahead."""
+"""Number of frames (2 s) that an actor's trail goes back, and its path goes ahead."""
 _PATH_ALPHA: Final = 0.5
 
 
 def write_poses(dataset: Dataset, moment: Moment, recording: McapRecording) -> None:
-    """Write world → agent → sensors in one message, and each agent's pose in a message of its own."""
-    transforms, poses = [], []
+    """Write world → agent → sensors in one message, and the pose of each agent in its own."""
+    transforms = []
+    poses = {}
     for agent, sample in moment.samples.items():
-        own = frame_id(agent, "ego")
-        there = transform_message("world", own, dataset.world_from(sample, "ego"), moment.index)
-        transforms.append(there)
-        transforms += [
-            transform_message(
-                own, frame_id(agent, channel), dataset.ego_from(sample, channel), moment.index
+        ego_frame = frame_id(agent, "ego")
+        poses[agent] = transform_message(
+            "world", ego_frame, dataset.world_from(sample, "ego"), moment.index
+        )
+        transforms.append(poses[agent])
+        for channel in EXPORTED_CHANNELS:
+            sensor_frame = frame_id(agent, channel)
+            transforms.append(
+                transform_message(
+                    ego_frame, sensor_frame, dataset.ego_from(sample, channel), moment.index
+                )
             )
-            for channel in EXPORTED_CHANNELS
-        ]
-        poses.append((agent, there))
     recording.write("/tf", FrameTransforms(transforms=transforms), moment.index)
-    for agent, there in poses:
+    for agent, transform in poses.items():
         message = PoseInFrame(timestamp=protobuf_timestamp(moment.index), frame_id="world")
-        message.pose.position.CopyFrom(there.translation)
-        message.pose.orientation.CopyFrom(there.rotation)
+        message.pose.position.CopyFrom(transform.translation)
+        message.pose.orientation.CopyFrom(transform.rotation)
         recording.write(f"/{agent}/pose", message, moment.index)
 
 
 def write_road(dataset: Dataset, moment: Moment, recording: McapRecording) -> None:
-    """Write what the agents' BEV cameras see of the ground at this moment as points in world, every 0.5 m."""
+    """Write the ground in the agents' BEV cameras at this moment as points in the world frame.
+
+    They are 0.5 m apart.
+    """
     parts = []
     for agent, sample in moment.samples.items():
         if not dataset.sensor_path(f"{sample}/{BEV_CAMERA}").exists():
             continue
-        image, height = dataset.load_bev(sample), -POLE_HEIGHT if agent == INFRASTRUCTURE else 0.0
-        tags, middle = image.semantic[::_ROAD_STEP, ::_ROAD_STEP], (len(image.semantic) - 1) / 2
+        image = dataset.load_bev(sample)
+        height = -POLE_HEIGHT if agent == INFRASTRUCTURE else 0.0
+        tags = image.semantic[::_ROAD_STEP_CELLS, ::_ROAD_STEP_CELLS]
+        middle = (len(image.semantic) - 1) / 2
         for name, color in MAP_COLORS.items():
-            ahead, left = (
-                middle - _ROAD_STEP * np.argwhere(tags == TAGS.get(name, -1)).T
-            ) * image.resolution
+            cells = np.argwhere(tags == TAGS.get(name, -1)).T
+            ahead, left = (middle - _ROAD_STEP_CELLS * cells) * image.resolution
             ground = np.column_stack([ahead, left, np.full(len(ahead), height)])
-            parts.append(colored_points(dataset.world_from(sample, "ego").apply(ground), color))
+            in_world = dataset.world_from(sample, "ego").apply(ground)
+            parts.append(colored_points(in_world, color))
     if parts:
-        recording.write(
-            "/road/points", cloud_message(joined(parts), "world", moment.index), moment.index
-        )
+        cloud = cloud_message(join_points(parts), "world", moment.index)
+        recording.write("/road/points", cloud, moment.index)
 
 
 def write_scenario(
@@ -136,27 +144,27 @@ def write_scenario(
     prediction: Predictions | None,
     progress: bool,
 ) -> Path:
-    """The work of `export_mcap`, with the same arguments and errors."""
+    """Do the work of `export_mcap`, with the same arguments and errors."""
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     token = record["token"]
     agents = exported_agents(dataset, token, config.agents)
     moments = [
-        moment_of(token, index, agents) for index in config.frame_numbers(record["num_frames"])
+        moment_of(token, number, agents) for number in config.frame_numbers(record["num_frames"])
     ]
     sensors = _SensorMessages(dataset, config)
-    parts: list[Callable[[Moment, McapRecording], None]]
-    parts = [
+    writers: list[Callable[[Moment, McapRecording], None]]
+    writers = [
         _StoryMessages(dataset, token).write,
         partial(write_poses, dataset),
         sensors.write,
         _ActorMessages(dataset, token).write,
     ]
     if config.motion_labels is not None:
-        parts.append(
+        writers.append(
             MotionMapMessages(dataset, token, resolved_label_config(config.motion_labels)).write
         )
     if prediction is not None:
-        parts.append(_predicted(prediction, moments, token).write)
+        writers.append(_predicted_scenes(prediction, moments, token).write)
     with (
         replacing(path) as temporary,
         temporary.open("wb") as stream,
@@ -165,85 +173,90 @@ def write_scenario(
         recording.add_metadata(METADATA, scenario_metadata(dataset, token))
         write_road(dataset, moments[0], recording)
         for moment in tqdm(moments, desc=path.name, disable=not progress, unit="frame"):
-            for write in parts:
+            for write in writers:
                 write(moment, recording)
     sensors.tell_missing()
     write_layouts(path, recording.topics)
     return path
 
 
-def _predicted(prediction: Predictions, moments: list[Moment], scenario: str) -> PredictedScenes:
+def _predicted_scenes(
+    prediction: Predictions, moments: list[Moment], scenario: str
+) -> PredictedScenes:
+    """Return the renderer of predictions; raises NotAvailableError if no sample has one."""
     scenes = PredictedScenes(prediction)
-    if not any(scenes.has(sample) for moment in moments for sample in moment.samples.values()):
+    samples = [sample for moment in moments for sample in moment.samples.values()]
+    if not any(map(scenes.has, samples)):
         raise NotAvailableError(
-            f"prediction: has nothing of {scenario} at these agents and frames, such as {moments[0].first_sample!r}"
+            f"prediction: has nothing of {scenario} at these agents and frames, such as "
+            f"{moments[0].first_sample!r}"
         )
     return scenes
 
 
 def scenario_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
-    """The file's metadata: the devkit's version, the scenario, a hash of its label, meta and calib files."""
+    """Return the file's metadata.
+
+    It has the devkit's version, the scenario, and a hash of its label, meta and calib files.
+    """
     record = dataset.get("scenario", scenario)
-    return {
+    hashes = scenario_hashes(dataset, [scenario], workers=1)
+    metadata = {
         "devkit_version": __version__,
         "release_version": dataset.version,
         "scenario": scenario,
-        "fingerprint": fingerprint(scenario_hashes(dataset, [scenario], workers=1)),
+        "fingerprint": fingerprint(hashes),
         "collision": json.dumps(record["collision"], sort_keys=True),
-        **{name: str(record[name]) for name in _SHOWN if record[name] is not None},
     }
+    for name in _SCENARIO_FIELDS:
+        if record[name] is not None:
+            metadata[name] = str(record[name])
+    return metadata
 
 
 class _StoryMessages:
-    """Writes into a log what happens, and, if there is an impact, a countdown to it."""
+    """Writes events into a log, and, if there is an impact, a countdown to it."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
         """Prepare the facts of a scenario."""
         self._dataset = dataset
         self._record: Any = dataset.get("scenario", scenario)
-        self._told = False
+        self._has_begun = False
 
     def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the countdown of a moment; at the first moment, the scenario's facts before it."""
-        if not self._told:
-            self._told = True
+        if not self._has_begun:
+            self._has_begun = True
             _log(self._facts(), moment.index, recording)
-        left = self._dataset.get("frame", frame_token(moment.scenario, moment.index))[
-            "time_to_impact"
-        ]
-        if left is None:
+        frame = self._dataset.get("frame", frame_token(moment.scenario, moment.index))
+        seconds = frame["time_to_impact"]
+        if seconds is None:
             return
-        recording.write("/time_to_impact", DoubleValue(value=left), moment.index)
-        if left == 0:
+        recording.write("/time_to_impact", DoubleValue(value=seconds), moment.index)
+        if seconds == 0:
             _log(f"impact: {self._pair()}", moment.index, recording, Log.ERROR)
-        elif round(left * 10) % _LOG_EVERY == 0:
-            _log(f"{left:.1f} s to the impact", moment.index, recording)
+        elif round(seconds * 10) % _LOG_INTERVAL_FRAMES == 0:
+            _log(f"{seconds:.1f} s to the impact", moment.index, recording)
 
     def _facts(self) -> str:
-        told = ", ".join(
-            f"{name} {self._record[name]}" for name in _SHOWN if self._record[name] is not None
-        )
-        ending = (
-            f"ends in an accident: {self._pair()}"
-            if self._record["collision"]
-            else "no collision is known"
-        )
-        return f"{self._record['token']}: {told}; {ending}"
+        facts = []
+        for name in _SCENARIO_FIELDS:
+            if self._record[name] is not None:
+                facts.append(f"{name} {self._record[name]}")
+        ending = "no collision is known"
+        if self._record["collision"]:
+            ending = f"ends in an accident: {self._pair()}"
+        return f"{self._record['token']}: {', '.join(facts)}; {ending}"
 
     def _pair(self) -> str:
         collision = self._record["collision"]
-        return " and ".join(
-            f"{kind} {actor}"
-            for kind, actor in zip(collision["classes"], collision["ids"], strict=True)
-        )
+        pair = zip(collision["classes"], collision["ids"], strict=True)
+        return " and ".join(f"{category} {actor}" for category, actor in pair)
 
 
 def _log(text: str, index: int, recording: McapRecording, level: int = Log.INFO) -> None:
-    recording.write(
-        "/log",
-        Log(timestamp=protobuf_timestamp(index), level=level, message=text, name=METADATA),
-        index,
-    )
+    message = Log(timestamp=protobuf_timestamp(index), level=level, message=text, name=METADATA)
+    recording.write("/log", message, index)
 
 
 class _SensorMessages:
@@ -275,25 +288,24 @@ class _SensorMessages:
     def _write_image(
         self, agent: str, token: str, path: ReleasePath, index: int, recording: McapRecording
     ) -> None:
-        (content, size), channel = read_jpeg(path), token.rsplit("/", 1)[1]
+        content, size = read_jpeg(path)
+        channel = token.rsplit("/", 1)[1]
         frame = frame_id(agent, channel)
+        calibration = _calibration(self._dataset, token, size, frame, index)
         image = CompressedImage(
             timestamp=protobuf_timestamp(index), frame_id=frame, data=content, format="jpeg"
         )
-        recording.write(
-            f"/{frame}/calibration", _calibration(self._dataset, token, size, frame, index), index
-        )
+        recording.write(f"/{frame}/calibration", calibration, index)
         recording.write(f"/{frame}/image", image, index)
 
     def _write_cloud(self, agent: str, sample: str, index: int, recording: McapRecording) -> None:
         cloud = self._dataset.load_point_cloud(sample, "lidar")
-        rows = slice(None, None, self._step)
-        points = np.zeros(len(cloud.xyz[rows]), dtype=LIDAR_POINT)
-        # few digits are small when compressed: clouds are most of a file
-        points["x"], points["y"], points["z"] = (
-            cloud.xyz[rows] * _LIDAR_STEPS
-        ).round().T / _LIDAR_STEPS
-        points["intensity"] = (cloud.intensity[rows] * _INTENSITIES).round() / _INTENSITIES
+        xyz, intensity = cloud.xyz[:: self._step], cloud.intensity[:: self._step]
+        points = np.zeros(len(xyz), dtype=LIDAR_POINT)
+        # values with few digits compress well: clouds are most of a file
+        rounded = (xyz * _LIDAR_STEPS).round().T / _LIDAR_STEPS
+        points["x"], points["y"], points["z"] = rounded
+        points["intensity"] = (intensity * _INTENSITY_STEPS).round() / _INTENSITY_STEPS
         frame = frame_id(agent, "lidar")
         recording.write(f"/{frame}/points", cloud_message(points, frame, index), index)
 
@@ -301,7 +313,10 @@ class _SensorMessages:
 def _calibration(
     dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int
 ) -> Any:
-    """A CameraCalibration for an image of `size` (width, height), which may be smaller than calib says."""
+    """Return a CameraCalibration for an image of `size` (width, height).
+
+    The image may be smaller than in the calib file.
+    """
     lens = dataset.camera(token).resized(*size)
     return CameraCalibration(
         timestamp=protobuf_timestamp(index),
@@ -324,14 +339,13 @@ class _ActorMessages:
         self._dataset = dataset
         self._roles = Roles(dataset, scenario)
         tracks = scenario_tracks(dataset, scenario)
-        self._paths: Mapping[int, tuple[IntArray, FloatArray]] = {
-            actor: (tracks.index[rows], tracks.boxes.center[rows])
-            for actor in np.unique(tracks.actor_id).tolist()
-            for rows in [np.flatnonzero(tracks.actor_id == actor)]
-        }
+        self._paths: dict[int, tuple[IntArray, FloatArray]] = {}
+        for actor in np.unique(tracks.actor_id).tolist():
+            rows = np.flatnonzero(tracks.actor_id == actor)
+            self._paths[actor] = (tracks.index[rows], tracks.boxes.center[rows])
 
     def write(self, moment: Moment, recording: McapRecording) -> None:
-        """Write all actors of a moment in world, and the annotations of each agent in its LiDAR frame."""
+        """Write all actors of a moment in the world frame, and annotations in LiDAR frames."""
         self._write_actors(moment, recording)
         for agent, sample in moment.samples.items():
             if self._dataset.get("sample", sample)["labelled"]:
@@ -341,24 +355,24 @@ class _ActorMessages:
         view = cooperative_view(self._dataset, moment.first_sample, agents=tuple(moment.samples))
         boxes, segments = view.boxes, box_segments(view.boxes)
         colors = role_colors(self._dataset, moment.first_sample, boxes)
-        seen = {
-            agent: set(visible_actors(self._dataset, sample, agents=(agent,)).tolist())
-            for agent, sample in moment.samples.items()
-        }
+        visible = {}
+        for agent, sample in moment.samples.items():
+            visible[agent] = set(visible_actors(self._dataset, sample, agents=(agent,)).tolist())
         entities, points = [], []
         for row, actor in enumerate(boxes.actor_id.tolist()):
             color = colors[row]
             trail, path = self._trail(actor, moment.index)
+            annotators = [name for bit, name in enumerate(AGENTS) if view.seen_by[row] >> bit & 1]
+            observers = [agent for agent, actors in visible.items() if actor in actors]
             facts = {
                 **self._facts(boxes, row, actor),
-                "annotated_by": ", ".join(
-                    [name for bit, name in enumerate(AGENTS) if view.seen_by[row] >> bit & 1]
-                ),
-                "seen_by": ", ".join(agent for agent, actors in seen.items() if actor in actors),
+                "annotated_by": ", ".join(annotators),
+                "seen_by": ", ".join(observers),
             }
             name = str(actor)
             if actor == UNTRACKED_ID:
                 name = f"untracked/{AGENTS[view.source[row]]}/{boxes.row[row]}"
+            strips = [strip(part, color) for part in (trail, path) if len(part) > 1]
             entities.append(
                 entity(
                     name,
@@ -366,11 +380,8 @@ class _ActorMessages:
                     moment.index,
                     facts,
                     cubes=[cube(boxes, row, color)],
-                    lines=[
-                        lines(segments[row, -1:], color),
-                        *(strip(part, color) for part in (trail, path) if len(part) > 1),
-                    ],
-                    texts=[label(facts["text"], above(boxes, row), color)],
+                    lines=[lines(segments[row, -1:], color), *strips],
+                    texts=[label(facts["text"], text_position(boxes, row), color)],
                 )
             )
             points += [
@@ -378,45 +389,42 @@ class _ActorMessages:
                 strip_points(trail, color),
                 strip_points(path, color, _PATH_ALPHA),
             ]
+        self._write_speeds(boxes, moment, recording)
+        recording.write("/actors", scene_update(entities, moment.index), moment.index)
+        cloud = cloud_message(join_points(points), "world", moment.index)
+        recording.write("/actors/points", cloud, moment.index)
+
+    def _write_speeds(self, boxes: Boxes, moment: Moment, recording: McapRecording) -> None:
+        """Write the known speeds of the exported agents."""
         for row in np.flatnonzero(np.isfinite(boxes.velocity[:, 0])).tolist():
             agent = self._roles.agents.get(int(boxes.actor_id[row]))
             if agent in moment.samples:
-                speed = DoubleValue(value=float(np.linalg.norm(boxes.velocity[row])))
-                recording.write(f"/{agent}/speed", speed, moment.index)
-        recording.write("/actors", scene_update(entities, moment.index), moment.index)
-        recording.write(
-            "/actors/points", cloud_message(joined(points), "world", moment.index), moment.index
-        )
+                speed = float(np.linalg.norm(boxes.velocity[row]))
+                recording.write(f"/{agent}/speed", DoubleValue(value=speed), moment.index)
 
     def _write_annotations(
         self, agent: str, sample: str, index: int, recording: McapRecording
     ) -> None:
-        boxes, actors = (
-            self._dataset.boxes(sample, "lidar"),
-            self._dataset.actor_ids(sample).tolist(),
-        )
+        boxes = self._dataset.boxes(sample, "lidar")
+        actors = self._dataset.actor_ids(sample).tolist()
         segments, color = box_segments(boxes), AGENT_COLORS[agent]
+        frame = frame_id(agent, "lidar")
         entities = []
         for row, actor in enumerate(actors):
             facts = {**self._facts(boxes, row, actor), "label_id": str(boxes.actor_id[row])}
             name = f"{actor}/{boxes.row[row]}"
-            entities.append(
-                entity(
-                    name,
-                    frame_id(agent, "lidar"),
-                    index,
-                    facts,
-                    lines=[lines(segments[row], color)],
-                )
-            )
+            entities.append(entity(name, frame, index, facts, lines=[lines(segments[row], color)]))
         recording.write(f"/{agent}/annotations", scene_update(entities, index), index)
 
     def _facts(self, boxes: Boxes, row: int, actor: int) -> dict[str, str]:
         category, velocity = CATEGORIES[boxes.category[row]], boxes.velocity[row]
         role = self._roles.role(actor)
         identity = "untracked" if actor == UNTRACKED_ID else str(actor)
+        suffix = ""
+        if role:
+            suffix = f" ({role})"
         return {
-            "text": f"{category} {identity}" + (f" ({role})" if role else ""),
+            "text": f"{category} {identity}{suffix}",
             "actor_id": identity,
             "category": category,
             "role": role,
@@ -428,7 +436,10 @@ class _ActorMessages:
         }
 
     def _trail(self, actor: int, index: int) -> tuple[FloatArray, FloatArray]:
-        """Where an actor was and where it will be, (n, 3) each, in world; both include the present."""
+        """Return an actor's past and future positions, shape (n, 3) each, in the world frame.
+
+        Both include the present.
+        """
         frames, centers = self._paths.get(actor, (np.zeros(0, dtype=np.int64), np.zeros((0, 3))))
         past = (frames <= index) & (frames >= index - TRAIL_FRAMES)
         future = (frames >= index) & (frames <= index + TRAIL_FRAMES)

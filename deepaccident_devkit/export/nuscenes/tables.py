@@ -1,9 +1,9 @@
-"""The nuScenes format: its settings, what each scenario becomes, and the tables as files."""
+"""The nuScenes format: its settings, rows of each scenario, and the tables as files."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output
 
-_OF_UNITS: Final = (
+# Tables with rows of scenarios.
+_SCENARIO_TABLES: Final = (
     *("log", "scene", "sample", "sample_data", "ego_pose", "calibrated_sensor"),
     *("instance", "sample_annotation"),
 )
@@ -52,16 +53,17 @@ _VISIBILITIES: Final = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-10
 
 @dataclass(frozen=True, kw_only=True)
 class NuScenes(Format):
-    """Tables and sensor files for the nuScenes devkit 1.2 and all that reads nuScenes.
+    """Tables and sensor files for the nuScenes devkit 1.2 and all software that reads nuScenes.
 
-    A scene is what one agent recorded of a scenario. The last frame is a keyframe, and every fifth one before it; those
-    between are sweeps.
+    A scene is one agent's recording of a scenario. The last frame is a keyframe, and every fifth
+    one before it; the frames between them are sweeps.
 
     Attributes:
-        van: vehicle of nuScenes that vans become, `car` or `truck`.
-        lidar_axes: axes of clouds and their calibration: `ego`, x forward and y left as everywhere in the devkit, or
-            `nuscenes`, x right and y forward, which code made for nuScenes may take for granted.
-        sweeps: whether the frames between keyframes are exported too.
+        van: Vehicle of nuScenes that vans become, `car` or `truck`.
+        lidar_axes: Axes of clouds and their calibration: `ego`, x forward and y left as everywhere
+            in the devkit, or `nuscenes`, x right and y forward, which code made for nuScenes may
+            rely on.
+        sweeps: Whether the frames between keyframes are exported too.
 
     Raises:
         ChoiceError: a setting is none of these.
@@ -79,21 +81,20 @@ class NuScenes(Format):
         settle_choices(self, {"van": get_args(Van), "lidar_axes": get_args(LidarAxes)})
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write the sensor files of a scenario, and keep its rows."""
-        rows = []
+        """Write the sensor files of a scenario, and its rows into its part."""
+        rows_by_scene = []
         for scene in self.scenes(dataset, unit):
             files = write_sensors(scene, self.lidar_axes, output)
-            rows.append({**scene.rows(), **files, **box_rows(scene, self.van, output)})
+            rows_by_scene.append({**scene.rows(), **files, **box_rows(scene, self.van, output)})
             output.tally.samples += len(scene.frames)
             output.leave_out("frames between keyframes", scene.last - len(scene.frames))
-        output.leave_out(
-            "agents of scenarios that are not in this release", len(self.agents) - len(rows)
-        )
-        for table in _OF_UNITS:
-            lines = "".join(
-                f"{json.dumps(row)}\n" for scene_rows in rows for row in scene_rows[table]
-            )
-            write_bytes(output.parts / f"{table}.jsonl", lines.encode())
+        absent = len(self.agents) - len(rows_by_scene)
+        output.leave_out("agents of scenarios that are not in this release", absent)
+        for table in _SCENARIO_TABLES:
+            lines = []
+            for scene_rows in rows_by_scene:
+                lines += [f"{json.dumps(row)}\n" for row in scene_rows[table]]
+            write_bytes(output.parts / f"{table}.jsonl", "".join(lines).encode())
 
     def finish(
         self,
@@ -102,16 +103,15 @@ class NuScenes(Format):
         output: Output,
         parts: Callable[[Unit], Path],
     ) -> None:
-        """Write the 13 tables, `splits.json` and masks of maps; only rows of scenes and logs are in memory at once."""
-        folders = [parts(unit) for unit in units]
-        for table in _OF_UNITS:
-            _write_table(
-                table, (line for folder in folders for line in _lines(folder, table)), output
-            )
-        scenes, logs = (
-            [json.loads(line) for folder in folders for line in _lines(folder, each)]
-            for each in ("scene", "log")
-        )
+        """Write the 13 tables, `splits.json` and masks of maps.
+
+        Only rows of scenes and logs are all in memory at once.
+        """
+        folders = list(map(parts, units))
+        for table in _SCENARIO_TABLES:
+            _write_table(table, _lines(folders, table), output)
+        scenes = list(map(json.loads, _lines(folders, "scene")))
+        logs = list(map(json.loads, _lines(folders, "log")))
         for table, rows in {**_fixed_tables(), "map": _maps(logs)}.items():
             _write_table(table, map(json.dumps, rows), output)
         for row in _maps(logs):
@@ -122,20 +122,21 @@ class NuScenes(Format):
         output.write(f"{NUSCENES_VERSION}/splits.json", json.dumps(splits, indent=1).encode())
 
     def scenes(self, dataset: Dataset, unit: Unit) -> list[AgentScene]:
-        """The scenes of a unit."""
-        return [
-            scene
-            for token in unit.scenarios
-            for scene in scenes_of(dataset, token, self.agents, sweeps=self.sweeps)
-        ]
+        """Return the scenes of a unit."""
+        scenes: list[AgentScene] = []
+        for scenario in unit.scenarios:
+            scenes += scenes_of(dataset, scenario, self.agents, sweeps=self.sweeps)
+        return scenes
 
 
-def _lines(folder: Path, table: str) -> list[str]:
-    return read_bytes(folder / f"{table}.jsonl", "bundle").decode().splitlines()
+def _lines(folders: Iterable[Path], table: str) -> Iterator[str]:
+    """Yield the rows of a table, which are JSON, from the units' folders of parts."""
+    for folder in folders:
+        yield from read_bytes(folder / f"{table}.jsonl", "bundle").decode().splitlines()
 
 
 def _write_table(table: str, rows: Iterable[str], output: Output) -> None:
-    """Write a table of rows that are JSON, as they come."""
+    """Write a table of rows that are JSON, one after another."""
     with (
         output.file(f"{NUSCENES_VERSION}/{table}.json") as path,
         path.open("w", encoding="utf-8") as file,
@@ -148,30 +149,31 @@ def _write_table(table: str, rows: Iterable[str], output: Output) -> None:
 
 
 def _fixed_tables() -> dict[str, list[NuScenesRow]]:
-    """The tables that are the same in every export."""
-    sensors = {
-        name: "lidar" if name == LIDAR_CHANNEL else "camera" for name in CHANNEL_NAMES.values()
-    }
+    """Return the tables that are the same in every export."""
+    sensors = []
+    for name in CHANNEL_NAMES.values():
+        modality = "lidar" if name == LIDAR_CHANNEL else "camera"
+        sensors.append({"token": token("sensor", name), "channel": name, "modality": modality})
+    visibilities = []
+    for visibility, level in _VISIBILITIES.items():
+        visibilities.append({"token": visibility, "level": level, "description": ""})
     return {
-        "sensor": [
-            {"token": token("sensor", name), "channel": name, "modality": kind}
-            for name, kind in sensors.items()
-        ],
-        "category": [_word("category", name) for name in NUSCENES_CATEGORIES.values()],
-        "attribute": [_word("attribute", name) for name in _ATTRIBUTES],
-        "visibility": [
-            {"token": key, "level": level, "description": ""}
-            for key, level in _VISIBILITIES.items()
-        ],
+        "sensor": sensors,
+        "category": [_word_row("category", name) for name in NUSCENES_CATEGORIES.values()],
+        "attribute": [_word_row("attribute", name) for name in _ATTRIBUTES],
+        "visibility": visibilities,
     }
 
 
-def _word(table: str, name: str) -> NuScenesRow:
+def _word_row(table: str, name: str) -> NuScenesRow:
     return {"token": token(table, name), "name": name, "description": ""}
 
 
 def _maps(logs: Sequence[NuScenesRow]) -> list[NuScenesRow]:
-    """A map for each town, with all logs of the town: a reader stops at a log that is in no map."""
+    """Return a map for each town, with all logs of the town.
+
+    A reader stops at a log without a map.
+    """
     towns: dict[str, list[str]] = {}
     for log in logs:
         towns.setdefault(log["location"], []).append(log["token"])
@@ -187,7 +189,10 @@ def _maps(logs: Sequence[NuScenesRow]) -> list[NuScenesRow]:
 
 
 def _blank_mask() -> bytes:
-    """A map without roads: nuScenes' masks have no negative coordinates, CARLA's towns do."""
+    """Return a map without roads.
+
+    nuScenes' masks have no negative coordinates, but CARLA's towns do.
+    """
     from PIL import Image
 
     content = BytesIO()

@@ -1,4 +1,4 @@
-"""Questions for language models: what some agents observed, what happens next, and answers as results files.
+"""Questions for language models on what happens next, and their answers as results files.
 
     from deepaccident_devkit import DeepAccident
     from deepaccident_devkit.export.bulk import export_release
@@ -8,7 +8,7 @@
     export_release(da, "data/questions", Questions(split="val", observers="+infrastructure"))
     results_of_answers("answers.jsonl", "data/questions/truth.jsonl", "results/accident.json")
 
-docs/exports.md says what a question shows, and what not.
+docs/exports.md describes what a question shows, and what it does not.
 """
 
 from deepaccident_devkit.export.questions.answers import Answers, read_answers, results_of_answers

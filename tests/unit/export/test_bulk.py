@@ -398,7 +398,7 @@ class TestRelease:
         assert written(reopened(changing), tmp_path / "out", form).written == 0
 
     @pytest.mark.parametrize(
-        "moment", ["Store.drop", "Store.remove", "Manifest.write", "Export._remove_others"]
+        "moment", ["Store.drop", "Store.remove", "Manifest.write", "Export._remove_other_units"]
     )
     def test_a_call_that_is_killed_as_it_packs_or_unpacks(
         self, changing: Path, tmp_path: Path, moment: str

@@ -136,7 +136,7 @@ def test_a_virtual_camera_sees_the_same_in_the_same_directions(
     v, u = np.mgrid[0:120, 0:160]
     whole = np.stack([u, v, np.full_like(u, 200)], axis=-1).astype(np.uint8)
     own = np.array([[100 * zoom, 0, 160 * across], [0, 110 * zoom, 120 * down], [0, 0, 1]])
-    image, intrinsic = VirtualCamera(focal, height, width).taken(
+    image, intrinsic = VirtualCamera(focal, height, width).capture(
         whole, PinholeCamera(own, 160, 120), "full"
     )
     assert image.shape == (height, width, 3)

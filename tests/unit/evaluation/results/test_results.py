@@ -25,11 +25,11 @@ WRITTEN = {
     ),
     "records.RESULTS_FILE": "'results.json'",
     "records.WORDS": "'^[^/\\\\\\\\]+(/[^/\\\\\\\\]+)*$'",
-    "records.LARGEST": "1000000.0",
+    "records.MAX_MEASURE": "1000000.0",
     "records.LENGTH_FIRST": "[1, 0, 2]",
     "records.parsed_json": "levels=64",
     "records.entry_place": "number=None",
-    "writer.MOST_BYTES": "33554432",
+    "writer.MAX_SHARD_BYTES": "33554432",
     "writer.ResultsWriter": "meta=None, grid=None, step=0.5, labels='released', store='instances'",
 }
 

@@ -282,7 +282,7 @@ def test_results_are_by_token(results: Results) -> None:
 def test_a_copy_reads_again(results: Results) -> None:
     content = pickle.dumps(results)
     assert len(content) < 1000
-    reader.kept.clear()
+    reader.cached_contents.clear()
     copy = pickle.loads(content)
     assert (copy.task, copy.path, copy.fingerprint) == (
         results.task,
@@ -312,7 +312,7 @@ def test_a_change_is_noticed(results: Results) -> None:
     assert_refused(
         (results.check, ResultsError, "was changed after it was opened; open it again"),
     )
-    reader.kept.clear()
+    reader.cached_contents.clear()
     assert_refused(
         (
             lambda: pickle.loads(copy).prediction(FIRST),

@@ -40,7 +40,7 @@ from deepaccident_devkit.evaluation.runs.comparison import (
     p_values,
     paired_test,
     swaps_of,
-    undecided,
+    undecided_text,
 )
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 
@@ -480,35 +480,37 @@ def test_the_interval_is_students() -> None:
 def test_clusters_that_are_too_few() -> None:
     made = paired(np.zeros(5), np.arange(5) + 1.0)
     assert (
-        undecided(made, 0, 1, 5) == "no decision is possible with 5 clusters; at least 6 are needed"
+        undecided_text(made, 0, 1, 5)
+        == "no decision is possible with 5 clusters; at least 6 are needed"
     )
     assert (
-        undecided(made, 0, 4, 5) == "no decision is possible with 5 clusters; at least 8 are needed"
+        undecided_text(made, 0, 4, 5)
+        == "no decision is possible with 5 clusters; at least 8 are needed"
     )
     few = paired(np.zeros(30), np.eye(30)[0])
-    text = (
-        "no decision is possible with 1 of 30 clusters in which the two "
-        "differ; at least 6 are needed"
-    )
-    assert undecided(few, 0, 1, 30) == text
+    text = "no decision is possible with 1 of 30 clusters in which the two differ; at least 6 are needed"
+    assert undecided_text(few, 0, 1, 30) == text
 
 
 def test_resamples_that_are_too_few() -> None:
     made = paired(np.zeros(30), np.arange(30) + 1.0, Resampling(resamples=10))
     assert (
-        undecided(made, 0, 1, 30)
+        undecided_text(made, 0, 1, 30)
         == "no decision is possible with 10 resamples; at least 19 are needed"
     )
-    assert undecided(paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9).startswith(
-        "not tested: "
-    )
+    assert undecided_text(
+        paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9
+    ).startswith("not tested: ")
 
 
 def test_no_difference_decides_nothing() -> None:
-    assert undecided(paired(np.zeros(8), np.tile([1.0, -1.0], 4)), 0, 1, 8) == "the difference is 0"
+    assert (
+        undecided_text(paired(np.zeros(8), np.tile([1.0, -1.0], 4)), 0, 1, 8)
+        == "the difference is 0"
+    )
     nothing = np.full(8, math.nan)
     with np.errstate(all="ignore"), pytest.warns(RuntimeWarning):
-        assert undecided(paired(np.zeros(8), nothing), 0, 1, 8) == "nothing to compare"
+        assert undecided_text(paired(np.zeros(8), nothing), 0, 1, 8) == "nothing to compare"
 
 
 def test_all_swaps_or_random_ones() -> None:
@@ -569,8 +571,8 @@ def test_how_many_scenarios_would_decide(error: float, scenarios: int, told: str
     made = replace(paired(np.zeros(8), np.tile([3.0, -1.0], 4)), errors=np.array([error]))
     other = replace(made, differences=-made.differences)
     assert (
-        undecided(made, 0, 1, scenarios)
-        == undecided(other, 0, 1, scenarios)
+        undecided_text(made, 0, 1, scenarios)
+        == undecided_text(other, 0, 1, scenarios)
         == (
             "not decided"
             if told is None

@@ -18,7 +18,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
     default_selection,
 )
 from deepaccident_devkit.evaluation.runs.text import notes_of
-from deepaccident_devkit.evaluation.runs.verification import differing
+from deepaccident_devkit.evaluation.runs.verification import find_differences
 
 WRITTEN = {
     "bundles.SUMMARY_FILE": "'metrics_summary.json'",
@@ -31,7 +31,7 @@ WRITTEN = {
     "bundles.FILES_FORMAT": "'DeepAccident evaluation bundle'",
     "bundles.checksums_of": "listed=None",
     "bundles.save_run": "include_results=False, overwrite=False, extras=()",
-    "bundles.checked_target": "overwrite=False, asked=None",
+    "bundles.checked_target": "overwrite=False, requested=None",
     "comparison.compare_bundles": "resampling=None, common=False",
     "evaluation_run.SUMMARY_FORMAT": "'DeepAccident metrics summary'",
     "evaluation_run.SUMMARY_VERSION": "1",
@@ -45,14 +45,14 @@ WRITTEN = {
     "further.with_further": "resampling=None",
     "over_bytes.over_bytes": "resampling=None, common=False",
     "rows.STAMP_KEY": "b'deepaccident'",
-    "sanity.SAMPLES": "20",
-    "sanity.LISTS": "60",
-    "sanity.NEAR_IN_TIME": "0.15",
-    "sanity.MOVING": "4.0",
-    "sanity.STRAIGHT": "0.2617993877991494",
-    "sanity.FEWEST_FRAMES": "3",
+    "sanity.SAMPLE_COUNT": "20",
+    "sanity.LIST_COUNT": "60",
+    "sanity.TIME_TOLERANCE_S": "0.15",
+    "sanity.MIN_SPEED_MPS": "4.0",
+    "sanity.HEADING_TOLERANCE_RAD": "0.2617993877991494",
+    "sanity.FEW_FRAMES": "3",
     "sanity.SanityReport": "compared='', sought=()",
-    "sanity.Seen": "empty=False, scores=(), probabilities=False",
+    "sanity.SampleEvidence": "empty=False, scores=(), probabilities=False",
     "setups.LIST_STEP": "0.5",
     "setups.SampleSelection": "samples='evaluate', scope='accident', agents=None, horizon=2.0",
     "setups.Coverage": "missing=(), extra=(), unknown=(), splits=(), agents=(), options=''",
@@ -62,8 +62,8 @@ WRITTEN = {
     "setups.evaluation_store": "command=''",
     "text.SHOWN_BREAKDOWNS": "('time_to_impact', 'accident_visibility')",
     "text.summary_text": "by=('time_to_impact', 'accident_visibility')",
-    "verification.ABSENT": "'absent'",
-    "verification.differing": "without=(), path=''",
+    "verification.ABSENT_TEXT": "'absent'",
+    "verification.find_differences": "without=(), path=''",
     "verification.verify_bundle": "results=None, split=None",
 }
 
@@ -91,7 +91,7 @@ def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
         == "split val, samples evaluate (the last 2 s), scope accident, all agents"
     )
     write_rows(tmp_path / "rows", [], {})
-    assert (read_rows(tmp_path / "rows"), list(differing({}, {})), list(notes_of({}))) == (
+    assert (read_rows(tmp_path / "rows"), list(find_differences({}, {})), list(notes_of({}))) == (
         ([], {}),
         [],
         [],

@@ -30,13 +30,13 @@ from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, i
 from deepaccident_devkit.evaluation.runs import default_selection
 from deepaccident_devkit.evaluation.runs import sanity as sanity_module
 from deepaccident_devkit.evaluation.runs.sanity import (
+    SampleEvidence,
     SanityReport,
-    Seen,
     check_sanity,
     class_tally,
-    facts_of,
-    mistakes_of,
-    summed,
+    label_free_facts,
+    sum_tallies,
+    suspect_mistakes,
     tallies_of,
     tally_of,
 )
@@ -584,7 +584,7 @@ def test_from_which_shares_on_a_mistake_is_suspected(
     name: str, task: str, undone: int, given: int, whole: int, *, suspected: bool
 ) -> None:
     half = {name: tally_of(undone / 2, given / 2, whole / 2)}
-    warnings = list(mistakes_of(summed([half, half]), task))
+    warnings = list(suspect_mistakes(sum_tallies([half, half]), task))
     assert len(warnings) == suspected
     told = (
         f"({undone / whole:.0%} of the truth is hit once that is undone, "
@@ -596,24 +596,26 @@ def test_from_which_shares_on_a_mistake_is_suspected(
 def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
     two = np.array([[80.0, 20.0], [100.0, 100.0], [0.0, 0.0], [100.0, 100.0]])
     one = np.where([[0, 1], [0, 0], [0, 0], [0, 0]], 30.0, two)
-    (warning,) = mistakes_of(
+    (warning,) = suspect_mistakes(
         {"x mirrored": two, "y mirrored": one, "one step late": tally_of(90, 0, 100)}, "motion"
     )
     assert warning.startswith("y mirrored: ")  # and nothing of time beside it
     assert "(30% of the truth" in warning
     one_missed = np.array([[100.0, 0.0], [100.0, 1.0], [0.0, 0.0], [100.0, 1.0]])
-    assert list(mistakes_of({"x mirrored": one_missed}, "motion")) == []
+    assert list(suspect_mistakes({"x mirrored": one_missed}, "motion")) == []
 
 
 @pytest.mark.parametrize(("right", "every", "told"), [(4, 10, True), (5, 10, False), (0, 9, False)])
 def test_when_headings_look_random(right: int, every: int, *, told: bool) -> None:
     found = {"heading": tally_of(0, right, every)}
-    warnings = list(mistakes_of({**found, "place": tally_of(0, every, 5 * every)}, "detection"))
+    warnings = list(
+        suspect_mistakes({**found, "place": tally_of(0, every, 5 * every)}, "detection")
+    )
     assert [each.split(",")[0] for each in warnings] == [
         f"headings look random: {right} of {every} are right"
     ] * told
     assert (
-        list(mistakes_of({**found, "place": tally_of(0, every, 6 * every)}, "detection")) == []
+        list(suspect_mistakes({**found, "place": tally_of(0, every, 6 * every)}, "detection")) == []
     )  # found by chance
 
 
@@ -638,7 +640,9 @@ def test_when_headings_look_random(right: int, every: int, *, told: bool) -> Non
 def test_what_shows_without_labels(
     seen: list[dict[str, Any]], *, ranked: bool, told: list[str]
 ) -> None:
-    found = list(facts_of([Seen(tallies={}, **each) for each in seen], ranked=ranked))
+    found = list(
+        label_free_facts([SampleEvidence(tallies={}, **each) for each in seen], ranked=ranked)
+    )
     assert [each[: len(start)] for each, start in zip(found, told, strict=True)] == told
 
 

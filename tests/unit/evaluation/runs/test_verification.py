@@ -28,7 +28,7 @@ from deepaccident_devkit.evaluation.runs import (
 )
 from deepaccident_devkit.evaluation.runs.rows import read_rows, write_rows
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
-from deepaccident_devkit.evaluation.runs.verification import ABSENT, differing
+from deepaccident_devkit.evaluation.runs.verification import ABSENT_TEXT, find_differences
 from deepaccident_devkit.support.reading import file_checksum
 
 pytestmark = pytest.mark.slow
@@ -327,13 +327,13 @@ def read_scenarios(bundle: Path, ending: str) -> list[str]:
         ({"a": True}, {"a": 1}, [("a", True, 1)]),
         ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, [("a/b/1", 2, 3)]),
         ({"a": [1]}, {"a": [1, 2]}, [("a", [1], [1, 2])]),
-        ({"a": 1}, {"b": 1}, [("a", 1, ABSENT), ("b", ABSENT, 1)]),
-        ({"a": None}, {}, [("a", None, ABSENT)]),
+        ({"a": 1}, {"b": 1}, [("a", 1, ABSENT_TEXT), ("b", ABSENT_TEXT, 1)]),
+        ({"a": None}, {}, [("a", None, ABSENT_TEXT)]),
         ({"skip": 1, "keep": {"skip": 1}}, {"skip": 2, "keep": {"skip": 2}}, [("keep/skip", 1, 2)]),
     ],
 )
 def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]) -> None:
-    assert list(differing(stored, found, without=["skip"])) == expected
+    assert list(find_differences(stored, found, without=["skip"])) == expected
 
 
 def test_what_does_not_belong_is_named_and_not_opened(
