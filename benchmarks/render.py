@@ -49,7 +49,7 @@ def video_s(dataset: DeepAccident, folder: Path) -> list[Figure]:
             dataset.render_scenario_video,
             scenario,
             folder / f"{name}.mp4",
-            what=name,
+            views=name,
             size=SIZE,
             workers=2,
             progress=False,

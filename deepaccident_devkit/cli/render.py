@@ -480,7 +480,7 @@ def video(
         dataset,
         scenario or default_scenario(dataset),
         out,
-        what=words_of(views) or "frame",
+        views=words_of(views) or "frame",
         agents=names_or_configuration(agents),
         layers=cast(list[Layer] | None, words_of(layers) or None),
         workers=release["workers"],

@@ -1,4 +1,4 @@
-"""When it was too late: the last moment to brake, and what a warning at each earlier moment would have changed."""
+"""The last moment to brake, and what a warning at each earlier moment would have changed."""
 
 from __future__ import annotations
 
@@ -40,15 +40,16 @@ from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 BRAKERS: Final = ("first", "second", "both")
-"""Who of the pair brakes; the pair is in the meta file's order."""
+"""The braking actors of the pair; the pair is in the meta file's order."""
 MASKS: Final = ((True, False), (False, True), (True, True))
-"""The same as `outcomes_of` takes it."""
-# Seconds between the starts of braking that are tried.
-_SCAN_STEP: Final = 0.01
+"""`BRAKERS` as `outcomes_of` takes them: whether each actor of the pair brakes."""
+# Seconds between the tried starts of braking.
+_SCAN_STEP_S: Final = 0.01
 # Least angle between the headings at the end, radians.
-_HEAD_ON: Final = 3 * math.pi / 4
-# Metres of a gap that counts as contact: of others no contact is recorded that would need a margin.
-_NO_GAP: Final = 1e-9
+_MIN_HEAD_ON_ANGLE_RAD: Final = 3 * math.pi / 4
+# Metres of a gap that counts as contact. With other actors no contact was recorded, so no larger
+# margin is needed.
+_CONTACT_GAP_M: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,12 +57,14 @@ class LastMoments(FrozenArrays):
     """The last moments to brake of N ways to brake; arrays are read-only.
 
     Attributes:
-        time: (N,) seconds from the first frame: the latest start of a braking that avoids the accident; NaN if none
-            does.
-        switches: (N,) how often the answer changes from one tried start to the next. More than once: braking a little
-            earlier than the last moment can be worse than it, as when one passes behind the other.
-        extrapolated: (N,) whether no start avoids the accident, but some start does until the recording ends: the
-            contact is one of the continuation, in which the other goes straight on.
+        time: Latest start of a braking that avoids the accident, shape (N,), seconds from the first
+            frame; NaN if no start does.
+        switches: Number of changes of the answer from one tried start to the next, shape (N,). With
+            more than one, braking a little earlier than the last moment can be worse than braking
+            at it, for example if one actor passes behind the other.
+        extrapolated: Whether no start avoids the accident although some start avoids it until the
+            recording ends, shape (N,). The contact is then part of the continuation, in which the
+            other actor goes straight on.
     """
 
     time: FloatArray
@@ -71,17 +74,18 @@ class LastMoments(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SecondaryContact:
-    """One of the pair touches another actor in a replay, and did not in the recording.
+    """A contact of the pair with another actor, in a replay only and not in the recording.
 
-    The other's motion stays as recorded, though a driver would react: these are no outcomes, but a hint.
+    The other actor keeps its recorded motion, though a driver would react: the contact is a hint,
+    not an outcome.
 
     Attributes:
-        replay: number of the replay.
-        actor_id: CARLA id of the one of the pair.
-        other_id: the other's.
-        category: the other's class.
-        time: seconds from the first frame of the accident.
-        extrapolated: whether it is after the end of the recording.
+        replay: Number of the replay.
+        actor_id: CARLA id of the actor of the pair.
+        other_id: CARLA id of the other actor.
+        category: Class of the other actor.
+        time: Seconds from the first frame of the accident.
+        extrapolated: Whether the contact is after the end of the recording.
     """
 
     replay: int
@@ -94,18 +98,20 @@ class SecondaryContact:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Avoidability(FrozenArrays):
-    """When an accident could have been avoided by braking, and what warnings would have changed. Arrays are read-only.
+    """When braking could have avoided an accident, and what warnings would have changed.
+
+    Arrays are read-only.
 
     Attributes:
-        accident: the recorded motion.
-        check: the replay in which nobody brakes.
-        brakings: the K ways to brake after a warning.
-        decelerations: (D,) m/s², those of `brakings`, ascending.
-        last_moments: one value for each of `BRAKERS` and each deceleration, row by row (3 · D).
-        leads: (L,) seconds from a warning to the end of the recording: 0, 0.1, …
-        outcomes: for each of `BRAKERS` what the L warnings make of the accident in K ways.
-        secondary: contacts with others in the replays in which the braking begins at the last moment; their `replay`
-            is the position in `last_moments`.
+        accident: Recorded motion.
+        check: Replay in which nobody brakes.
+        brakings: The K ways to brake after a warning.
+        decelerations: Decelerations of `brakings`, shape (D,), m/s², ascending.
+        last_moments: One value for each of `BRAKERS` and each deceleration, row by row (3 · D).
+        leads: Seconds from a warning to the end of the recording, shape (L,): 0, 0.1, …
+        outcomes: For each of `BRAKERS`, what the L warnings make of the accident in K ways.
+        secondary: Contacts with other actors in the replays in which the braking begins at the last
+            moment; their `replay` is the position in `last_moments`.
     """
 
     accident: Accident
@@ -119,25 +125,33 @@ class Avoidability(FrozenArrays):
 
     @property
     def slack(self) -> FloatArray:
-        """(3, D) seconds from the last moment to brake to the end of the recording; NaN if nothing avoids it."""
-        return np.reshape(self.accident.duration - self.last_moments.time, (len(BRAKERS), -1))
+        """Seconds from the last moment to brake to the end of the recording, shape (3, D).
+
+        It is NaN if nothing avoids the accident.
+        """
+        seconds = self.accident.duration - self.last_moments.time
+        return np.reshape(seconds, (len(BRAKERS), -1))
 
     @property
     def head_on(self) -> bool:
-        """Whether they meet head-on, where one who brakes alone depends on how the other goes on."""
-        first, second = self.accident.paths[:, -1, 2]
-        return abs(math.remainder(float(first - second), 2 * math.pi)) >= _HEAD_ON
+        """Whether the pair meets head-on.
+
+        If only one of the two brakes, the outcome then depends on how the other goes on.
+        """
+        first_yaw, second_yaw = self.accident.paths[:, -1, 2]
+        angle = math.remainder(float(first_yaw - second_yaw), 2 * math.pi)
+        return abs(angle) >= _MIN_HEAD_ON_ANGLE_RAD
 
     @property
     def pedestrian(self) -> bool:
-        """Whether one of them walks: braking is no answer that a pedestrian gives."""
+        """Whether one of the pair is a pedestrian: a pedestrian cannot answer by braking."""
         return "pedestrian" in self.accident.categories
 
     def to_dict(self, *, warnings: bool = True) -> dict[str, Any]:
-        """Values for JSON; None for what does not exist.
+        """Return values for JSON; None for what does not exist.
 
         Args:
-            warnings: whether to give what each warning changes, some thousand values.
+            warnings: Whether to include what each warning changes, about a thousand values.
         """
         accident = self.accident
         actors = zip(
@@ -147,12 +161,10 @@ class Avoidability(FrozenArrays):
             accident.masses.tolist(),
             strict=True,
         )
+        keys = ("actor_id", "category", "agent", "mass")
         result: dict[str, Any] = {
             "scenario": accident.scenario,
-            "actors": [
-                dict(zip(("actor_id", "category", "agent", "mass"), each, strict=True))
-                for each in actors
-            ],
+            "actors": [dict(zip(keys, actor, strict=True)) for actor in actors],
             "duration": round(accident.duration, 1),
             "head_on": self.head_on,
             "pedestrian": self.pedestrian,
@@ -165,11 +177,10 @@ class Avoidability(FrozenArrays):
         return result
 
     def last_moment_rows(self) -> Iterator[dict[str, Any]]:
-        """For each of `BRAKERS` and each deceleration the last moment to brake, and what comes with it."""
+        """Yield the last moment to brake, with its facts, for `BRAKERS` and each deceleration."""
         moments = self.last_moments
-        for row, (brakers, deceleration) in enumerate(
-            product(BRAKERS, self.decelerations.tolist())
-        ):
+        ways = product(BRAKERS, self.decelerations.tolist())
+        for row, (brakers, deceleration) in enumerate(ways):
             yield {
                 "brakers": brakers,
                 "deceleration": deceleration,
@@ -178,18 +189,23 @@ class Avoidability(FrozenArrays):
                 "slack": known(self.slack.flat[row], 2),
                 "switches": int(moments.switches[row]),
                 "extrapolated": bool(moments.extrapolated[row]),
-                "secondary": [
-                    {
-                        "actor_id": each.actor_id,
-                        "other_id": each.other_id,
-                        "category": each.category,
-                        "time": round(each.time, 3),
-                        "extrapolated": each.extrapolated,
-                    }
-                    for each in self.secondary
-                    if each.replay == row
-                ],
+                "secondary": self._secondary_rows(row),
             }
+
+    def _secondary_rows(self, replay: int) -> list[dict[str, Any]]:
+        rows = []
+        for contact in self.secondary:
+            if contact.replay == replay:
+                rows.append(
+                    {
+                        "actor_id": contact.actor_id,
+                        "other_id": contact.other_id,
+                        "category": contact.category,
+                        "time": round(contact.time, 3),
+                        "extrapolated": contact.extrapolated,
+                    }
+                )
+        return rows
 
     def _recorded(self) -> dict[str, Any]:
         return {
@@ -202,7 +218,7 @@ class Avoidability(FrozenArrays):
 
     @property
     def relative_speed(self) -> float:
-        """m/s between the two at the recorded contact."""
+        """Relative speed of the pair at the recorded contact, m/s."""
         return float(self.check.delta_v.sum())  # the shares of the two add up to 1
 
     def _warning_rows(self) -> Iterator[dict[str, Any]]:
@@ -221,34 +237,38 @@ class Avoidability(FrozenArrays):
 
 
 def last_moments(pair: Pair, brakers: tuple[bool, bool], decelerations: ArrayLike) -> LastMoments:
-    """The last moments to brake with decelerations (N,) m/s²: each hundredth of a second is tried.
+    """Return the last moments to brake with decelerations (N,) m/s².
 
-    The answer may change more than once.
+    Each hundredth of a second is tried, because the answer may change more than once.
     """
-    hard = checked("decelerations", decelerations, (None,))
-    tried = np.arange(round(pair.duration / _SCAN_STEP) + 1) * _SCAN_STEP
-    starts = np.where(brakers, np.tile(tried, len(hard))[:, None], np.inf)
-    each = np.repeat(hard, len(tried))
-    avoids = ~contact_made(pair, starts, each).reshape(len(hard), -1)
+    values = checked("decelerations", decelerations, (None,))
+    count = len(values)
+    scan = np.arange(round(pair.duration / _SCAN_STEP_S) + 1) * _SCAN_STEP_S
+    starts = np.where(brakers, np.tile(scan, count)[:, None], np.inf)
+    repeated = np.repeat(values, len(scan))
+    avoids = ~contact_made(pair, starts, repeated).reshape(count, -1)
     possible = avoids.any(axis=1)
-    last = len(tried) - 1 - np.argmax(avoids[:, ::-1], axis=1)
-    extrapolated = np.zeros(len(hard), dtype=bool)
-    rows = np.flatnonzero(np.repeat(~possible, len(tried)))
-    until_the_end = contact_made(pair, starts[rows], each[rows], window=(0.0, pair.duration))
-    extrapolated[~possible] = (~until_the_end).reshape(-1, len(tried)).any(axis=1)
+    latest = len(scan) - 1 - np.argmax(avoids[:, ::-1], axis=1)
+    extrapolated = np.zeros(count, dtype=bool)
+    rows = np.flatnonzero(np.repeat(~possible, len(scan)))
+    recorded = (0.0, pair.duration)
+    touches = contact_made(pair, starts[rows], repeated[rows], window=recorded)
+    extrapolated[~possible] = (~touches).reshape(-1, len(scan)).any(axis=1)
+    switches = np.count_nonzero(np.diff(avoids, axis=1), axis=1)
     return LastMoments(
-        time=np.where(possible, tried[last], np.nan),
-        switches=np.count_nonzero(np.diff(avoids, axis=1), axis=1).astype(np.int64),
+        time=np.where(possible, scan[latest], np.nan),
+        switches=switches.astype(np.int64),
         extrapolated=extrapolated,
     )
 
 
 def unusable(accident: Accident, check: ReplayCheck) -> str:
-    """Why an accident whose check fails cannot be replayed, in words."""
+    """Return in words why an accident with a failed check cannot be replayed."""
     first, second = accident.actor_ids
     return (
-        f"{accident.scenario}: the outlines of {first} and {second} are {check.margin:.2f} m apart at their last "
-        f"frame, more than {MOST_MARGIN:g} m: the recording does not show the accident"
+        f"{accident.scenario}: the outlines of {first} and {second} are {check.margin:.2f} m apart "
+        f"at their last frame, more than {MOST_MARGIN:g} m: "
+        "the recording does not show the accident"
     )
 
 
@@ -258,33 +278,32 @@ def avoidability_of(
     *,
     brakings: Sequence[Braking] = BRAKINGS,
 ) -> Avoidability:
-    """When an accident could have been avoided by braking.
+    """Return when braking could have avoided an accident.
 
     Args:
-        accident: the recorded motion.
-        tracks: of all actors of its scenario, for contacts with others than the pair; None leaves these out.
-        brakings: the ways to brake after a warning.
+        accident: Recorded motion.
+        tracks: Tracks of all actors of its scenario, for contacts with actors outside the pair;
+            None to leave these out.
+        brakings: Ways to brake after a warning.
 
     Raises:
-        NotAvailableError: the gap between the two at the last frame is so large that the recording does not show the
-            accident.
+        NotAvailableError: The gap between the two at the last frame is so large that the recording
+            does not show the accident.
     """
     check = undisturbed(accident)
     if not check.usable:
         raise NotAvailableError(unusable(accident, check))
     pair = pair_of(accident.paths, accident.sizes)
-    decelerations = np.unique([each.deceleration for each in brakings])
+    decelerations = np.unique([braking.deceleration for braking in brakings])
     scans = [last_moments(pair, brakers, decelerations) for brakers in MASKS]
-    moments = LastMoments(
-        **{
-            name: np.concatenate([getattr(each, name) for each in scans])
-            for name in LastMoments.__slots__
-        }
-    )
+    columns = {}
+    for name in LastMoments.__slots__:
+        columns[name] = np.concatenate([getattr(scan, name) for scan in scans])
+    moments = LastMoments(**columns)
     leads = as_floats(np.arange(accident.paths.shape[1]) * FRAME_PERIOD)
+    warnings = accident.duration - leads
     first, second, both = (
-        outcomes_of(accident, brakers, accident.duration - leads, brakings=brakings)
-        for brakers in MASKS
+        outcomes_of(accident, brakers, warnings, brakings=brakings) for brakers in MASKS
     )
     return Avoidability(
         accident=accident,
@@ -301,37 +320,48 @@ def avoidability_of(
 def avoidability(
     dataset: Dataset, scenario: RowArgument, *, brakings: Sequence[Braking] = BRAKINGS
 ) -> Avoidability | None:
-    """When a scenario's accident could have been avoided by braking; None if the meta file names no collision.
+    """Return when braking could have avoided a scenario's accident.
+
+    It is None if the meta file names no collision.
 
     Args:
-        dataset: the release.
-        scenario: token or record.
-        brakings: the ways to brake after a warning.
+        dataset: The release.
+        scenario: Token or record.
+        brakings: Ways to brake after a warning.
 
     Raises:
-        TokenError: no such scenario.
-        NotAvailableError: the scenario lacks labels or meta, or its labels do not show the accident.
+        TokenError: No such scenario.
+        NotAvailableError: The scenario lacks labels or meta, or its labels do not show the
+            accident.
     """
     accident = accident_of(dataset, scenario)
-    return (
-        None
-        if accident is None
-        else avoidability_of(accident, scenario_tracks(dataset, scenario), brakings=brakings)
-    )
+    if accident is None:
+        return None
+    return avoidability_of(accident, scenario_tracks(dataset, scenario), brakings=brakings)
 
 
 def _secondary(
     accident: Accident, tracks: ScenarioTracks, moments: LastMoments, decelerations: FloatArray
 ) -> tuple[SecondaryContact, ...]:
-    """Contacts with others in the replays that avoid the accident at the last moment."""
+    """Return contacts with other actors in replays that avoid the accident at the last moment."""
     brakes = np.repeat(np.array(MASKS), len(decelerations), axis=0)
-    starts = np.where(brakes & np.isfinite(moments.time)[:, None], moments.time[:, None], np.inf)
-    return tuple(secondary_contacts(accident, tracks, starts, np.tile(decelerations, len(MASKS))))
+    moment = moments.time[:, None]
+    starts = np.where(brakes & np.isfinite(moment), moment, np.inf)
+    repeated = np.tile(decelerations, len(MASKS))
+    return tuple(secondary_contacts(accident, tracks, starts, repeated))
 
 
 @dataclass(frozen=True, slots=True)
 class _Other:
-    """Another actor: its path at the accident's frames, and the seconds within which labels show it."""
+    """An actor outside the pair.
+
+    Attributes:
+        actor_id: CARLA id.
+        category: Class.
+        path: Path at the accident's frames.
+        size: Length and width, shape (2,), metres.
+        window: First and last second in which labels show the actor.
+    """
 
     actor_id: int
     category: str
@@ -343,41 +373,54 @@ class _Other:
 def secondary_contacts(
     accident: Accident, tracks: ScenarioTracks, starts: FloatArray, decelerations: FloatArray
 ) -> list[SecondaryContact]:
-    """The first contacts of each of the pair with each other actor in N replays, which the recording does not have.
+    """Return first contacts of the pair with other actors in N replays, by replay, then by time.
 
-    `starts` (N, 2) are the seconds at which each of the two begins to brake, inf if it does not. By replay, then by
-    time. Others that labels show at one frame alone have no motion, and are left out.
+    Contacts that the recording has too are left out, and so are actors that labels show at one
+    frame only: they have no motion.
+
+    Args:
+        accident: Recorded motion.
+        tracks: Tracks of all actors of the scenario.
+        starts: Seconds at which each of the pair begins to brake, shape (N, 2); inf if it does not.
+        decelerations: Decelerations of the replays, shape (N,), m/s².
     """
-    found = []
-    for other, which in product(_others(accident, tracks), (0, 1)):
-        rows = np.flatnonzero(np.isfinite(starts[:, which]))
-        if len(rows) and _may_meet(accident.paths[which], accident.sizes[which], other):
-            times = _new_contacts(accident, which, other, starts[rows], decelerations[rows])
-            found += [
-                SecondaryContact(
-                    replay=int(row),
-                    actor_id=accident.actor_ids[which],
-                    other_id=other.actor_id,
-                    category=other.category,
-                    time=float(time),
-                    extrapolated=bool(time > accident.duration),
+    contacts = []
+    for other, member in product(_others(accident, tracks), (0, 1)):
+        rows = np.flatnonzero(np.isfinite(starts[:, member]))
+        if not len(rows) or not _may_meet(accident.paths[member], accident.sizes[member], other):
+            continue
+        times = _new_contacts(accident, member, other, starts[rows], decelerations[rows])
+        for row, time in zip(rows, times, strict=True):
+            if np.isfinite(time):
+                contacts.append(
+                    SecondaryContact(
+                        replay=int(row),
+                        actor_id=accident.actor_ids[member],
+                        other_id=other.actor_id,
+                        category=other.category,
+                        time=float(time),
+                        extrapolated=bool(time > accident.duration),
+                    )
                 )
-                for row, time in zip(rows, times, strict=True)
-                if np.isfinite(time)
-            ]
-    return sorted(found, key=lambda each: (each.replay, each.time, each.other_id))
+    return sorted(contacts, key=lambda contact: (contact.replay, contact.time, contact.other_id))
 
 
 def _new_contacts(
-    accident: Accident, which: int, other: _Other, starts: FloatArray, decelerations: FloatArray
+    accident: Accident, member: int, other: _Other, starts: FloatArray, decelerations: FloatArray
 ) -> FloatArray:
-    """(N,) seconds at which one of the pair touches another in N replays; inf if never, or in the recording too."""
-    paths = np.stack([accident.paths[which], other.path])
-    pair = pair_of(paths, [accident.sizes[which, :2], other.size], margin=_NO_GAP)
-    begun = np.full((len(starts) + 1, 2), np.inf)  # the last one is the recording
-    begun[:-1, 0] = starts[:, which]
-    times = contact_times(pair, begun, np.append(decelerations, 1.0), window=other.window)
-    return times[:-1] if times[-1] > accident.duration else np.full(len(starts), np.inf)
+    """Return seconds at which one of the pair touches another actor in N replays, shape (N,).
+
+    They are inf if the two never touch, or touch in the recording too.
+    """
+    paths = np.stack([accident.paths[member], other.path])
+    pair = pair_of(paths, [accident.sizes[member, :2], other.size], margin=_CONTACT_GAP_M)
+    # one row for each replay, and a last one for the recording
+    pair_starts = np.full((len(starts) + 1, 2), np.inf)
+    pair_starts[:-1, 0] = starts[:, member]
+    times = contact_times(pair, pair_starts, np.append(decelerations, 1.0), window=other.window)
+    if times[-1] > accident.duration:
+        return times[:-1]
+    return np.full(len(starts), np.inf)
 
 
 def _others(accident: Accident, tracks: ScenarioTracks) -> Iterator[_Other]:
@@ -390,30 +433,41 @@ def _others(accident: Accident, tracks: ScenarioTracks) -> Iterator[_Other]:
 
 
 def _other(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> _Other:
-    first, last = ((tracks.index[rows[end]] - frames[0]) * FRAME_PERIOD for end in (0, -1))
-    stays = tracks.index[rows[-1]] == frames[-1]
+    start, end = ((tracks.index[row] - frames[0]) * FRAME_PERIOD for row in (rows[0], rows[-1]))
+    if tracks.index[rows[-1]] == frames[-1]:
+        end = end + HORIZON
     return _Other(
         actor_id=int(tracks.actor_id[rows[0]]),
         category=CATEGORIES[int(tracks.boxes.category[rows[-1]])],
         path=recorded_path(tracks, rows, frames),
         size=np.median(tracks.boxes.size[rows, :2], axis=0),
-        window=(float(first), float(last + HORIZON if stays else last)),
+        window=(float(start), float(end)),
     )
 
 
 def _may_meet(path: FloatArray, size: FloatArray, other: _Other) -> bool:
-    """Whether the two can touch at all: a braking actor is where it was recorded, or earlier on its path."""
-    mine, theirs = _positions(path), _positions(other.path)
-    apart = np.hypot(*(mine[:, None] - theirs[None]).transpose(2, 0, 1))
-    steps = sum(np.hypot(*np.diff(each, axis=0).T).max() for each in (mine, theirs))
-    reach = (np.hypot(*size[:2]) + np.hypot(*other.size)) / 2 + steps
-    not_ahead = np.arange(len(mine))[:, None] <= np.arange(len(theirs)) + 1
-    return bool((not_ahead & (apart <= reach)).any())
+    """Return whether the two can touch at all.
+
+    A braking actor is where it was recorded, or earlier on its path.
+    """
+    positions, other_positions = _positions(path), _positions(other.path)
+    offsets = positions[:, None] - other_positions[None]
+    distances = np.hypot(*offsets.transpose(2, 0, 1))
+    steps = _longest_step(positions) + _longest_step(other_positions)
+    max_distance = (np.hypot(*size[:2]) + np.hypot(*other.size)) / 2 + steps
+    not_ahead = np.arange(len(positions))[:, None] <= np.arange(len(other_positions)) + 1
+    return bool((not_ahead & (distances <= max_distance)).any())
+
+
+def _longest_step(positions: FloatArray) -> Any:
+    steps = np.diff(positions, axis=0)
+    return np.hypot(*steps.T).max()
 
 
 def _positions(path: FloatArray) -> FloatArray:
-    """Positions at each frame of the recording and of its continuation."""
-    onward = np.arange(1, round(HORIZON / FRAME_PERIOD) + 1)[:, None] * (
-        path[-1, :2] - path[-2, :2]
-    )
-    return np.concatenate([path[:, :2], path[-1, :2] + onward])
+    """Return positions at each frame of the recording and of its continuation."""
+    count = round(HORIZON / FRAME_PERIOD)
+    last_step = path[-1, :2] - path[-2, :2]
+    steps = np.arange(1, count + 1)[:, None]
+    continuation = path[-1, :2] + steps * last_step
+    return np.concatenate([path[:, :2], continuation])

@@ -1,6 +1,6 @@
 """`describe`: what happens in a scenario, as facts and as two or three sentences.
 
-Each clause of a sentence says one fact, and goes where that is unknown.
+Each clause of a sentence states one fact, and is dropped where the fact is unknown.
 """
 
 from __future__ import annotations
@@ -57,170 +57,198 @@ _SIDES: Final = {
     "left": "on its left side",
     "right": "on its right side",
 }
+_LIGHTS: Final = {True: "with traffic lights", False: "without traffic lights"}
+_RECORD_FACTS: Final = ("town", "road_type", "signalized", "weather", "time_of_day")
 DECELERATION: Final = 6.0
-"""m/s² of the braking that a story tells of: the middle one of `BRAKINGS`."""
+"""m/s² of the braking in a story: the middle one of `BRAKINGS`."""
 _EGO: Final = "ego_vehicle"
-# Agent → the column of the scenario table that tells its way.
-_TURNS: Final = {_EGO: "ego_direction", "other_vehicle": "other_direction"}
+# Agent → the column of the scenario table with its direction.
+_DIRECTION_COLUMNS: Final = {_EGO: "ego_direction", "other_vehicle": "other_direction"}
 
 
 def story_text(facts: Mapping[str, Any]) -> str:
-    """The sentences that facts (`safety.scenario_facts`) come to; None among them leaves its clause out."""
+    """Return the sentences for facts (`safety.scenario_facts`); a fact of None drops its clause."""
     accident = facts["accident"]
-    if accident is not None:
-        avoidance = None if accident["apart"] else _avoidance(accident)
-        sentences = [_collision(facts, accident), _seen_text(accident), avoidance]
-    else:
+    if accident is None:
         sentences = [_no_accident(facts), _nearest_text(facts["nearest"])]
-    return " ".join(f"{each[0].upper()}{each[1:]}." for each in sentences if each)
+    else:
+        sentences = [_collision(facts, accident), _seen_text(accident)]
+        if not accident["apart"]:
+            sentences.append(_avoidance(accident))
+    known_sentences = [sentence for sentence in sentences if sentence]
+    return " ".join(f"{sentence[0].upper()}{sentence[1:]}." for sentence in known_sentences)
 
 
 def actor_words(actor: Mapping[str, Any]) -> str:
-    """What an actor is called: an agent by its role, any other road user by its class."""
-    kind = f"a {actor['category']}" if actor["category"] else "a road user"
+    """Return an actor's name: an agent's role, or the class of any other road user."""
+    if actor["category"]:
+        kind = f"a {actor['category']}"
+    else:
+        kind = "a road user"
     return _AGENTS.get(actor["agent"] or "", kind)
 
 
 def _collision(facts: Mapping[str, Any], accident: Mapping[str, Any]) -> str:
-    """Where it is, and who hits whom on which side, how fast, or that the two are apart; and when outlines touch."""
+    """Return the sentence on the place of a collision, its actors, sides, speeds and first contact.
+
+    If the two actors are apart at the end, the sentence states the distance.
+    """
     first, second = accident["pair"]
     if first["side"] == "front" and second["side"] != "front":
         first, second = second, first  # the first is hit, by the front of the second
-    mine, others = first["side"], second["side"]
+    side, other_side = first["side"], second["side"]
     actors = [_with_motion(first, closes=True), _with_motion(second)]
     details = [_number(accident["closing_speed"], "closing at {:.1f} m/s"), _delta_v(first, second)]
     if accident["touching"] != 0 and accident["gap"] is not None:
         details.append(contact_words(accident["touching"], accident["gap"]))
     if accident["apart"]:
-        sentence = f"meta lets {actors[0]} collide with {actors[1]}, but they are {accident['gap']:.1f} m apart at the end"
-        details = details[2:] if accident["touching"] else []
-    elif mine == others == "front":
-        sentence = f"{actors[0]} collides head-on with {actors[1]}"
-    elif others == "front":
-        sentence = " ".join(
-            part for part in (actors[0], "is hit", _SIDES.get(mine), "by", actors[1]) if part
+        sentence = (
+            f"meta lets {actors[0]} collide with {actors[1]}, "
+            f"but they are {accident['gap']:.1f} m apart at the end"
         )
+        if accident["touching"]:
+            details = details[2:]
+        else:
+            details = []
+    elif side == other_side == "front":
+        sentence = f"{actors[0]} collides head-on with {actors[1]}"
+    elif other_side == "front":
+        sentence = _joined([actors[0], "is hit", _SIDES.get(side), "by", actors[1]])
     else:
         sentence = f"{actors[0]} collides with {actors[1]}"
-        details.insert(0, f"{mine} side to {others} side" if mine and others else None)
-    return ", ".join(part for part in (_place(facts), sentence, *details) if part)
+        if side and other_side:
+            details.insert(0, f"{side} side to {other_side} side")
+    return _joined([_place(facts), sentence, *details], ", ")
 
 
 def _delta_v(first: Mapping[str, Any], second: Mapping[str, Any]) -> str | None:
-    values = [f"{each:.1f}" for each in (first["delta_v"], second["delta_v"]) if each is not None]
-    return (
-        f"with a delta-v of {' and '.join(values)} m/s if masses are as assumed" if values else None
-    )
+    values = [actor["delta_v"] for actor in (first, second)]
+    words = [f"{value:.1f}" for value in values if value is not None]
+    if not words:
+        return None
+    return f"with a delta-v of {' and '.join(words)} m/s if masses are as assumed"
 
 
 def _with_motion(actor: Mapping[str, Any], *, closes: bool = False) -> str:
-    """An actor, what it is, and how it moves."""
+    """Return an actor's name, class and motion; `closes` ends the motion with a comma."""
     words = actor_words(actor)
-    kind = f"a {actor['category']}" if actor["agent"] and actor["category"] else None
-    motion = " ".join(
-        part
-        for part in (_TURN_WORDS.get(actor["turn"] or ""), _number(actor["speed"], "at {:.1f} m/s"))
-        if part
-    )
-    more = " ".join(part for part in (kind, motion) if part)
-    if not more:
+    details = [_TURN_WORDS.get(actor["turn"] or ""), _number(actor["speed"], "at {:.1f} m/s")]
+    if actor["agent"] and actor["category"]:
+        details.insert(0, f"a {actor['category']}")
+    motion = _joined(details)
+    if not motion:
         return words
-    return f"{words}, {more}{',' if closes else ''}"
+    if closes:
+        return f"{words}, {motion},"
+    return f"{words}, {motion}"
 
 
 def _place(facts: Mapping[str, Any]) -> str | None:
-    lights = {True: "with traffic lights", False: "without traffic lights", None: None}[
-        facts["signalized"]
-    ]
-    road = facts["road_type"] or ("junction" if lights else None)
-    town = f"in {facts['town']}" if facts["town"] else None
+    lights = None
+    if facts["signalized"] is not None:
+        lights = _LIGHTS[facts["signalized"]]
+    words: list[str | None] = []
+    if facts["road_type"]:
+        words.append(f"at a {facts['road_type']}")
+    elif lights:
+        words.append("at a junction")
+    words.append(lights)
+    if facts["town"]:
+        words.append(f"in {facts['town']}")
     sky = _listed([facts["weather"], facts["time_of_day"]])
-    words = [f"at a {road}" if road else None, lights, town, f"({sky})" if sky else None]
-    return " ".join(word for word in words if word) or None
+    if sky:
+        words.append(f"({sky})")
+    return _listed(words, " ")
 
 
 def _seen_text(accident: Mapping[str, Any]) -> str | None:
-    """Who saw both first, and what the ego saw alone; `seen` is agent → seconds before the impact, 0 for never."""
+    """Return which agent saw both actors first, and what the ego saw by itself.
+
+    `seen` maps an agent to seconds before the impact, 0 for never.
+    """
     seen: Mapping[str, float | None] = accident["seen"]
     leads = {agent: lead for agent, lead in seen.items() if lead is not None}
     if not leads:
         return None
-    best = max(leads, key=lambda agent: (leads[agent], agent == "ego_vehicle"))
+    best = max(leads, key=lambda agent: (leads[agent], agent == _EGO))
     if not leads[best]:
         return "no agent alone saw both at one moment"
     text = f"{_AGENTS[best]} saw both {leads[best]:.1f} s before"
-    ego = leads.get("ego_vehicle")
-    if ego is None or best == "ego_vehicle":
+    ego_lead = leads.get(_EGO)
+    if ego_lead is None or best == _EGO:
         return text
-    return f"{text}; the ego alone {f'{ego:.1f} s before' if ego else 'never did'}"
+    if ego_lead:
+        return f"{text}; the ego alone {ego_lead:.1f} s before"
+    return f"{text}; the ego alone never did"
 
 
 def _avoidance(accident: Mapping[str, Any]) -> str | None:
     braking = accident["braking"]
     if braking is None or None in (braking["by"], braking["deceleration"], braking["avoidable"]):
         return None
-    who = _listed([_AGENTS.get(agent, "the other road user") for agent in braking["by"]], " and ")
-    how = f"braking at {braking['deceleration']:g} m/s² by {who}"
+    brakers = [_AGENTS.get(agent, "the other road user") for agent in braking["by"]]
+    action = f"braking at {braking['deceleration']:g} m/s² by {_listed(brakers, ' and ')}"
     if not braking["avoidable"]:
-        return f"{how} would not have avoided it at any time"
-    return (
-        None
-        if braking["slack"] is None
-        else f"{how} until {braking['slack']:.1f} s before would have avoided it"
-    )
+        return f"{action} would not have avoided it at any time"
+    if braking["slack"] is None:
+        return None
+    return f"{action} until {braking['slack']:.1f} s before would have avoided it"
 
 
 def _no_accident(facts: Mapping[str, Any]) -> str:
-    overlap = (facts["nearest"] or {}).get("min_gap") == 0
-    what, more = {
-        None: ("it is not known whether anybody collides", ""),
-        False: ("meta names no collision" if overlap else "nobody collides", ""),
-        True: (
-            f"{_partners_text(facts.get('partners')) or 'two'} collide",
-            ", but the labels do not show how",
-        ),
-    }[facts["collision"]]
-    return (
-        " ".join(
-            part
-            for part in (_place(facts), what, _number(facts["duration"], "in {:.1f} s"))
-            if part
-        )
-        + more
-    )
+    ending = ""
+    if facts["collision"] is None:
+        statement = "it is not known whether anybody collides"
+    elif facts["collision"]:
+        partners = _partners_text(facts.get("partners")) or "two"
+        statement = f"{partners} collide"
+        ending = ", but the labels do not show how"
+    elif (facts["nearest"] or {}).get("min_gap") == 0:
+        statement = "meta names no collision"
+    else:
+        statement = "nobody collides"
+    duration = _number(facts["duration"], "in {:.1f} s")
+    return _joined([_place(facts), statement, duration]) + ending
 
 
 def _partners_text(partners: Iterable[Mapping[str, Any]] | None) -> str | None:
-    """The two that meta names; of one that no label shows, that it is so."""
-    unseen = {True: "", False: " that no label shows"}
-    return _listed(
-        [actor_words(each) + unseen[each["labelled"]] for each in partners or ()], " and "
-    )
+    """Return the two actors that meta names, each with a remark if no label shows it."""
+    words = []
+    for partner in partners or ():
+        name = actor_words(partner)
+        if not partner["labelled"]:
+            name += " that no label shows"
+        words.append(name)
+    return _listed(words, " and ")
 
 
 def _nearest_text(nearest: Mapping[str, Any] | None) -> str | None:
-    """The most critical pair."""
+    """Return the sentence on the most critical pair."""
     if nearest is None:
         return None
-    who = " and ".join(actor_words(each) for each in nearest["pair"])
+    actors = " and ".join(actor_words(actor) for actor in nearest["pair"])
     if nearest["min_gap"] == 0:
-        return f"the outlines of {who} overlap"
-    details = _listed(
-        [
-            _number(nearest["min_ttc"], "a least time to collision of {:.1f} s"),
-            _number(nearest["min_gap"], "a least gap of {:.1f} m"),
-        ],
-        " and ",
-    )
-    return f"{who} come nearest to a collision, with {details}" if details else None
+        return f"the outlines of {actors} overlap"
+    time = _number(nearest["min_ttc"], "a least time to collision of {:.1f} s")
+    gap = _number(nearest["min_gap"], "a least gap of {:.1f} m")
+    details = _listed([time, gap], " and ")
+    if details is None:
+        return None
+    return f"{actors} come nearest to a collision, with {details}"
 
 
 def _number(value: float | None, form: str) -> str | None:
-    return None if value is None else form.format(value)
+    if value is None:
+        return None
+    return form.format(value)
 
 
-def _listed(parts: Iterable[str | None], by: str = ", ") -> str | None:
-    return by.join(part for part in parts if part) or None
+def _joined(parts: Iterable[str | None], separator: str = " ") -> str:
+    return separator.join(part for part in parts if part)
+
+
+def _listed(parts: Iterable[str | None], separator: str = ", ") -> str | None:
+    return _joined(parts, separator) or None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,34 +256,34 @@ class Story(ShortRepr):
     """A scenario in words.
 
     Attributes:
-        facts: as JSON holds them (docs/safety.md lists them); None for what is not known.
-        text: English sentences of which each clause tells one of the facts.
+        facts: Facts as JSON holds them (docs/safety.md lists them); None for unknown values.
+        text: English sentences; each clause states one of the facts.
     """
 
     facts: Mapping[str, Any]
     text: str
 
     def __str__(self) -> str:
-        """The text."""
+        """Return the text."""
         return self.text
 
     def to_json(self) -> str:
-        """Facts and text as one JSON object."""
+        """Return facts and text as one JSON object."""
         return json.dumps({**self.facts, "text": self.text}, indent=2, allow_nan=False)
 
 
 def describe(dataset: Dataset, scenario: RowArgument) -> Story:
-    """Tell a scenario: who collides, how fast, who saw it before, and what would have avoided it.
+    """Describe a scenario: the collision, its speeds, earlier observers, and what would avoid it.
 
-    All of it is computed from labels and meta. What these do not tell is missing in the text and None in the facts,
-    and `facts["unknown"]` says why.
+    Everything is computed from labels and meta. What these do not contain is missing in the text
+    and None in the facts, and `facts["unknown"]` states why.
 
     Args:
-        dataset: the release.
-        scenario: token or record.
+        dataset: The release.
+        scenario: Token or record.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: No such scenario.
 
     Examples:
         >>> print(da.describe(da.find(collision=True)[0]).text)  # doctest: +SKIP
@@ -267,52 +295,57 @@ def describe(dataset: Dataset, scenario: RowArgument) -> Story:
 def stories(
     dataset: Dataset,
     scenarios: Iterable[RowArgument] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> tuple[Story, ...]:
-    """The stories of scenarios, in the order of the release.
+    """Return the stories of scenarios, in the order of the release.
 
     Args:
-        dataset: the release.
-        scenarios: tokens or records; None for all.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        scenarios: Tokens or records; None for all.
+        **engine: Options `workers`, `executor` and `progress` of `parallel.Engine`.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: No such scenario.
     """
-    return those_of(
-        Story, each_scenario(describe, dataset, scenarios, label="stories", at_once=1, **how)
-    )
+    results = each_scenario(describe, dataset, scenarios, label="stories", at_once=1, **engine)
+    return those_of(Story, results)
 
 
 def scenario_facts(
     dataset: Dataset, scenario: RowArgument, replayed: Avoidability | Skipped | None = None
 ) -> dict[str, Any]:
-    """The facts of `describe`; errors as there.
+    """Return the facts of `describe`; errors are the same.
 
     Args:
-        dataset: the release.
-        scenario: token or record.
-        replayed: what `avoidability` gives for it, or why that gives nothing, where it is known; None to compute it.
+        dataset: The release.
+        scenario: Token or record.
+        replayed: Result of `avoidability` for it, or the reason why there is none, if known; None
+            to compute it.
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     unknown: list[str] = []
-    collides = None if record["weather"] is None else record["collision"] is not None
+    collides = None
+    if record["weather"] is not None:
+        collides = record["collision"] is not None
     if collides is None:
         unknown.append(
             f"{record['token']} has no meta file, which says whether two collide; unpack meta"
         )
-    accident = _accident(dataset, record, unknown, replayed) if collides else None
+    accident, partners, nearest = None, None, None
+    if collides:
+        accident = _accident(dataset, record, unknown, replayed)
+    if accident is None:
+        partners = _partners(dataset, record)
+    if not collides:
+        nearest = _nearest(dataset, record, unknown)
     return {
         "scenario": record["token"],
-        **{
-            name: record[name]
-            for name in ("town", "road_type", "signalized", "weather", "time_of_day")
-        },
+        **{name: record[name] for name in _RECORD_FACTS},
         "duration": round((record["num_frames"] - 1) * FRAME_PERIOD, 1),
         "collision": collides,
         "accident": accident,
-        "partners": _partners(dataset, record) if accident is None else None,
-        "nearest": None if collides else _nearest(dataset, record, unknown),
+        "partners": partners,
+        "nearest": nearest,
         "unknown": unknown,
     }
 
@@ -323,7 +356,10 @@ def _accident(
     unknown: list[str],
     replayed: Avoidability | Skipped | None,
 ) -> dict[str, Any] | None:
-    """Who collides, how, who saw it, and what would have avoided it."""
+    """Return the facts on a collision: its actors, observers, and the braking that would avoid it.
+
+    Reasons for missing facts are appended to `unknown`.
+    """
     try:
         accident, contact = accident_of(dataset, record), collision(dataset, record)
     except NotAvailableError as error:
@@ -331,12 +367,18 @@ def _accident(
         return None
     if accident is None or contact is None:  # only for the type checker: meta names a collision
         return None
-    found = tried(avoidability, dataset, record) if replayed is None else replayed
-    braked = None if isinstance(found, Skipped) else found
-    if isinstance(found, Skipped):
-        unknown.append(found.reason)
+    if replayed is None:
+        replayed = tried(avoidability, dataset, record)
+    braked: Avoidability | None = None
+    braking = None
+    if isinstance(replayed, Skipped):
+        unknown.append(replayed.reason)
+    else:
+        braked = replayed
+    if braked is not None:
+        braking = _braking(accident, braked)
     return {
-        "pair": [_collider(record, accident, contact, braked, which) for which in range(2)],
+        "pair": [_collider(record, accident, contact, braked, member) for member in range(2)],
         "time": round((accident.last_frame - 1) * FRAME_PERIOD, 1),
         "gap": round(contact.gap, 2),
         "touching": contact.touching,
@@ -344,25 +386,27 @@ def _accident(
         "closing_speed": known(contact.closing_speed, 2),
         "impact_angle": round(math.degrees(contact.impact_angle)),
         "seen": _seen(dataset, accident),
-        "braking": None if braked is None else _braking(accident, braked),
+        "braking": braking,
     }
 
 
 def _partners(dataset: Dataset, record: ScenarioRecord) -> list[dict[str, Any]] | None:
-    """Whom meta names as the pair, and whether labels show them."""
-    told, labelled = record["collision"], scenario_tracks(dataset, record).actor_id
-    if told is None or told["ids"][0] == told["ids"][1]:
+    """Return the pair that meta names, and whether labels show its actors."""
+    named, labelled = record["collision"], scenario_tracks(dataset, record).actor_id
+    if named is None or named["ids"][0] == named["ids"][1]:
         return None
     agents = agents_by_actor(dataset, record["token"])
-    return [
-        {
-            "actor_id": actor,
-            "category": word if word in CATEGORIES else None,
-            "agent": agents.get(actor),
-            "labelled": bool(np.isin(actor, labelled)),
-        }
-        for actor, word in zip(told["ids"], told["classes"], strict=True)
-    ]
+    partners = []
+    for actor, word in zip(named["ids"], named["classes"], strict=True):
+        partners.append(
+            {
+                "actor_id": actor,
+                "category": word if word in CATEGORIES else None,
+                "agent": agents.get(actor),
+                "labelled": bool(np.isin(actor, labelled)),
+            }
+        )
+    return partners
 
 
 def _collider(
@@ -370,40 +414,53 @@ def _collider(
     accident: Accident,
     contact: Contact,
     braked: Avoidability | None,
-    which: int,
+    member: int,
 ) -> dict[str, Any]:
-    agent = accident.agents[which]
-    turn = _TURNS.get(agent or "")
+    agent = accident.agents[member]
+    column = _DIRECTION_COLUMNS.get(agent or "")
+    delta_v = None
+    if braked is not None:
+        delta_v = known(braked.check.delta_v[member], 2)
     return {
-        "actor_id": accident.actor_ids[which],
-        "category": accident.categories[which],
+        "actor_id": accident.actor_ids[member],
+        "category": accident.categories[member],
         "agent": agent,
-        "turn": record[turn] if turn else None,  # type: ignore[literal-required]
-        "speed": known(contact.speeds[which], 2),
-        "side": contact.sides[which],
-        "delta_v": None if braked is None else known(braked.check.delta_v[which], 2),
+        "turn": record[column] if column else None,  # type: ignore[literal-required]
+        "speed": known(contact.speeds[member], 2),
+        "side": contact.sides[member],
+        "delta_v": delta_v,
     }
 
 
 def _seen(dataset: Dataset, accident: Accident) -> dict[str, float]:
-    """Agent → seconds before the impact at which it alone first observes both; 0 if it never does."""
-    there, observed = observed_actors(dataset, accident.scenario, accident.actor_ids)
-    return {
-        agent: round((both.size - 1 - int(np.argmax(both))) * FRAME_PERIOD, 1)
-        if both.any()
-        else 0.0
-        for agent, both in zip(there, observed[:, 0] & observed[:, 1], strict=True)
-    }
+    """Return agent → seconds before the impact at which it first observes both by itself.
+
+    The value is 0 if it never does.
+    """
+    agents, observed = observed_actors(dataset, accident.scenario, accident.actor_ids)
+    leads: dict[str, float] = {}
+    for agent, both in zip(agents, observed[:, 0] & observed[:, 1], strict=True):
+        leads[agent] = 0.0
+        if both.any():
+            leads[agent] = round((both.size - 1 - int(np.argmax(both))) * FRAME_PERIOD, 1)
+    return leads
 
 
 def _braking(accident: Accident, braked: Avoidability) -> dict[str, Any]:
-    """Of the ego alone if it is one of the two, of both else: until when it would have avoided the accident."""
-    by = [accident.agents.index(_EGO)] if _EGO in accident.agents else [0, 1]
-    row = BRAKERS.index("both") if len(by) == 2 else by[0]
+    """Return until when braking would have avoided the accident.
+
+    The ego brakes if it is one of the pair; otherwise both brake.
+    """
+    if _EGO in accident.agents:
+        row = accident.agents.index(_EGO)
+        brakers = [row]
+    else:
+        row = BRAKERS.index("both")
+        brakers = [0, 1]
     column = int(np.argmin(np.abs(braked.decelerations - DECELERATION)))
     slack = braked.slack[row, column]
     return {
-        "by": [accident.agents[which] for which in by],
+        "by": [accident.agents[member] for member in brakers],
         "deceleration": float(braked.decelerations[column]),
         "avoidable": bool(np.isfinite(slack)),
         "slack": known(slack, 2),
@@ -411,22 +468,21 @@ def _braking(accident: Accident, braked: Avoidability) -> dict[str, Any]:
 
 
 def _nearest(dataset: Dataset, record: ScenarioRecord, unknown: list[str]) -> dict[str, Any] | None:
-    """The pair with the least time to collision: of those of which one moves into the other, or of moving ones."""
+    """Return the pair with the least time to collision, among overlapping pairs or moving ones."""
+    token = record["token"]
     pairs = interactions(dataset, record).pairs
-    overlap = pairs.min_gap == 0
-    rows = np.flatnonzero(overlap if overlap.any() else pairs.moving & np.isfinite(pairs.min_ttc))
+    candidates = pairs.min_gap == 0
+    if not candidates.any():
+        candidates = pairs.moving & np.isfinite(pairs.min_ttc)
+    rows = np.flatnonzero(candidates)
     if not len(rows):
-        if not any(
-            dataset.get_sample(record["token"], agent, 1)["labelled"]
-            for agent in agents_of(dataset, record)
-        ):
-            unknown.append(f"{record['token']} has no labels, which say where actors are")
+        samples = (dataset.get_sample(token, agent, 1) for agent in agents_of(dataset, record))
+        if not any(sample["labelled"] for sample in samples):
+            unknown.append(f"{token} has no labels, which say where actors are")
         return None
     row = rows[np.argmin(pairs.min_ttc[rows])]
     return {
-        "pair": [
-            _actor(dataset, record["token"], actor) for actor in pairs.actor_ids[row].tolist()
-        ],
+        "pair": [_actor(dataset, token, actor) for actor in pairs.actor_ids[row].tolist()],
         "min_ttc": known(pairs.min_ttc[row], 2),
         "min_gap": known(pairs.min_gap[row], 2),
     }

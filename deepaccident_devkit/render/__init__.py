@@ -1,4 +1,7 @@
-"""All pictures. A function for one panel takes `ax=` and returns the Axes; nothing here opens a window."""
+"""All pictures.
+
+The function of a panel takes `ax=` and returns the Axes; nothing here opens a window.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -60,7 +63,7 @@ __all__ = [
     "style",
 ]
 
-if not TYPE_CHECKING:  # the types stay those of the functions themselves
+if not TYPE_CHECKING:  # type checkers see the functions themselves
     for _name in __all__:
         if _name.startswith("render_") and _name in globals():
             globals()[_name] = with_keywords_named(globals()[_name], __name__)

@@ -28,13 +28,14 @@ from deepaccident_devkit.render.camera import (
     crop_about,
     draw_camera,
 )
-from deepaccident_devkit.render.captions import is_there, set_scene_title
+from deepaccident_devkit.render.captions import has_sensor_file, set_scene_title
 from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.figures import (
     Layer,
     figure_or_new,
     layers_of,
     settled,
+    show_square,
     with_light_grid,
 )
 from deepaccident_devkit.render.ground import draw_underlay
@@ -61,42 +62,41 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAIR_LAYERS: Final[tuple[Layer, ...]] = (*CAMERA_LAYERS, "bev", "trajectories", "grid")
-# Frames for which the last camera that saw the pair is kept.
-_REMEMBERED: Final = 10
-# Metres around the place of contact that are shown, at least and at most.
-_LEAST, _MOST = 9.0, 24.0
+_DEFAULT_LAYERS: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
+# Frames for which the last camera that saw the pair stays selected.
+_CAMERA_MEMORY_FRAMES: Final = 10
+# Metres shown around the point of contact.
+_MIN_VIEW_RANGE_M, _MAX_VIEW_RANGE_M = 9.0, 24.0
 # Metres around the pair.
-_MARGIN: Final = 2.5
+_PAIR_MARGIN_M: Final = 2.5
 # Seconds of the paths that led to the contact.
-_PAST: Final = 3.0
-# Share of an image's width that is shown at least: who looks must still see where it is.
-_LEAST_CROP: Final = 0.4
-# Points: the size of the cross at the place of contact.
-_CROSS: Final = 9.0
-# Share of a panel's width and height that the places of tags keep to its edges.
-_EDGE: Final = 0.01
-# Points, about, at the top of an image in which tags may cover a car: it may fill the image.
-_FREE: Final = 22.0
-_HIDDEN: Final = (0, (3, 2))
+_PAST_S: Final = 3.0
+# Least share of an image's width: the viewer must still recognise the surroundings.
+_MIN_CROP_SHARE: Final = 0.4
+# Points: size of the cross at the point of contact.
+_CROSS_SIZE_PT: Final = 9.0
+# Share of a panel's width and height between the positions of tags and its edges.
+_EDGE_SHARE: Final = 0.01
+# Points at the top of an image, about, in which tags may cover a car: it may fill the image.
+_TAG_HEIGHT_PT: Final = 22.0
+_HIDDEN_LINE_STYLE: Final = (0, (3, 2))
 # Seconds before the impact.
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
-_IN_A_COLUMN: Final = (1.0, 0.0)
-_SHOWN: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
-# Width of a panel in inches.
-_WIDTH: Final = 3.3
+_COLUMN_COUNTDOWN: Final = (1.0, 0.0)
+_PANEL_WIDTH_IN: Final = 3.3
 # Inches of a camera's panel below which agents are left out.
-_LEAST_WIDTH: Final = 1.6
-# Letters that a line above a panel of a small picture has room for.
-_SHORT: Final = 16
+_MIN_PANEL_WIDTH_IN: Final = 1.6
+# Letters of a line that fits above a panel of a small picture.
+_MAX_TITLE_LETTERS: Final = 16
 # Inches of words above a row, for letters of one point.
-_ROW_WORDS: Final = 0.03
-# Of a small picture that panels should cover, by the estimate of `_width`.
-_ENOUGH: Final = 0.6
+_ROW_WORDS_HEIGHT_IN: Final = 0.03
+# Share of a small picture that panels should cover, by the estimate of `_panel_width`.
+_MIN_COVERED_SHARE: Final = 0.6
 # Inches of the height that titles take, about.
-_TITLE: Final = 1.0
+_TITLE_HEIGHT_IN: Final = 1.0
 # The panels of a video's picture.
 _MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
-_DASHES: Final = ("-", "--")
+_LINE_STYLES: Final = ("-", "--")
 
 
 @in_own_settings
@@ -109,72 +109,83 @@ def render_accident(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render the countdown to an accident: a column for each moment, a row for each agent, and one from above.
+    """Render the countdown to an accident, in the agents' cameras and from above.
 
-    In a wide figure rows are columns. Each agent has a part of the image that shows the colliding pair best, of those
-    that were downloaded; if none was, a grey panel. If no camera shows the pair, it is the last one that did, or the
-    front one. The pair's boxes are dashed where the agent's label says that no camera sees them. The view from above
-    has the place of contact (a cross), the pair's speeds, and the pair's paths up to the contact; its scale is that of
-    its bar. `E` is the ego vehicle, `O` the other one.
+    There is a column for each moment, a row for each agent, and one from above; in a wide figure
+    rows are columns. Each agent has the part of an image that shows the colliding pair best, of its
+    downloaded images; without any, a grey panel. If no camera shows the pair, it is the last one
+    that did, or the front one. The pair's boxes are dashed where the agent's label states that no
+    camera sees them. The view from above has the point of contact (a cross), the pair's speeds, and
+    the pair's paths up to the contact; its bar shows the scale. `E` is the ego vehicle, `O` the
+    other one.
 
     Args:
-        dataset: the release.
-        scenario: token or record of one with a collision.
-        seconds: before the recording's last frame, which the impact is near; moments before the first are left out.
-            None is for `COUNTDOWN`, or in a paper's column for one second before the impact and the impact.
-        agents: whose images are shown; an empty list for none. None is for all that are there or, where their images
-            would be narrower than 1.6 inches, as on a slide, for the ego and those that see the pair best; the title
-            says so.
+        dataset: The release.
+        scenario: Token or record of a scenario with a collision.
+        seconds: Seconds before the recording's last frame, which the impact is near; moments before
+            the first frame are left out. None stands for `COUNTDOWN`, or in a paper's column for
+            one second before the impact and the impact.
+        agents: Agents with images in the figure; an empty list for none. None stands for all
+            present agents or, where their images would be narrower than 1.6 inches, as on a slide,
+            for the ego and the agents that see the pair best; the title then states their number.
         layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
-            `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image file is read.
-        fig: an empty figure to render on; a new one if None.
+            `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image
+            file is read.
+        fig: Empty figure to render on; a new one if None.
 
     Returns:
-        The figure; its title says who hits whom, how fast and at which angle, and whether the recording ends before
-        the pair are near enough to touch.
+        The figure; its title states which actor hits which, how fast and at which angle, and
+        whether the recording ends before the pair are near enough to touch.
 
     Raises:
-        TokenError: no such scenario.
-        NotAvailableError: nobody collides in it (the nearest approach of a normal scenario is no accident), it has no
-            meta, or an agent is not in this release.
-        ChoiceError: no such agent, configuration or layer, or none of the moments was recorded.
+        TokenError: No such scenario.
+        NotAvailableError: Nobody collides in it (the nearest approach of a normal scenario is no
+            accident), it has no meta, or an agent is not in this release.
+        ChoiceError: No such agent, configuration or layer, or none of the moments was recorded.
     """
-    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
+    shown_layers = layers_of(layers, _DEFAULT_LAYERS, PAIR_LAYERS)
     contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
     record = dataset.get("scenario", scenario)
-    cut = _cut_words(contact, record["num_frames"])
-    usual = _IN_A_COLUMN if current_style().room == "column" else COUNTDOWN
-    moments = _moments(seconds or usual, record["num_frames"])
-    first = sample_token(record["token"], agents_of(dataset, scenario)[0], record["num_frames"])
-    names = in_drawing_order([] if agents == [] else cooperating_agents(dataset, first, agents))
-    fig = figure_or_new(
-        fig, (_WIDTH * len(moments) + 0.8, 1.95 * len(names) + _WIDTH + 1.1), column=1.45
-    )
-    pair, best = CollidingPair.of(dataset, contact), ""
-    room = _agents_with_room(fig, len(names), len(moments)) if agents is None else len(names)
-    if room < len(names):
-        best = f"{room} of {len(names)} agents"
-        names = _best_agents(pair, names, [index for _, index in moments], room)
-    axes, across = _panels(fig, len(names), len(moments))
-    for column, (left, index) in enumerate(moments):
+    frames = record["num_frames"]
+    cut_words = _cut_words(contact, frames)
+    default_seconds: Sequence[float] = COUNTDOWN
+    if current_style().room == "column":
+        default_seconds = _COLUMN_COUNTDOWN
+    moments = _moments(seconds or default_seconds, frames)
+    names = _agent_names(dataset, record, agents)
+    size = (_PANEL_WIDTH_IN * len(moments) + 0.8, 1.95 * len(names) + _PANEL_WIDTH_IN + 1.1)
+    fig = figure_or_new(fig, size, column=1.45)
+    pair, selection_words = CollidingPair.of(dataset, contact), ""
+    if agents is None:
+        count = _fitting_agents(fig, len(names), len(moments))
+        if count < len(names):
+            selection_words = f"{count} of {len(names)} agents"
+            names = _best_agents(pair, names, [frame for _, frame in moments], count)
+    axes, is_wide = _panels(fig, len(names), len(moments))
+    last_word = "the last frame" if cut_words or contact.touching else "the impact"
+    for column, (time_left, frame) in enumerate(moments):
         for agent, ax in zip(names, axes[:, column], strict=False):
-            _write_name(draw_pair_in_camera(pair, agent, index, shown, ax), ax)
-        draw_pair_from_above(pair, index, shown, axes[-1, column])
-        end = "the last frame" if cut or contact.touching else "the impact"
-        _write_head(
-            end if left == 0 else f"{left:g} s before", "black", axes[0, column], above=not across
-        )
+            words = draw_pair_in_camera(pair, agent, frame, shown_layers, ax)
+            _write_name(words, ax)
+        draw_pair_from_above(pair, frame, shown_layers, axes[-1, column])
+        head = last_word if time_left == 0 else f"{time_left:g} s before"
+        _write_head(head, "black", axes[0, column], above=not is_wide)
     for agent, ax in zip(names, axes[:, 0], strict=False):
-        _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=across)
-    _write_head(
-        "from above,\nspeeds in m/s" if current_style().few else "from above",
-        "black",
-        axes[-1, 0],
-        above=across,
-    )
-    words = "\n".join(filter(None, [accident_words(dataset, contact), cut]))
-    set_scene_title(fig, dataset, record["token"], best, below=words)
+        _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=is_wide)
+    head = "from above,\nspeeds in m/s" if current_style().few else "from above"
+    _write_head(head, "black", axes[-1, 0], above=is_wide)
+    lines = [accident_words(dataset, contact), cut_words]
+    words = "\n".join(line for line in lines if line)
+    set_scene_title(fig, dataset, record["token"], selection_words, below=words)
     return settled(fig)
+
+
+def _agent_names(dataset: Dataset, record: Any, agents: Agents) -> list[str]:
+    if agents == []:
+        return []
+    recorder = agents_of(dataset, record)[0]
+    sample = sample_token(record["token"], recorder, record["num_frames"])
+    return in_drawing_order(cooperating_agents(dataset, sample, agents))
 
 
 def draw_countdown(
@@ -185,60 +196,84 @@ def draw_countdown(
     layers: Collection[Layer] | None,
     fig: Figure,
 ) -> None:
-    """Render a moment of an accident on an empty figure of about 16 to 9: five cameras, the contact, the pair's speeds.
+    """Render a moment of an accident: five cameras, the contact from above, the pair's speeds.
 
-    Cameras are chosen and layers named as in `render_accident`. Raises NotAvailableError if nobody collides.
+    The figure is an empty one of about 16 to 9. Cameras are selected and layers named as in
+    `render_accident`.
+
+    Raises:
+        NotAvailableError: Nobody collides.
     """
-    shown = layers_of(layers, _SHOWN, PAIR_LAYERS)
+    shown_layers = layers_of(layers, _DEFAULT_LAYERS, PAIR_LAYERS)
     record = dataset.get("frame", frame)
     index = record["index"]
     contact = _contact(dataset, record["scenario_token"], "the view 'frame'")
     pair = CollidingPair.of(dataset, contact)
     axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 0.8))
     for agent in AGENTS:
+        ax = axes[agent]
         if agent not in agents:
-            axes[agent].set_axis_off()
+            ax.set_axis_off()
             continue
-        words = draw_pair_in_camera(pair, agent, index, shown, axes[agent]).replace("\n", " ")
-        axes[agent].set_title(
-            f"{short_name(agent)}: {words}", fontsize="medium", color=AGENT_COLORS[agent]
-        )
-    draw_pair_from_above(pair, index, shown, axes["above"])
-    axes["above"].set_title(f"from above, {axes['above'].get_title()}", fontsize="medium")
+        words = draw_pair_in_camera(pair, agent, index, shown_layers, ax).replace("\n", " ")
+        title = f"{short_name(agent)}: {words}"
+        ax.set_title(title, fontsize="medium", color=AGENT_COLORS[agent])
+    above_ax = axes["above"]
+    draw_pair_from_above(pair, index, shown_layers, above_ax)
+    above_ax.set_title(f"from above, {above_ax.get_title()}", fontsize="medium")
     _draw_speeds(pair, index, axes["speeds"])
-    set_scene_title(
-        fig, dataset, frame, below=accident_words(dataset, contact).replace("\n", "; "), fontsize=12
-    )
+    words = accident_words(dataset, contact).replace("\n", "; ")
+    set_scene_title(fig, dataset, frame, below=words, fontsize=12)
 
 
 def accident_words(dataset: Dataset, contact: Contact) -> str:
-    """Two lines: who hits whom, with which sides, how fast and at which angle; and when, if not at the last frame."""
+    """Return two lines on a contact: its actors and sides, and its speeds and angle.
+
+    The time follows if the contact is not at the last frame.
+    """
     scenario = contact.frame.rsplit("/", 1)[0]
-    owners = {
-        dataset.agent.get(f"{scenario}/{agent}")["actor_id"]: short_name(agent)
-        for agent in agents_of(dataset, scenario)
-    }
+    agent_names = {}
+    for agent in agents_of(dataset, scenario):
+        actor = dataset.agent.get(f"{scenario}/{agent}")["actor_id"]
+        agent_names[actor] = short_name(agent)
     names = []
     for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
-        category = dataset.instance.get(instance)["category"]
-        names.append(
-            f"{owners[actor]} ({category} {actor})" if actor in owners else f"{category} {actor}"
-        )
-    order = (1, 0) if contact.sides[1] == "front" and contact.sides[0] != "front" else (0, 1)
-    hitting, hit = (names[each] for each in order)
-    verb = "and" if contact.apart else "hits" if contact.sides[order[0]] == "front" else "touches"
-    sides = " to ".join(contact.sides[each] for each in order)
-    speeds = " and ".join(number_words(contact.speeds[each]) for each in order)
-    when = "" if contact.touching == 0 else f"\n{contact_words(contact.touching, contact.gap)}"
-    return (
-        f"{hitting} {verb} {hit}, {sides}\n{speeds} m/s, closing at {number_words(contact.closing_speed)} m/s, "
-        f"{np.degrees(contact.impact_angle):.0f}° between their headings{when}"
-    )
+        name = f"{dataset.instance.get(instance)['category']} {actor}"
+        if actor in agent_names:
+            name = f"{agent_names[actor]} ({name})"
+        names.append(name)
+    hitting, hit = 0, 1
+    if contact.sides[1] == "front" and contact.sides[0] != "front":
+        hitting, hit = 1, 0
+    if contact.apart:
+        verb = "and"
+    elif contact.sides[hitting] == "front":
+        verb = "hits"
+    else:
+        verb = "touches"
+    speeds = f"{number_words(contact.speeds[hitting])} and {number_words(contact.speeds[hit])} m/s"
+    closing_speed = f"closing at {number_words(contact.closing_speed)} m/s"
+    angle = f"{np.degrees(contact.impact_angle):.0f}° between their headings"
+    lines = [
+        f"{names[hitting]} {verb} {names[hit]}, {contact.sides[hitting]} to {contact.sides[hit]}",
+        f"{speeds}, {closing_speed}, {angle}",
+    ]
+    if contact.touching != 0:
+        lines.append(contact_words(contact.touching, contact.gap))
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CollidingPair:
-    """Two actors that collide in a scenario (a token), where all actors are, and the short names of the two by id."""
+    """Two actors that collide in a scenario.
+
+    Attributes:
+        dataset: The release.
+        scenario: Token.
+        contact: How they collide.
+        tracks: Boxes of all actors of the scenario.
+        tags: Actor id → short name of the two.
+    """
 
     dataset: Dataset
     scenario: str
@@ -248,7 +283,7 @@ class CollidingPair:
 
     @classmethod
     def of(cls, dataset: Dataset, contact: Contact) -> CollidingPair:
-        """The pair of a contact."""
+        """Return the pair of a contact."""
         scenario = contact.frame.rsplit("/", 1)[0]
         tracks = scenario_tracks(dataset, scenario)
         return cls(
@@ -260,282 +295,342 @@ class CollidingPair:
         )
 
     def at(self, index: int, seen_by: str | None = None) -> Boxes:
-        """Their boxes in world in a frame (number from 1), as far as they exist; without the agent that sees them."""
-        there = self.tracks.at(index)
-        own = (
-            None
-            if seen_by is None
-            else self.dataset.agent.get(f"{self.scenario}/{seen_by}")["actor_id"]
-        )
-        return there.select(
-            np.isin(there.actor_id, [actor for actor in self.contact.actor_ids if actor != own])
-        )
+        """Return the pair's existing boxes in world in a frame (number from 1).
+
+        The agent that sees them is left out.
+        """
+        boxes = self.tracks.at(index)
+        own_actor = None
+        if seen_by is not None:
+            own_actor = self.dataset.agent.get(f"{self.scenario}/{seen_by}")["actor_id"]
+        actors = [actor for actor in self.contact.actor_ids if actor != own_actor]
+        return boxes.select(np.isin(boxes.actor_id, actors))
 
     def view(self, agent: str, index: int) -> tuple[str, BestView | None, int | None]:
-        """The camera of an agent that shows the pair best in a frame, its view, and when it last had the pair.
+        """Return the camera of an agent that shows the pair best in a frame, and its view.
 
-        Cameras whose images are there come first. If none has the pair in its image, it is the last one that had, and
-        without such a one the front camera; then there is no view.
+        The third value is the last frame in which it had the pair. Cameras with present images come
+        first. If none has the pair in its image, it is the last one that had, and otherwise the
+        front camera; then there is no view.
         """
         sample = sample_token(self.scenario, agent, index)
-        there = [
-            channel for channel in CAMERAS if is_there(self.dataset, f"{sample}/{channel}")
-        ] or CAMERAS
-        for earlier in range(index, max(0, index - _REMEMBERED), -1):
-            then = sample_token(self.scenario, agent, earlier)
-            view = best_view(self.dataset, [then], self.at(earlier, agent), there)
+        cameras: Sequence[str] = [
+            channel for channel in CAMERAS if has_sensor_file(self.dataset, f"{sample}/{channel}")
+        ]
+        cameras = cameras or CAMERAS
+        for frame in range(index, max(0, index - _CAMERA_MEMORY_FRAMES), -1):
+            frame_sample = sample_token(self.scenario, agent, frame)
+            view = best_view(self.dataset, [frame_sample], self.at(frame, agent), cameras)
             if view is not None:
-                return view.camera.rsplit("/", 1)[1], view if earlier == index else None, earlier
-        return there[0], None, None
+                channel = view.camera.rsplit("/", 1)[1]
+                return channel, view if frame == index else None, frame
+        return cameras[0], None, None
 
 
 def draw_pair_in_camera(
     pair: CollidingPair, agent: str, index: int, layers: Collection[Layer], ax: Axes
 ) -> str:
-    """Render the part of an agent's image that has the pair, with tags; dashed if no camera of the agent sees them.
+    """Render the part of an agent's image with the pair, and tags, in a frame (number from 1).
 
-    The frame is a number from 1. Returns the camera's short name, and how long ago it saw the pair if it does not now.
+    Boxes are dashed if no camera of the agent sees them. Returns the camera's short name, and how
+    long ago it saw the pair if it does not see it now.
     """
     dataset, sample = pair.dataset, sample_token(pair.scenario, agent, index)
-    channel, view, last = pair.view(agent, index)
+    channel, view, seen_frame = pair.view(agent, index)
     name = camera_name(channel)
     camera = dataset.get("sample_data", f"{sample}/{channel}")
     draw_camera(dataset, camera, {*layers}.intersection(CAMERA_LAYERS), ax)
     ax.set_title("")
     if view is None:
-        return name if last is None else f"{name}:\nseen {(index - last) * FRAME_PERIOD:.1f} s ago"
+        if seen_frame is None:
+            return name
+        return f"{name}:\nseen {(index - seen_frame) * FRAME_PERIOD:.1f} s ago"
     lens = camera_of(dataset, camera)
     left, top, right, bottom = crop_about(
-        view.bounds, width=lens.width, height=lens.height, share=_LEAST_CROP
+        view.bounds, width=lens.width, height=lens.height, share=_MIN_CROP_SHARE
     )
     ax.set(xlim=(left, right), ylim=(bottom, top))
     if "boxes" not in layers:
         return name
-    both = pair.at(index, agent).transform(dataset.world_from(sample, channel).inverse(), channel)
-    hidden = both.select(~np.isin(both.actor_id, dataset.boxes(sample, visible="camera").actor_id))
-    draw_boxes_in_image(hidden, lens, ax, [COLLIDER_COLOR] * len(hidden), linestyle=_HIDDEN)
-    _write_tags_in_image(pair, both.actor_id.tolist(), bounds_in_image(both, lens), ax)
+    optical_from_world = dataset.world_from(sample, channel).inverse()
+    boxes = pair.at(index, agent).transform(optical_from_world, channel)
+    visible_ids = dataset.boxes(sample, visible="camera").actor_id
+    hidden = boxes.select(~np.isin(boxes.actor_id, visible_ids))
+    colors = [COLLIDER_COLOR] * len(hidden)
+    draw_boxes_in_image(hidden, lens, ax, colors, linestyle=_HIDDEN_LINE_STYLE)
+    _write_tags_in_image(pair, boxes.actor_id.tolist(), bounds_in_image(boxes, lens), ax)
     return name
 
 
 def draw_pair_from_above(
     pair: CollidingPair, index: int, layers: Collection[Layer], ax: Axes
 ) -> None:
-    """Render a frame (number from 1) around the place of contact, in world, as near as the pair allows.
+    """Render a frame (number from 1) around the point of contact, in world.
 
-    The layers are `bev` (the road), `boxes`, `velocities`, `ids`, `trajectories` (of the pair, up to the contact) and
-    `grid`; the title is the pair's speeds.
+    The view is as close as the pair allows. The layers are `bev` (the road), `boxes`, `velocities`,
+    `ids`, `trajectories` (of the pair, up to the contact) and `grid`; the title is the pair's
+    speeds.
     """
-    dataset, contact = pair.dataset, pair.contact
-    sample = dataset.get(
-        "sample", sample_token(pair.scenario, agents_of(dataset, pair.scenario)[0], index)
-    )
-    boxes, both = pair.tracks.at(index), pair.at(index)
-    place = contact.point[:2]
-    reach = _MARGIN + float(np.abs(both.bottom_corners()[..., :2] - place).max(initial=0.0))
-    reach = min(max(reach, _LEAST), _MOST)
-    x, y = place.tolist()
-    ax.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal")
+    dataset, point = pair.dataset, pair.contact.point[:2]
+    token = sample_token(pair.scenario, agents_of(dataset, pair.scenario)[0], index)
+    sample = dataset.get("sample", token)
+    boxes, pair_boxes = pair.tracks.at(index), pair.at(index)
+    distances = np.abs(pair_boxes.bottom_corners()[..., :2] - point)
+    view_range = _PAIR_MARGIN_M + float(distances.max(initial=0.0))
+    view_range = min(max(view_range, _MIN_VIEW_RANGE_M), _MAX_VIEW_RANGE_M)
+    x, y = point.tolist()
+    show_square(ax, (x, y), view_range)
     if "bev" in layers:
-        _draw_road(pair, index, reach, ax)
+        _draw_road(pair, index, view_range, ax)
     if "trajectories" in layers:
-        seconds, red = (_PAST, sample["time_to_impact"] or 0.0), [COLLIDER_COLOR] * len(both)
         draw_trails(
-            dataset, sample, both, red, target_from_world=SE3.identity(), seconds=seconds, ax=ax
+            dataset,
+            sample,
+            pair_boxes,
+            [COLLIDER_COLOR] * len(pair_boxes),
+            target_from_world=SE3.identity(),
+            seconds=(_PAST_S, sample["time_to_impact"] or 0.0),
+            ax=ax,
         )
-    _write_tags_from_above(pair, both, ax)  # before the ids, which have what room is left
+    _write_tags_from_above(pair, pair_boxes, ax)  # before the ids, which use the remaining space
     draw_actors_from_above(boxes, ax, role_colors(dataset, sample, boxes), layers)
-    ax.plot(x, y, "x", color="black", markersize=_CROSS, markeredgewidth=1.8, zorder=5)
-    keep_free(ax, [[place]], margin=(-_CROSS / 2, -_CROSS / 2, _CROSS / 2, _CROSS / 2))
-    _draw_scale(reach, ax, grid="grid" in layers)
-    speeds = [
-        f"{pair.tags[actor]} {number_words(float(np.linalg.norm(velocity)))}"
-        for actor, velocity in zip(both.actor_id.tolist(), both.velocity, strict=True)
-    ]
-    words = ", ".join(speeds) + ("" if current_style().few else " m/s")
-    ax.set_title(
-        "\n".join(speeds) if current_style().few and len(words) > _SHORT else words,
-        fontsize=text_size(),
-    )
+    ax.plot(x, y, "x", color="black", markersize=_CROSS_SIZE_PT, markeredgewidth=1.8, zorder=5)
+    half = _CROSS_SIZE_PT / 2
+    keep_free(ax, [[point]], margin=(-half, -half, half, half))
+    _draw_scale(view_range, ax, grid="grid" in layers)
+    ax.set_title(_speeds_title(pair, pair_boxes), fontsize=text_size())
+
+
+def _speeds_title(pair: CollidingPair, boxes: Boxes) -> str:
+    speeds = []
+    for actor, velocity in zip(boxes.actor_id.tolist(), boxes.velocity, strict=True):
+        speed = float(np.linalg.norm(velocity))
+        speeds.append(f"{pair.tags[actor]} {number_words(speed)}")
+    line = ", ".join(speeds)
+    if not current_style().few:
+        return f"{line} m/s"
+    if len(line) > _MAX_TITLE_LETTERS:
+        return "\n".join(speeds)
+    return line
 
 
 def number_words(value: float) -> str:
-    """A number with one digit, or `unknown`."""
-    return f"{value:.1f}" if np.isfinite(value) else "unknown"
+    """Return a number with one digit, or `unknown`."""
+    if np.isfinite(value):
+        return f"{value:.1f}"
+    return "unknown"
 
 
-def _draw_road(pair: CollidingPair, index: int, reach: float, ax: Axes) -> None:
-    """Render the ground from the BEV camera that is nearest to the contact; nothing if there is no file."""
-    dataset, place = pair.dataset, pair.contact.point[:2]
-    samples = [
-        sample_token(pair.scenario, agent, index) for agent in agents_of(dataset, pair.scenario)
-    ]
-    there = [sample for sample in samples if is_there(dataset, f"{sample}/{BEV_CAMERA}")]
-    poses = [dataset.world_from(sample, "ego") for sample in there]
-    away = [float(np.abs(pose.translation[:2] - place).max()) for pose in poses]
-    if there:
-        best = int(np.argmin(away))
-        image = dataset.load_bev(there[best])
-        draw_underlay(image, ax, target_from_ego=poses[best], view_range=reach + away[best])
+def _draw_road(pair: CollidingPair, index: int, view_range: float, ax: Axes) -> None:
+    """Render the ground from the BEV camera nearest to the contact, if a file is present."""
+    dataset, point = pair.dataset, pair.contact.point[:2]
+    samples, poses, distances = [], [], []
+    for agent in agents_of(dataset, pair.scenario):
+        sample = sample_token(pair.scenario, agent, index)
+        if has_sensor_file(dataset, f"{sample}/{BEV_CAMERA}"):
+            pose = dataset.world_from(sample, "ego")
+            samples.append(sample)
+            poses.append(pose)
+            distances.append(float(np.abs(pose.translation[:2] - point).max()))
+    if samples:
+        nearest = int(np.argmin(distances))
+        draw_underlay(
+            dataset.load_bev(samples[nearest]),
+            ax,
+            target_from_ego=poses[nearest],
+            view_range=view_range + distances[nearest],
+        )
 
 
-def _draw_scale(reach: float, ax: Axes, *, grid: bool) -> None:
-    """Render a bar of 5 or 10 m, and cells of that size, in place of numbers at the axes."""
+def _draw_scale(view_range: float, ax: Axes, *, grid: bool) -> None:
+    """Render a bar of 5 or 10 m, and cells of that size, instead of numbers at the axes."""
     from matplotlib.ticker import MultipleLocator
 
-    metres = 5.0 if reach < 1.25 * _LEAST else 10.0
+    metres = 10.0
+    if view_range < 1.25 * _MIN_VIEW_RANGE_M:
+        metres = 5.0
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)
         ax.set_axisbelow(True)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MultipleLocator(metres))
     ax.tick_params(labelbottom=False, labelleft=False, length=0)
-    left, low = (each + 0.1 * reach for each in ax.viewLim.min)
-    ax.plot([left, left + metres], [low, low], color="black", linewidth=2)
-    paper = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+    start, low = (edge + 0.1 * view_range for edge in ax.viewLim.min)
+    ax.plot([start, start + metres], [low, low], color="black", linewidth=2)
+    background = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
     ax.text(
-        left,
-        low + 0.06 * reach,
+        start,
+        low + 0.06 * view_range,
         f"{metres:.0f} m",
         fontsize=text_size(),
         va="bottom",
         zorder=6,
-        bbox=paper,
+        bbox=background,
     )
-    keep_free(ax, [[(left, low), (left + metres, low)]], margin=(-2, -2, 2, 2 * text_size()))
+    keep_free(ax, [[(start, low), (start + metres, low)]], margin=(-2, -2, 2, 2 * text_size()))
 
 
 def _write_tags_in_image(
     pair: CollidingPair, actors: list[int], bounds: FloatArray, ax: Axes
 ) -> None:
-    """Write tags above what the panel shows of boxes with bounds (N, 4), pixels; of two, at their outer sides."""
+    """Write tags above the visible parts of boxes with bounds (N, 4), pixels.
+
+    The tags of two boxes are at their outer sides.
+    """
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     cars = bounds.reshape(-1, 2, 2).clip((left, top), (right, bottom))
-    shown = np.flatnonzero((cars[:, 1] > cars[:, 0]).all(axis=1))
-    shown = shown[np.argsort(cars[shown, :, 0].mean(axis=1))]
-    cars = cars[shown]
-    places = np.column_stack([cars[..., 0].mean(axis=1), cars[:, 0, 1]])
+    visible = np.flatnonzero((cars[:, 1] > cars[:, 0]).all(axis=1))
+    from_left = np.argsort(cars[visible, :, 0].mean(axis=1))
+    rows = visible[from_left]
+    cars = cars[rows]
+    positions = np.column_stack([cars[..., 0].mean(axis=1), cars[:, 0, 1]])
     if len(cars) > 1:
-        places[:, 0] = cars[0, 0, 0], cars[1, 1, 0]
-    free = top + (bottom - top) * min(0.5, _FREE * ax.figure.dpi / 72 / ax.bbox.height)
-    places[places[:, 1] < free, 1] = top
-    cars[..., 1] = cars[..., 1].clip(free)
-    _write_tags([pair.tags[actors[row]] for row in shown.tolist()], places, ax)
+        positions[:, 0] = cars[0, 0, 0], cars[1, 1, 0]
+    tag_share = min(0.5, _TAG_HEIGHT_PT * ax.figure.dpi / 72 / ax.bbox.height)
+    tag_bottom = top + (bottom - top) * tag_share
+    positions[positions[:, 1] < tag_bottom, 1] = top
+    cars[..., 1] = cars[..., 1].clip(tag_bottom)
+    _write_tags([pair.tags[actors[row]] for row in rows.tolist()], positions, ax)
     keep_free(ax, cars)
 
 
-def _write_tags_from_above(pair: CollidingPair, both: Boxes, ax: Axes) -> None:
-    """Write tags beside boxes of the pair, each at the end that is away from the other."""
-    middle = both.center[:, :2].mean(axis=0) if len(both) > 1 else pair.contact.point[:2]
-    away = both.center[:, :2] - middle
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    ends = both.bottom_corners()[..., :2] - both.center[:, None, :2]
-    places = both.center[:, :2] + away * (ends @ away[..., None]).max(axis=1)
-    _write_tags([pair.tags[actor] for actor in both.actor_id.tolist()], places, ax)
+def _write_tags_from_above(pair: CollidingPair, boxes: Boxes, ax: Axes) -> None:
+    """Write tags beside boxes of the pair, each at the end farther from the other actor."""
+    centers = boxes.center[:, :2]
+    middle = pair.contact.point[:2]
+    if len(boxes) > 1:
+        middle = centers.mean(axis=0)
+    directions = centers - middle
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+    ends = boxes.bottom_corners()[..., :2] - boxes.center[:, None, :2]
+    lengths = (ends @ directions[..., None]).max(axis=1)
+    positions = centers + directions * lengths
+    _write_tags([pair.tags[actor] for actor in boxes.actor_id.tolist()], positions, ax)
 
 
-def _write_tags(tags: list[str], places: FloatArray, ax: Axes) -> None:
-    """Write tags near places (N, 2) or, if these are not in the panel, at its edge."""
+def _write_tags(tags: list[str], positions: FloatArray, ax: Axes) -> None:
+    """Write tags near positions (N, 2) or, if these are not in the panel, at its edge."""
     low, high = np.array(ax.viewLim.min), np.array(ax.viewLim.max)
-    edge = _EDGE * (high - low)
-    places = places.clip(low + edge, high - edge)
-    place_chips(ax, zip(tags, places, strict=True), colors=[COLLIDER_COLOR] * len(tags))
+    edge = _EDGE_SHARE * (high - low)
+    positions = positions.clip(low + edge, high - edge)
+    place_chips(ax, zip(tags, positions, strict=True), colors=[COLLIDER_COLOR] * len(tags))
 
 
 def _cut_words(contact: Contact, frames: int) -> str:
-    """Says that a recording of so many frames does not end with its accident; empty if it does."""
-    last = int(contact.frame.rsplit("/", 1)[1])
-    if last == frames and contact.gap <= CONTACT_GAP:
+    """Return a warning if a recording does not end with its accident; empty if it does."""
+    contact_frame = int(contact.frame.rsplit("/", 1)[1])
+    if contact_frame == frames and contact.gap <= CONTACT_GAP:
         return ""
-    return f"cut short? the pair are {contact.gap:.1f} m apart at frame {last} of {frames}, the last that shows both"
+    return (
+        f"cut short? the pair are {contact.gap:.1f} m apart at frame {contact_frame} of {frames}, "
+        "the last that shows both"
+    )
 
 
-def _contact(dataset: Dataset, scenario: RowArgument, instead: str) -> Contact:
-    """How the accident of a scenario happened; raises NotAvailableError, with a remedy, if there is none."""
+def _contact(dataset: Dataset, scenario: RowArgument, alternative: str) -> Contact:
+    """Return how the accident of a scenario happened.
+
+    Raises:
+        NotAvailableError: Nobody collides; the message has the alternative as a remedy.
+    """
     contact = collision(dataset, scenario)
     if contact is None:
         raise NotAvailableError(
-            f"{dataset.get('scenario', scenario)['token']}: nobody collides in it, so there is nothing to count down "
-            f"to; choose a scenario with a collision, or {instead}"
+            f"{dataset.get('scenario', scenario)['token']}: nobody collides in it, "
+            "so there is nothing to count down to; "
+            f"choose a scenario with a collision, or {alternative}"
         )
     return contact
 
 
-def _moments(seconds: Sequence[float], last: int) -> list[tuple[float, int]]:
-    """Seconds before the impact and frame numbers of those that were recorded."""
-    moments = [(left, last - round(left / FRAME_PERIOD)) for left in seconds]
-    recorded = [(left, index) for left, index in moments if 1 <= index <= last]
+def _moments(seconds: Sequence[float], frames: int) -> list[tuple[float, int]]:
+    """Return the recorded moments as seconds before the impact and frame numbers."""
+    recorded = []
+    for time_left in seconds:
+        frame = frames - round(time_left / FRAME_PERIOD)
+        if 1 <= frame <= frames:
+            recorded.append((time_left, frame))
     if not recorded:
         raise ChoiceError(
-            f"seconds: expected some from 0 to {(last - 1) * FRAME_PERIOD:.1f}, as recorded before the impact, "
-            f"found {list(seconds)}"
+            f"seconds: expected some from 0 to {(frames - 1) * FRAME_PERIOD:.1f}, "
+            f"as recorded before the impact, found {list(seconds)}"
         )
     return recorded
 
 
-def _width(fig: Figure, agents: int, moments: int) -> tuple[float, bool]:
-    """Inches of a panel of the first row or column, about, and whether rows are columns because it is then wider."""
-    width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi - _TITLE
-    down = min(width / moments, height / (agents * 9 / 16 + 1))
-    row = height / moments - _ROW_WORDS * text_size()
-    across = (16 / 9 if agents else 1) * min(row, width / (agents * 16 / 9 + 1))
-    return max(down, across), across > down
+def _panel_width(fig: Figure, agents: int, moments: int) -> tuple[float, bool]:
+    """Return the width of a panel of the first row or column, about, in inches.
+
+    The second value is whether rows are columns because it is then wider.
+    """
+    width = fig.bbox.width / fig.dpi
+    height = fig.bbox.height / fig.dpi - _TITLE_HEIGHT_IN
+    row_height = height / moments - _ROW_WORDS_HEIGHT_IN * text_size()
+    width_as_rows = min(width / moments, height / (agents * 9 / 16 + 1))
+    panel_ratio = 16 / 9 if agents else 1
+    width_as_columns = panel_ratio * min(row_height, width / (agents * 16 / 9 + 1))
+    return max(width_as_rows, width_as_columns), width_as_columns > width_as_rows
 
 
 def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
-    """Axes (agents + 1, moments), and whether rows are columns."""
-    if _width(fig, agents, moments)[1]:
-        return fig.subplots(
-            moments, agents + 1, squeeze=False, width_ratios=(*[16 / 9] * agents, 1)
-        ).T, True
-    return fig.subplots(
-        agents + 1, moments, squeeze=False, height_ratios=(*[9 / 16] * agents, 1)
-    ), False
+    """Return axes (agents + 1, moments), and whether rows are columns."""
+    _, is_wide = _panel_width(fig, agents, moments)
+    if is_wide:
+        ratios = (*[16 / 9] * agents, 1)
+        return fig.subplots(moments, agents + 1, squeeze=False, width_ratios=ratios).T, True
+    ratios = (*[9 / 16] * agents, 1)
+    return fig.subplots(agents + 1, moments, squeeze=False, height_ratios=ratios), False
 
 
-def _agents_with_room(fig: Figure, agents: int, moments: int) -> int:
-    """How many of the agents can be shown so large that one can see what happens, or as large as they can be."""
-    panels = {number: _width(fig, number, moments) for number in range(1, agents + 1)}
-    least = min(_LEAST_WIDTH, 0.9 * max(width for width, _ in panels.values()))
-    areas = {
-        number: moments * width**2 * (number * 9 / 16 + (81 / 256 if across else 1))
-        for number, (width, across) in panels.items()
-        if width >= least
-    }
-    enough = _ENOUGH * fig.bbox.width * fig.bbox.height / fig.dpi**2 if current_style().few else 0.0
-    return max(
-        (number for number, area in areas.items() if area > enough),
-        default=max(areas, key=areas.__getitem__),
-    )
+def _fitting_agents(fig: Figure, agents: int, moments: int) -> int:
+    """Return how many agents can have panels large enough to recognise what happens.
+
+    If no number can, it is the one with the largest panels.
+    """
+    panels = {number: _panel_width(fig, number, moments) for number in range(1, agents + 1)}
+    widest = max(width for width, _ in panels.values())
+    min_width = min(_MIN_PANEL_WIDTH_IN, 0.9 * widest)
+    areas = {}
+    for number, (width, is_wide) in panels.items():
+        if width >= min_width:
+            above_ratio = 81 / 256 if is_wide else 1
+            areas[number] = moments * width**2 * (number * 9 / 16 + above_ratio)
+    min_area = 0.0
+    if current_style().few:
+        min_area = _MIN_COVERED_SHARE * fig.bbox.width * fig.bbox.height / fig.dpi**2
+    sufficient = [number for number, area in areas.items() if area > min_area]
+    return max(sufficient, default=max(areas, key=areas.__getitem__))
 
 
 def _best_agents(
     pair: CollidingPair, agents: Sequence[str], frames: Sequence[int], number: int
 ) -> list[str]:
-    """So many of the agents: the ego, and those in whose images most, and of equals the largest, of the pair is."""
-    views = {agent: [pair.view(agent, index)[1] for index in frames] for agent in agents}
-    seen = {
-        agent: [(view.shown, view.area) for view in views[agent] if view is not None]
-        for agent in agents
-    }
-    best = {agent: np.sum([(0, 0), *seen[agent]], axis=0).tolist() for agent in agents}
-    ranked = sorted(agents, key=lambda agent: (agent == AGENTS[0], best[agent]), reverse=True)
+    """Return the ego and the agents that see most of the pair in their images.
+
+    Of equal agents the one with the largest part of the pair in its images comes first.
+    """
+    priorities = {}
+    for agent in agents:
+        views = [pair.view(agent, frame)[1] for frame in frames]
+        shares = [(view.total_share, view.area) for view in views if view is not None]
+        total = np.sum([(0, 0), *shares], axis=0).tolist()
+        priorities[agent] = (agent == AGENTS[0], total)
+    ranked = sorted(agents, key=priorities.__getitem__, reverse=True)
     return in_drawing_order(ranked[:number])
 
 
 def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
-    """Write the head of a column above its first panel, or that of a row beside it."""
+    """Write the head of a column above its first panel, or the head of a row beside it."""
     if above:
-        ax.set_title(
-            "\n".join(filter(None, [words, ax.get_title()])), color=color, fontsize="medium"
-        )
+        lines = [line for line in (words, ax.get_title()) if line]
+        ax.set_title("\n".join(lines), color=color, fontsize="medium")
         return
     style: dict[str, Any] = {"rotation": 90, "ha": "right", "va": "center", "fontweight": "bold"}
     ax.text(-0.02, 0.5, words, color=color, transform=ax.transAxes, **style)
 
 
 def _write_name(words: str, ax: Axes) -> None:
-    """Write a camera's name into the lower left corner of its panel, whatever is there."""
+    """Write a camera's name into the lower left corner of its panel, over any content."""
     ax.annotate(
         words,
         (0, 0),
@@ -550,17 +645,20 @@ def _write_name(words: str, ax: Axes) -> None:
 
 
 def _draw_speeds(pair: CollidingPair, index: int, ax: Axes) -> None:
-    """Render the pair's speeds over the seconds before the impact: strong up to the present, pale after it."""
+    """Render the pair's speeds over the seconds before the impact.
+
+    Lines are strong up to the present and pale after it.
+    """
     tracks = pair.tracks
     impact = int(tracks.index.max())
-    for actor, dashes in zip(pair.contact.actor_ids, _DASHES, strict=True):
+    for actor, line_style in zip(pair.contact.actor_ids, _LINE_STYLES, strict=True):
         rows = np.flatnonzero(tracks.actor_id == actor)
-        before = (tracks.index[rows] - impact) * FRAME_PERIOD
+        seconds = (tracks.index[rows] - impact) * FRAME_PERIOD
         speed = np.linalg.norm(tracks.boxes.velocity[rows], axis=1)
         past = tracks.index[rows] <= index
-        style: dict[str, Any] = {"color": COLLIDER_COLOR, "linestyle": dashes}
-        ax.plot(before, speed, linewidth=1.2, alpha=0.25, **style)
-        ax.plot(before[past], speed[past], linewidth=2.0, label=pair.tags[actor], **style)
+        style: dict[str, Any] = {"color": COLLIDER_COLOR, "linestyle": line_style}
+        ax.plot(seconds, speed, linewidth=1.2, alpha=0.25, **style)
+        ax.plot(seconds[past], speed[past], linewidth=2.0, label=pair.tags[actor], **style)
     ax.axvline((index - impact) * FRAME_PERIOD, color="black", linewidth=1.2)
     ax.axvline(0, color=COLLIDER_COLOR, linewidth=1.2, linestyle=":")
     ax.set(

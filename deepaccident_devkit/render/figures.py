@@ -1,4 +1,4 @@
-"""Figures and axes, made, laid out and written into files, and the layers that pictures have."""
+"""Figures and axes, their layout and their files, and the layers of pictures."""
 
 from __future__ import annotations
 
@@ -34,42 +34,50 @@ Layer = Literal[
     "visibility",
     "grid",
 ]
-"""`image` is the camera's picture, `map` the town's ground by all its recordings, `bev` the simulator's camera from
-above, `labels` what the motion labels say."""
+"""`image` is the camera's picture, `map` the town's ground by all its recordings, `bev` the
+simulator's camera from above, `labels` the cells of the motion labels."""
 LAYERS: tuple[Layer, ...] = get_args(Layer)
-_UNDATED: Final[Mapping[str, dict[str, Any]]] = {
+# Suffix → metadata without a date.
+_UNDATED_METADATA: Final[Mapping[str, dict[str, Any]]] = {
     "pdf": {"CreationDate": None},
     "svg": {"Date": None},
 }
 # Width by height of a view from above on a slide.
-_WIDE: Final = 1.6
-# How often a figure is laid out at most; of its width or height, how far a panel that does not move may move.
-_PASSES, _STILL = 4, 1e-5
+_SLIDE_ASPECT_RATIO: Final = 1.6
+# Maximum number of layouts of a figure.
+_MAX_LAYOUT_PASSES: Final = 4
+# Share of the width or height of a figure within which a panel counts as not moving.
+_LAYOUT_TOLERANCE: Final = 1e-5
 PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg", ".jpg", ".webp")
 
 
 def layers_of(
-    given: Iterable[Layer] | None, default: Iterable[Layer], possible: Collection[Layer] = LAYERS
+    layers: Iterable[Layer] | None, default: Iterable[Layer], possible: Collection[Layer] = LAYERS
 ) -> frozenset[Layer]:
-    """The layers to render of the possible ones: None is the default, an empty list none. Raises ChoiceError."""
-    words = default if given is None else given
-    return frozenset(
-        choice("layers", layer, possible)
-        for layer in ((words,) if isinstance(words, str) else words)
-    )
+    """Return the layers to render: by default (None) the default, for an empty list none.
+
+    Raises ChoiceError.
+    """
+    names: Iterable[str] = default if layers is None else layers
+    if isinstance(names, str):
+        names = (names,)
+    return frozenset(choice("layers", name, possible) for name in names)
 
 
 def axes_or_new(ax: Axes | None, size: tuple[float, float] = (8, 8)) -> Axes:
-    """The axes given, or those of a new pyplot figure, which notebooks display, of a size in inches or its style's."""
+    """Return the given axes, or new ones of a pyplot figure, which notebooks display.
+
+    The size is in inches; a style may have its own.
+    """
     if ax is not None:
         return ax
     from matplotlib import pyplot as plt
 
     from deepaccident_devkit.render.own_figure import OwnFigure
 
-    return plt.subplots(
-        figsize=size_in_style(size, panels="one"), layout="constrained", FigureClass=OwnFigure
-    )[1]
+    inches = size_in_style(size, panels="one")
+    _, new_ax = plt.subplots(figsize=inches, layout="constrained", FigureClass=OwnFigure)
+    return new_ax
 
 
 def figure_or_new(
@@ -79,9 +87,10 @@ def figure_or_new(
     panels: Literal["one", "several"] = "several",
     **heights: float,
 ) -> Figure:
-    """The figure given, or a new pyplot one, which notebooks display, of a size in inches or its style's.
+    """Return the given figure, or a new pyplot one, which notebooks display.
 
-    `heights` are those of `page` and `column`, in widths.
+    The size is in inches; a style may have its own. `heights` are the heights in `page` and
+    `column`, in widths.
     """
     if fig is not None:
         return fig
@@ -94,37 +103,68 @@ def figure_or_new(
 
 
 def widening(ax: Axes | None) -> float:
-    """By how much a view from above, on these axes or new ones, is wider than high: on a slide it fills it."""
-    return _WIDE if ax is None and current_style().ratio is not None else 1.0
+    """Return the width by height of a view from above on these axes, or on new ones (None).
+
+    New axes fill a slide.
+    """
+    if ax is None and current_style().ratio is not None:
+        return _SLIDE_ASPECT_RATIO
+    return 1.0
 
 
-def axis_words(frame: str) -> tuple[str, str]:
-    """The labels of the axes of a view from above, in metres of `ego`, `lidar` or `world`."""
-    return ("x, world (m)", "y, world (m)") if frame == "world" else ("x forward (m)", "y left (m)")
+def label_axes(ax: Axes, frame: str) -> None:
+    """Label the axes of a view from above, in metres of `ego`, `lidar` or `world`."""
+    if frame == "world":
+        ax.set(xlabel="x, world (m)", ylabel="y, world (m)")
+    else:
+        ax.set(xlabel="x forward (m)", ylabel="y left (m)")
+
+
+def show_square(ax: Axes, center: Iterable[float], half: float) -> None:
+    """Limit axes to a square around a centre, with equal scales; `half` is half its side."""
+    x, y = center
+    ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal")
+
+
+def write_in_middle(ax: Axes, words: str, **style: Any) -> None:
+    """Write words into the middle of axes."""
+    ax.text(0.5, 0.5, words, ha="center", va="center", transform=ax.transAxes, **style)
+
+
+def hide_axes(axes: Iterable[Axes]) -> None:
+    """Hide the axes of unused panels."""
+    for ax in axes:
+        ax.set_axis_off()
 
 
 def check_view_range(metres: float) -> None:
-    """Raise ChoiceError unless so many metres can be shown to each side."""
+    """Raise ChoiceError unless a range of metres to each side can be shown."""
     if not (math.isfinite(metres) and metres > 0):
         raise ChoiceError(f"view_range: expected metres above 0, found {metres!r}")
 
 
 def titled_from_above(ax: Axes, title: str, *, grid: bool) -> Axes:
-    """The axes as a view from above in metres, with a small title."""
-    ax.set(aspect="equal", xlabel="x forward (m)", ylabel="y left (m)")
+    """Return the axes as a view from above in metres, with a small title."""
+    ax.set_aspect("equal")
+    label_axes(ax, "ego")
     ax.set_title(title, fontsize=text_size())
-    return with_light_grid(ax, "both") if grid else ax
+    if grid:
+        with_light_grid(ax, "both")
+    return ax
 
 
 def detached_figure(size: tuple[float, float]) -> Figure:
-    """A figure that pyplot does not know, for files: pyplot does not keep it, and no display is needed."""
+    """Return a figure for files that pyplot does not know.
+
+    Pyplot does not store it, and no display is needed.
+    """
     from deepaccident_devkit.render.own_figure import OwnFigure
 
     return OwnFigure(figsize=size, layout="constrained")
 
 
 def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
-    """The axes, with a light grid in the background, and without lines at the top and right."""
+    """Return the axes with a light grid, and without lines at the top and right."""
     ax.grid(axis=grid, color=GRID_COLOR, linewidth=0.5)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
@@ -132,14 +172,15 @@ def with_light_grid(ax: Axes, grid: Literal["x", "y", "both"]) -> Axes:
 
 
 def settled(fig: Figure) -> Figure:
-    """The figure, laid out once.
+    """Return the figure, laid out once.
 
-    matplotlib measures the room for titles and legends before it makes the panels' scales equal, so the room is too
-    small. When it lays the figure out again at rendering, it starts from panels that are nearly right.
+    matplotlib measures the space for titles and legends before it makes the panels' scales equal,
+    so the space is too small. When it lays the figure out again at rendering, it starts from panels
+    that are nearly right.
     """
-    engine = (
-        fig.get_layout_engine() if fig.figure is fig else None
-    )  # a part of a figure is laid out with it
+    if fig.figure is not fig:  # a part of a figure is laid out with it
+        return fig
+    engine = fig.get_layout_engine()
     if engine is not None:
         with getattr(fig, "settings", nullcontext)():
             engine.execute(fig)
@@ -148,28 +189,29 @@ def settled(fig: Figure) -> Figure:
 
 @contextmanager
 def laid_out(fig: Figure, dpi: float) -> Iterator[None]:
-    """Lay a figure out until its panels move no more, a few times at most; in the block, matplotlib does not do it."""
-    engine, usual, places = fig.get_layout_engine(), fig.dpi, np.zeros(0)
+    """Lay a figure out until its panels move no more, a few times at most.
+
+    Within the block, matplotlib does not lay it out.
+    """
+    engine, usual_dpi, positions = fig.get_layout_engine(), fig.dpi, np.zeros(0)
     fig.set_dpi(dpi)  # letters are measured in pixels
-    for number in range(_PASSES):
-        before, places = (
-            places,
-            np.array([ax.get_position(original=False).bounds for ax in settled(fig).axes]),
-        )
-        if (
-            number > 1 and np.abs(places - before).max(initial=0) < _STILL
-        ):  # the first two may be equal by chance
-            break
+    for number in range(_MAX_LAYOUT_PASSES):
+        previous_positions = positions
+        settled(fig)
+        positions = np.array([ax.get_position(original=False).bounds for ax in fig.axes])
+        if number > 1:  # the first two may be equal by chance
+            if np.abs(positions - previous_positions).max(initial=0) < _LAYOUT_TOLERANCE:
+                break
     fig.set_layout_engine(None)
     try:
         yield
     finally:
         fig.set_layout_engine(engine)
-        fig.set_dpi(usual)
+        fig.set_dpi(usual_dpi)
 
 
 def check_picture_path(path: str | os.PathLike[str]) -> Path:
-    """The path, if it has the suffix of a picture; raises ChoiceError."""
+    """Return the path, if it has the suffix of a picture; raises ChoiceError."""
     path = path_of(path)
     if path.suffix.lower() not in PICTURE_SUFFIXES:
         raise ChoiceError(
@@ -179,24 +221,27 @@ def check_picture_path(path: str | os.PathLike[str]) -> Path:
 
 
 def figure_of_pixels(width: int, height: int, *, dpi: float) -> Figure:
-    """A figure that pyplot does not know, whose picture has exactly this width and height."""
-    whole = 1e-3  # a canvas drops fractions of pixels, and inches are rounded
-    figure = detached_figure(((width + whole) / dpi, (height + whole) / dpi))
+    """Return a figure that pyplot does not know, for a picture of this width and height."""
+    margin = 1e-3  # a canvas drops fractions of pixels, and inches are rounded
+    figure = detached_figure(((width + margin) / dpi, (height + margin) / dpi))
     figure.set_dpi(dpi)
     return figure
 
 
 def save_picture(
-    drawn: Axes | Figure, path: str | os.PathLike[str], *, dpi: float | None = None
+    picture: Axes | Figure, path: str | os.PathLike[str], *, dpi: float | None = None
 ) -> Path:
-    """Write a `render_…` result's figure atomically into a file of one of `PICTURE_SUFFIXES`, and close it in pyplot.
+    """Write a `render_…` result's figure atomically into a file, and close it in pyplot.
 
-    `dpi` is pixels an inch; None for those of the style, in a notebook's 100. Raises ChoiceError for another suffix.
+    `dpi` is pixels an inch; None for the style's value, in a notebook 100.
+
+    Raises:
+        ChoiceError: The suffix is none of `PICTURE_SUFFIXES`.
     """
     from matplotlib import pyplot as plt
 
     path = check_picture_path(path)
-    figure: Any = drawn.figure
+    figure: Any = picture.figure
     try:
         return write_figure(figure, path, dpi=dpi or current_style().dpi)
     finally:
@@ -206,36 +251,45 @@ def save_picture(
 def write_figure(
     figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None
 ) -> Path:
-    """Write a figure as the path's suffix says, atomically and without a date: the same picture makes the same bytes.
+    """Write a figure in the format of the path's suffix, atomically.
 
-    `words` are the text entries of a PNG file. The figure is one from `detached_figure`; others stay open in pyplot.
+    There is no date in the file: the same picture makes the same bytes. `words` are the text
+    entries of a PNG file. The figure is one from `detached_figure`; others stay open in pyplot.
     """
-    kind = path.suffix[1:].lower()
+    suffix = path.suffix[1:].lower()
+    metadata = _UNDATED_METADATA.get(suffix, words)
     with replacing(path) as temporary, laid_out(figure, dpi):
-        figure.savefig(temporary, format=kind, dpi=dpi, metadata=_UNDATED.get(kind, words))
+        figure.savefig(temporary, format=suffix, dpi=dpi, metadata=metadata)
     return path
 
 
 def report_figure(
     size: tuple[float, float], *, panels: Literal["one", "several"] = "several", **heights: float
 ) -> Figure:
-    """A figure that pyplot does not know, of a size in inches, or its style's; `heights` are as in `figure_or_new`."""
+    """Return a figure that pyplot does not know, of a size in inches, or its style's.
+
+    `heights` are as in `figure_or_new`.
+    """
     return detached_figure(size_in_style(size, panels=panels, heights=heights))
 
 
 def write_report_figure(
     figure: Figure, path: Path, *, dpi: float = 150, words: dict[str, Any] | None = None
 ) -> Path:
-    """Write a figure of a report into a PNG file, and for a paper or a slide also into a PDF file beside it."""
+    """Write a figure of a report into a PNG file.
+
+    For a paper or a slide a PDF file is also written beside it.
+    """
     style = current_style()
     if style.few:
         write_figure(figure, path.with_suffix(".pdf"), dpi=style.dpi)
-    return write_figure(figure, path, dpi=style.dpi if style.few else dpi, words=words)
+        dpi = style.dpi
+    return write_figure(figure, path, dpi=dpi, words=words)
 
 
 def figure_png(figure: Figure, *, dpi: float) -> bytes:
-    """A figure from `detached_figure` as the bytes of a PNG file."""
-    written = io.BytesIO()
+    """Return a figure from `detached_figure` as the bytes of a PNG file."""
+    content = io.BytesIO()
     with laid_out(figure, dpi):
-        figure.savefig(written, format="png", dpi=dpi)
-    return written.getvalue()
+        figure.savefig(content, format="png", dpi=dpi)
+    return content.getvalue()

@@ -1,4 +1,7 @@
-"""Which points of other agents a camera's own agent would not see, because its LiDAR has something in front of them."""
+"""LiDAR points of other agents that a camera's own agent would not see.
+
+They are hidden if its own LiDAR has something in front of them.
+"""
 
 from __future__ import annotations
 
@@ -16,36 +19,41 @@ from deepaccident_devkit.v2x import map_pointcloud_to_image
 from deepaccident_devkit.v2x.poses import ImagePoints, camera_of
 
 # Square cells across an image.
-_COLUMNS: Final = 50
-# A point is seen up to its cell's depth times this, and so many metres more.
-_SHARE, _METRES = 1.1, 1.0
+_COLUMN_COUNT: Final = 50
+# A point is visible up to its cell's depth times a factor, plus a margin in metres.
+_DEPTH_FACTOR, _DEPTH_MARGIN_M = 1.1, 1.0
 
 
 def hiding(dataset: Dataset, camera: RowArgument) -> Callable[[ImagePoints], ImagePoints]:
-    """What takes out of the mask of points in an image (a token or record) those that its own agent's cloud hides.
+    """Return a function that removes hidden points from the mask of points in an image.
 
-    A cell of the image, a fiftieth of its width, is as deep as the farthest of the agent's own points in it. Between
-    two rings of the LiDAR a cell has the depth above it; above the highest ring, where walls go on, that below it.
-    Nothing is hidden in a column without a point, or if the cloud was not downloaded.
+    The image is a token or record; the cloud of its own agent hides points. A cell of the image, a
+    fiftieth of its width, is as deep as the farthest of the agent's own points in it. Between two
+    rings of the LiDAR a cell has the depth above it; above the highest ring, where walls go on, the
+    depth below it. Nothing is hidden in a column without a point, or if the cloud was not
+    downloaded.
     """
     lens = camera_of(dataset, camera)
-    depths = np.zeros((-(-_COLUMNS * lens.height // lens.width), _COLUMNS))
+    row_count = -(-_COLUMN_COUNT * lens.height // lens.width)
+    depths = np.zeros((row_count, _COLUMN_COUNT))
 
     def cells(points: ImagePoints) -> tuple[IntArray, IntArray]:
-        column, row = (points.pixels[points.mask] * _COLUMNS / lens.width).astype(np.int64).T
+        scaled = points.pixels[points.mask] * _COLUMN_COUNT / lens.width
+        column, row = scaled.astype(np.int64).T
         return row, column
 
     if has_cloud(dataset, dataset.get("sample_data", camera)["sample_token"]):
-        own = map_pointcloud_to_image(dataset, camera, colors=False)
-        np.maximum.at(depths, cells(own), own.depth[own.mask])
+        own_points = map_pointcloud_to_image(dataset, camera, colors=False)
+        np.maximum.at(depths, cells(own_points), own_points.depth[own_points.mask])
     for rows in (depths, depths[::-1]):
-        for before, row in pairwise(rows):
-            np.copyto(row, before, where=row == 0)
+        for row_before, row in pairwise(rows):
+            np.copyto(row, row_before, where=row == 0)
     depths[depths == 0] = np.inf
 
-    def seen(points: ImagePoints) -> ImagePoints:
+    def without_hidden(points: ImagePoints) -> ImagePoints:
         mask = points.mask.copy()
-        mask[mask] = points.depth[mask] <= _SHARE * depths[cells(points)] + _METRES
+        max_depth = _DEPTH_FACTOR * depths[cells(points)] + _DEPTH_MARGIN_M
+        mask[mask] = points.depth[mask] <= max_depth
         return replace(points, mask=mask)
 
-    return seen
+    return without_hidden

@@ -1,4 +1,4 @@
-"""The effects of a link on shared data: where partners' boxes arrive, and the clouds with and without the link."""
+"""The effects of a link on shared data: received boxes, and clouds with and without the link."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.render.bev import BevView, draw_bev, link_words
 from deepaccident_devkit.render.boxes import (
-    at_once,
+    ARROW_STYLE,
     collider_ids,
     draw_boxes_from_above,
     draw_ids_from_above,
+    simultaneous_sample,
     write_beside,
 )
 from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import (
     Layer,
-    axis_words,
     check_view_range,
     figure_or_new,
+    label_axes,
     layers_of,
     settled,
     widening,
@@ -51,16 +52,14 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import SampleRecord
 
-_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "grid")
-_SHOWN: Final[tuple[Layer, ...]] = ("points", "boxes", "grid")
-
-
+_LINK_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "grid")
+_DEFAULT_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "grid")
 # Metres around the agents and the pair.
-_AROUND: Final = 8.0
-# Metres to each side that are shown at least and at most.
-_REACHES: Final = (25.0, 60.0)
-_DASHED: Final = (0, (2, 1))
-_RECEIVER: Final[Mapping[str, Any]] = {
+_VIEW_MARGIN_M: Final = 8.0
+# Metres shown to each side: minimum and maximum.
+_VIEW_RANGE_LIMITS_M: Final = (25.0, 60.0)
+_TRUE_LINE_STYLE: Final = (0, (2, 1))
+_RECEIVER_STYLE: Final[Mapping[str, Any]] = {
     "linestyle": "none",
     "marker": "*",
     "color": OWN_COLOR,
@@ -71,12 +70,12 @@ _RECEIVER: Final[Mapping[str, Any]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SharedBoxes:
-    """What a partner shares of the actors that it annotated, in the ego frame of the receiver.
+    """The boxes of the actors that a partner annotated, in the ego frame of the receiver.
 
     Attributes:
-        agent: the partner.
-        true: the boxes of its label at the present, at their true places.
-        received: the boxes that arrive, where the receiver places them; none if the message is lost.
+        agent: Name of the partner.
+        true: Present boxes of its label, at their true positions.
+        received: Received boxes, at the receiver's positions; none if the message is lost.
     """
 
     agent: str
@@ -85,11 +84,11 @@ class SharedBoxes:
 
     @property
     def shifts(self) -> tuple[FloatArray, FloatArray]:
-        """(M, 2) true and (M, 2) received centres, x and y, of the actors that are in both."""
-        _, first, second = np.intersect1d(
+        """True and received centres of the actors in both, x and y, shape (M, 2) each."""
+        _, true_rows, received_rows = np.intersect1d(
             self.true.actor_id, self.received.actor_id, return_indices=True
         )
-        return self.true.center[first, :2], self.received.center[second, :2]
+        return self.true.center[true_rows, :2], self.received.center[received_rows, :2]
 
 
 @in_own_settings
@@ -103,67 +102,57 @@ def render_link(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render the effects of latency, wrong poses and losses on the data that partners share with a sample's agent.
+    """Render the effects of latency, wrong poses and losses on the data that partners share.
 
-    The first panel has all partners' boxes: dashed at their true places, in each partner's hue where they arrive, with
-    arrows between these places; the legend says how far that is on average. The other panels have the agents' clouds
-    without the link and with it, in papers and on slides only with it, and in a paper's column there are none.
+    The first panel has all partners' boxes: dashed at their true positions, and in each partner's
+    hue as received, with arrows between these positions; the legend has the mean distances. The
+    other panels have the agents' clouds without the link and with it, in papers and on slides only
+    with it, and in a paper's column there are none.
 
     Args:
-        dataset: the release.
-        sample: token or record: its agent receives.
-        link: what happens to the partners' data.
-        agents: which agents cooperate: names, a configuration or its name as seen from the ego; None for all that are
-            there.
-        view_range: metres shown to each side of the ego; None shows all agents and the colliding pair.
-        layers: `points`, `boxes` and `grid` are the default; also `ids`. Without `points` there are no clouds.
-        fig: an empty figure to render on; a new one if None.
+        dataset: The release.
+        sample: Token or record: its agent receives.
+        link: Effects on the partners' data.
+        agents: Cooperating agents: names, a configuration or its name from the view of the ego;
+            None for all present agents.
+        view_range: Metres shown to each side of the ego; None shows all agents and the colliding
+            pair.
+        layers: `points`, `boxes` and `grid` are the default; also `ids`. Without `points` there are
+            no clouds.
+        fig: Empty figure to render on; a new one if None.
 
     Returns:
         The figure, in metres of the sample's ego frame.
 
     Raises:
-        TokenError: no such sample.
-        ChoiceError: no such agent, configuration or layer, no partner among the agents, or `view_range` is not above 0.
-        NotAvailableError: an agent is not in this (partial) release.
+        TokenError: No such sample.
+        ChoiceError: No such agent, configuration or layer, no partner among the agents, or
+            `view_range` is not above 0.
+        NotAvailableError: An agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
-    shown = layers_of(layers, _SHOWN, _LAYERS)
-    record, room = dataset.sample[dataset.getind("sample", sample)], current_style().room
+    shown_layers = layers_of(layers, _DEFAULT_LAYERS, _LINK_LAYERS)
+    record = dataset.sample[dataset.getind("sample", sample)]
     if view_range is not None:
         check_view_range(view_range)
     shared = shared_boxes(dataset, record, link, agents)
-    reach = view_range or _reach(dataset, record, shared)
-    clouds = (
-        {"without the link": None, "with the link": link}
-        if "points" in shown and room != "column"
-        else {}
-    )
-    if current_style().few:
-        clouds.pop("without the link", None)
-    wide = 1.0 if clouds else widening(None) ** 1.5  # the legend is below
-    size = 5.0 * (1 + len(clouds)) + 0.4, 6.4
-    fig = figure_or_new(
-        fig, size, panels="several" if clouds else "one", page=0.6 if clouds else 1.28, column=1.28
-    )
-    first, *others = fig.subplots(1, 1 + len(clouds), squeeze=False)[0]
-    first.set(xlim=(-wide * reach, wide * reach), ylim=(-reach, reach), aspect="equal")
-    x_words, y_words = axis_words("ego")
-    first.set(xlabel=x_words, ylabel=y_words, title=_error_words(shared))
-    _draw_shared(shared, shown, first)
-    write_beside(
-        first, f"{short_name(record['agent'])} receives", (0.0, 0.0), AGENT_COLORS[record["agent"]]
-    )
-    for ax, (words, there) in zip(others, clouds.items(), strict=True):
-        draw_bev(
-            dataset,
-            record,
-            BevView(view_range=reach, agents=agents, link=there),
-            shown - {"boxes", "ids"},
-            ax,
-        )
+    view_range = view_range or _view_range(dataset, record, shared)
+    links = _links_of_clouds(link, shown_layers)
+    fig, box_ax, cloud_axes = _panels(fig, len(links))
+    # the legend is below, so a slide's panel is wider
+    width_ratio = 1.0 if links else widening(None) ** 1.5
+    half_width = width_ratio * view_range
+    box_ax.set(xlim=(-half_width, half_width), ylim=(-view_range, view_range), aspect="equal")
+    label_axes(box_ax, "ego")
+    box_ax.set_title(_error_words(shared))
+    _draw_shared(shared, shown_layers, box_ax)
+    words = f"{short_name(record['agent'])} receives"
+    write_beside(box_ax, words, (0.0, 0.0), AGENT_COLORS[record["agent"]])
+    for ax, (words, cloud_link) in zip(cloud_axes, links.items(), strict=True):
+        view = BevView(view_range=view_range, agents=agents, link=cloud_link)
+        draw_bev(dataset, record, view, shown_layers - {"boxes", "ids"}, ax)
         ax.set(title=f"clouds {words}", anchor="C")
-        if "boxes" in shown:
+        if "boxes" in shown_layers:
             truth = cooperative_boxes(dataset, record, agents=agents, frame="ego")
             draw_boxes_from_above(truth, ax, [OWN_COLOR] * len(truth), fill=0.0, linewidths=0.7)
     draw_legend(fig, [*map(_handle, shared), *_handles()], columns=4)
@@ -171,88 +160,96 @@ def render_link(
     return settled(fig)
 
 
-def _reach(dataset: Dataset, record: SampleRecord, shared: Sequence[SharedBoxes]) -> float:
-    """Metres to each side of the ego up to the agents and the colliding pair, within bounds."""
-    places = [
-        transform(dataset, record, at_once(record, each.agent), "ego", "ego").translation[:2]
-        for each in shared
-    ]
-    pair = [
-        each.true.select(np.isin(each.true.actor_id, [*collider_ids(dataset, record)]))
-        for each in shared
-    ]
-    far = np.concatenate([np.array(places), *(boxes.center[:, :2] for boxes in pair)])
-    return float(np.clip(np.abs(far).max() + _AROUND, *_REACHES))
+def _links_of_clouds(link: Link, layers: frozenset[Layer]) -> dict[str, Link | None]:
+    """Return the words for each panel of clouds → its link."""
+    if "points" not in layers or current_style().room == "column":
+        return {}
+    if current_style().few:
+        return {"with the link": link}
+    return {"without the link": None, "with the link": link}
+
+
+def _panels(fig: Figure | None, clouds: int) -> tuple[Figure, Axes, list[Axes]]:
+    """Return the figure, the axes of the boxes, and the axes of the clouds."""
+    size = 5.0 * (1 + clouds) + 0.4, 6.4
+    if clouds:
+        fig = figure_or_new(fig, size, panels="several", page=0.6, column=1.28)
+    else:
+        fig = figure_or_new(fig, size, panels="one", page=1.28, column=1.28)
+    box_ax, *cloud_axes = fig.subplots(1, 1 + clouds, squeeze=False)[0]
+    return fig, box_ax, cloud_axes
+
+
+def _view_range(dataset: Dataset, record: SampleRecord, shared: Sequence[SharedBoxes]) -> float:
+    """Return metres to each side of the ego up to the agents and the colliding pair.
+
+    They are within limits.
+    """
+    colliders = [*collider_ids(dataset, record)]
+    positions, pair_centers = [], []
+    for boxes in shared:
+        sample = simultaneous_sample(record, boxes.agent)
+        pose = transform(dataset, record, sample, "ego", "ego")
+        pair = boxes.true.select(np.isin(boxes.true.actor_id, colliders))
+        positions.append(pose.translation[:2])
+        pair_centers.append(pair.center[:, :2])
+    points = np.concatenate([np.array(positions), *pair_centers])
+    view_range = np.abs(points).max() + _VIEW_MARGIN_M
+    return float(np.clip(view_range, *_VIEW_RANGE_LIMITS_M))
 
 
 def shared_boxes(
     dataset: Dataset, sample: RowArgument, link: Link, agents: Agents = None
 ) -> list[SharedBoxes]:
-    """Each partner's tracked boxes as they arrive; arguments and errors as in `render_link`."""
+    """Return each partner's tracked boxes as received; arguments and errors as in `render_link`."""
     record = dataset.get("sample", sample)
-    partners = [
-        agent for agent in cooperating_agents(dataset, sample, agents) if agent != record["agent"]
-    ]
+    names = cooperating_agents(dataset, sample, agents)
+    partners = [agent for agent in names if agent != record["agent"]]
     if not partners:
         raise ChoiceError(
             f"agents: expected a partner of {record['agent']}, found none; a link needs two agents"
         )
-    arriving = {
-        message.agent for message in messages(dataset, sample, agents, link)
-    }  # together they may not fit
-    return [
-        SharedBoxes(
-            agent=agent,
-            true=_tracked(cooperative_boxes(dataset, sample, agents=[agent], frame="ego")),
-            received=_tracked(
-                cooperative_boxes(
-                    dataset,
-                    sample,
-                    agents=[agent],
-                    frame="ego",
-                    link=link if agent in arriving else replace(link, packet_loss=1.0),
-                )
-            ),
-        )
-        for agent in partners
-    ]
+    # all messages are sent together, since together they may not fit the link
+    senders = {message.agent for message in messages(dataset, sample, agents, link)}
+    shared = []
+    for agent in partners:
+        agent_link = link if agent in senders else replace(link, packet_loss=1.0)
+        true = cooperative_boxes(dataset, sample, agents=[agent], frame="ego")
+        received = cooperative_boxes(dataset, sample, agents=[agent], frame="ego", link=agent_link)
+        shared.append(SharedBoxes(agent=agent, true=_tracked(true), received=_tracked(received)))
+    return shared
 
 
 def _tracked(boxes: Boxes) -> Boxes:
     return boxes.select(boxes.actor_id != UNTRACKED_ID)
 
 
-def _draw_shared(shared: Sequence[SharedBoxes], shown: frozenset[Layer], ax: Axes) -> None:
-    """Render partners' boxes, and how far they are from their places."""
-    ax.plot(0, 0, **_RECEIVER)
+def _draw_shared(shared: Sequence[SharedBoxes], layers: frozenset[Layer], ax: Axes) -> None:
+    """Draw partners' boxes, with arrows from their true positions."""
+    ax.plot(0, 0, **_RECEIVER_STYLE)
     keep_free(ax, [[(0.0, 0.0)]], margin=(-5, -5, 5, 5))
-    true = concatenate([each.true for each in shared], "ego")
+    true = concatenate([boxes.true for boxes in shared], "ego")
     true = true.select(np.unique(true.actor_id, return_index=True)[1])
-    hues = [TRUE_PLACE_COLOR] * len(true)
-    if "boxes" in shown:
-        draw_boxes_from_above(true, ax, hues, fill=0, linestyle=_DASHED, linewidths=1)
-    for each in shared:
-        colors = [AGENT_COLORS[each.agent]] * len(each.received)
-        if "boxes" in shown:
-            draw_boxes_from_above(each.received, ax, colors, fill=0.25, linewidths=1)
-        start, end = each.shifts
-        if len(start):
-            how: dict[str, Any] = {
-                "angles": "xy",
-                "scale_units": "xy",
-                "scale": 1,
-                "width": 0.004,
-                "zorder": 4,
-            }
-            ax.quiver(*start.T, *(end - start).T, color=OWN_COLOR, **how)
-    if "ids" in shown:
-        draw_ids_from_above(true, ax, hues)
-    if "grid" in shown:
+    true_colors = [TRUE_PLACE_COLOR] * len(true)
+    if "boxes" in layers:
+        draw_boxes_from_above(
+            true, ax, true_colors, fill=0, linestyle=_TRUE_LINE_STYLE, linewidths=1
+        )
+    for boxes in shared:
+        colors = [AGENT_COLORS[boxes.agent]] * len(boxes.received)
+        if "boxes" in layers:
+            draw_boxes_from_above(boxes.received, ax, colors, fill=0.25, linewidths=1)
+        starts, ends = boxes.shifts
+        if len(starts):
+            ax.quiver(*starts.T, *(ends - starts).T, color=OWN_COLOR, **ARROW_STYLE)
+    if "ids" in layers:
+        draw_ids_from_above(true, ax, true_colors)
+    if "grid" in layers:
         with_light_grid(ax, "both")
 
 
 def _handle(shared: SharedBoxes) -> Artist:
-    """A partner's hue, and how far its boxes are from their places on average."""
+    """Return the handle of a partner: its hue, and the mean shift of its boxes."""
     from matplotlib.patches import Patch
 
     color = AGENT_COLORS[shared.agent]
@@ -260,7 +257,7 @@ def _handle(shared: SharedBoxes) -> Artist:
 
 
 def _handles() -> list[Artist]:
-    """What the other marks of the first panel mean."""
+    """Return handles of the other marks of the first panel."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -282,14 +279,14 @@ def _shift_words(shared: SharedBoxes) -> str:
     name = short_name(shared.agent)
     if not len(shared.received) and len(shared.true):
         return f"{name}: nothing arrived"
-    start, end = shared.shifts
-    if not len(start):
+    starts, ends = shared.shifts
+    if not len(starts):
         return f"{name}: no box in common"
-    apart = np.linalg.norm(end - start, axis=1)
-    return f"{name}: {apart.mean():.2f} m"
+    distances = np.linalg.norm(ends - starts, axis=1)
+    return f"{name}: {distances.mean():.2f} m"
 
 
 def _error_words(shared: Sequence[SharedBoxes]) -> str:
-    """The title of all partners' boxes."""
-    apart = [np.linalg.norm(np.subtract(*each.shifts), axis=1) for each in shared]
-    return f"boxes, off by at most {np.concatenate(apart).max(initial=0):.2f} m"
+    """Return the title of all partners' boxes."""
+    distances = [np.linalg.norm(np.subtract(*boxes.shifts), axis=1) for boxes in shared]
+    return f"boxes, off by at most {np.concatenate(distances).max(initial=0):.2f} m"

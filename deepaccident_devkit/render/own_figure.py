@@ -1,4 +1,7 @@
-"""The devkit's own kind of figure. The module imports matplotlib, so it is imported where a figure is made."""
+"""The devkit's own class of figures.
+
+The module imports matplotlib, so it is imported where a figure is made.
+"""
 
 from __future__ import annotations
 
@@ -11,29 +14,30 @@ from deepaccident_devkit.render.styles import current_style, own_settings
 
 
 class OwnFigure(Figure):
-    """A figure that looks as its style says, and no setting of the user counts, when it is made or later.
+    """A figure in the look of its style; no setting of the user counts, when it is made or later.
 
     Attributes:
-        settings: gives the settings, for `with`, of the style that was the current one when the figure was made.
+        settings: Function that returns the settings, for `with`, of the current style when the
+            figure was made.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        """Take what `Figure` takes."""
+        """Make a figure from the arguments of `Figure`."""
         self.settings = partial(own_settings, current_style())
         with self.settings():
             super().__init__(*arguments, **options)
 
     def add_subplot(self, *arguments: Any, **options: Any) -> Any:
-        """Add axes; `subplots` does it with this too."""
+        """Add axes; `subplots` also calls this."""
         with self.settings():
             return super().add_subplot(*arguments, **options)
 
     def draw(self, renderer: Any) -> None:
-        """Render it on a canvas."""
+        """Render the figure on a canvas."""
         with self.settings():
             super().draw(renderer)
 
     def savefig(self, *arguments: Any, **options: Any) -> None:
-        """Write it into a file."""
+        """Write the figure into a file."""
         with self.settings():
             super().savefig(*arguments, **options)

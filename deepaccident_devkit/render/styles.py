@@ -1,8 +1,9 @@
-"""How pictures look: the one table of colours of all pictures and pages, and the sizes of a paper or a slide.
+"""Colours of all pictures and pages, and the sizes of pictures in a paper or on a slide.
 
-Saturated hues are the five agents'. Red is the colliding pair, and nothing else; no colour map has it. Classes are
-shades of slate, and small ones have a shape of their own. Verdicts are muted, and no agent's hue. Hues differ in
-lightness too, for colour-blind readers: `docs/check_colors.py` measures it, and a test asserts it.
+Saturated hues are the five agents'. Red is the colliding pair, and nothing else has it; no colour
+map contains it. Classes are shades of slate, and small ones have a shape of their own. Verdicts are
+muted, and no agent's hue. Hues also differ in lightness, for colour-blind readers:
+`docs/check_colors.py` measures it, and a test asserts it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ CATEGORY_COLORS: Mapping[str, str] = {
     "motorcycle": "#7b8996",
     "pedestrian": "#1d272f",
 }
-# Hues of the classes, for pictures that are about them: all eyes tell them from each other and from the pair's red.
+# Hues of the classes, for pictures that are about them: all eyes distinguish them from each other
+# and from the pair's red.
 CLASS_COLORS: Mapping[str, str] = {
     "car": "#40409f",
     "truck": "#402040",
@@ -43,7 +45,7 @@ CLASS_COLORS: Mapping[str, str] = {
     "motorcycle": "#ff8000",
     "pedestrian": "#9f00ff",
 }
-# matplotlib's markers of the classes whose boxes are too small to be found from above.
+# matplotlib's markers of the classes with boxes that are too small to be found from above.
 CATEGORY_MARKERS: Mapping[str, str] = {"cyclist": "D", "motorcycle": "^", "pedestrian": "o"}
 # Instances of motion maps, by turns.
 INSTANCE_COLORS = ("#63717e", "#b5c3cf", "#4a5864", "#94a2b0", "#323f4b", "#7b8996")
@@ -51,7 +53,7 @@ INSTANCE_COLORS = ("#63717e", "#b5c3cf", "#4a5864", "#94a2b0", "#323f4b", "#7b89
 OWN_COLOR = "#111111"
 # Edges around marks and lines that lie on pictures.
 CASING_COLOR = "#ffffff"
-# LiDAR points that are not coloured by a value.
+# LiDAR points without a value for their colour.
 POINT_COLOR = "#9a9a9a"
 # LiDAR points in images; the nearest are yellow.
 DEPTH_COLORMAP = "viridis_r"
@@ -69,7 +71,7 @@ BEV_COLORS: Mapping[str, str] = {
     "vehicle": "#d3d9e0",
     "pedestrian": "#d3d9e0",
 }
-# The ground of a town's map that is alone in its picture.
+# The ground of a town's map in a picture of its own.
 MAP_COLORS: Mapping[str, str] = {
     "road": "#868f98",
     "road_line": "#ffffff",
@@ -77,13 +79,14 @@ MAP_COLORS: Mapping[str, str] = {
     "other": "#dde4e0",
 }
 GRID_COLOR = "#d0d0d0"
-# The place of an image that is not there.
+# The panel of a missing image.
 MISSING_COLOR = "#dddddd"
 # Less important words.
 MUTED_COLOR = "#666666"
-# The true place of something that is also rendered at another place.
+# The true position of something that is also rendered at another position.
 TRUE_PLACE_COLOR = "#8a8a8a"
-# Predictions that are right, predictions that are false, and truths that are missed: green, sand and pale grey.
+# Predictions that are right, predictions that are false, and truths that are missed: green, sand
+# and pale grey.
 OUTCOME_COLORS: Mapping[str, str] = {"right": "#23644d", "false": "#a98c52", "missed": "#bcc0c3"}
 # Predictions without a verdict: mauve.
 PREDICTED_COLOR = "#a8679b"
@@ -100,28 +103,30 @@ WARNING_COLOR = "#6b4a10"
 LINK_COLOR = "#2f4a63"
 # Background of a frame that is not recorded.
 BEYOND_COLOR = "#e4e4e4"
-# Dark for readers whose system is.
+# Colours of pages, dark on a system in dark mode.
 COLORS: Final = f"""
-:root {{ color-scheme: light; --paper: #fff; --ink: #1c1c1c; --soft: #444; --dim: #555; --line: #ececec;
+:root {{ color-scheme: light; --paper: #fff; --ink: #1c1c1c; --soft: #444; --dim: #555; \
+--line: #ececec;
   --rule: {GRID_COLOR}; --accent: {LINK_COLOR}; --caution: {WARNING_COLOR};
   --link: var(--accent); --warning: var(--caution); --block: #f3f3f3; --edge: #999; }}
 @media screen and (prefers-color-scheme: dark) {{
-  :root {{ color-scheme: dark; --paper: #181818; --ink: #e8e8e8; --soft: #c9c9c9; --dim: #a8a8a8; --line: #333;
+  :root {{ color-scheme: dark; --paper: #181818; --ink: #e8e8e8; --soft: #c9c9c9; --dim: #a8a8a8; \
+--line: #333;
     --rule: #535353; --link: color-mix(in srgb, var(--accent) 40%, #fff);
     --warning: color-mix(in srgb, var(--caution) 40%, #fff); --block: #292929; --edge: #777; }}
 }}
 """
 Drawing = TypeVar("Drawing", bound=Callable[..., Any])
 # Inches of a picture's height that words take, about: they shrink less than the picture.
-_ROOM_FOR_WORDS: Final = 0.5
+_WORDS_HEIGHT_IN: Final = 0.5
 # Type 42: the letters of a PDF file stay letters, as publishers ask.
 _FONTS: Final = {"pdf.fonttype": 42, "ps.fonttype": 42}
-_applied: ContextVar[_Style | None] = ContextVar("applied", default=None)
-_ONE_AT_A_TIME: Final = RLock()  # matplotlib has its settings once for all threads
+_applied_style: ContextVar[_Style | None] = ContextVar("applied", default=None)
+_SETTINGS_LOCK: Final = RLock()  # matplotlib has its settings once for all threads
 
 
 def page_style() -> str:
-    """The rules of all pages but replays."""
+    """Return the style rules of all pages except replays."""
     return COLORS + part("pages.css")
 
 
@@ -130,16 +135,17 @@ class _Style:
     """Sizes and words of new pictures.
 
     Attributes:
-        dpi: pixels an inch, for what is written.
-        panel: inches of the width of a picture with one panel; None for the view's own.
-        figure: the same with several panels.
-        ratio: width by height; None for the view's own.
-        letters: points of the smallest letters.
-        room: what a picture with several panels has room for: all of them, a page's width, a column or a slide.
-        tokens: whether titles have tokens.
-        titled: whether pictures have a title.
-        by_class: whether boxes have the hues of their classes, all but the pair's.
-        rc: matplotlib's settings.
+        dpi: Pixels an inch, for files.
+        panel: Width of a picture with one panel, inches; None for the view's own.
+        figure: Width of a picture with several panels, inches; None for the view's own.
+        ratio: Width by height; None for the view's own.
+        letters: Size of the smallest letters, points.
+        room: Extent of a picture with several panels: all of them, a page's width, a column or a
+            slide.
+        tokens: Whether titles have tokens.
+        titled: Whether pictures have a title.
+        by_class: Whether boxes have the hues of their classes, except the pair's boxes.
+        rc: Settings of matplotlib.
     """
 
     dpi: float
@@ -159,33 +165,34 @@ class _Style:
         return self.room != "all"
 
 
-def _small(letters: float, **how: Any) -> _Style:
-    """A style of small pictures with letters of so many points."""
-    sizes = {
+def _small(letters: float, **options: Any) -> _Style:
+    """Return a style of small pictures; `letters` is the size of letters in points."""
+    rc = {
+        **_FONTS,
         "font.size": letters,
         "axes.titlesize": letters,
         "figure.titlesize": letters + 1,
         "axes.linewidth": 0.6,
+        "xtick.major.size": 2.5,
+        "xtick.major.pad": 2.0,
+        "ytick.major.size": 2.5,
+        "ytick.major.pad": 2.0,
+        "axes.labelpad": 2.0,
     }
-    ticks = {
-        f"{axis}tick.{name}": size
-        for axis in "xy"
-        for name, size in (("major.size", 2.5), ("major.pad", 2.0))
-    }
-    return _Style(
-        letters=letters, tokens=False, rc={**_FONTS, **sizes, **ticks, "axes.labelpad": 2.0}, **how
-    )
+    return _Style(letters=letters, tokens=False, rc=rc, **options)
 
 
 def _printed(panel: float, figure: float) -> _Style:
-    """A style of a paper; letters of 7 points in DejaVu Sans are as tall as 9 points of Times."""
-    return _small(
-        7, dpi=300, panel=panel, figure=figure, room="column" if figure < _COLUMN else "page"
-    )
+    """Return a style of a paper, with widths of a panel and of a figure in inches.
+
+    Letters of 7 points in DejaVu Sans are as tall as 9 points of Times.
+    """
+    room = "column" if figure < _MAX_COLUMN_WIDTH_IN else "page"
+    return _small(7, dpi=300, panel=panel, figure=figure, room=room)
 
 
 # Inches: a narrower picture is a column of a paper.
-_COLUMN: Final = 4.0
+_MAX_COLUMN_WIDTH_IN: Final = 4.0
 _STYLES: Final[Mapping[str, _Style]] = {
     "paper": _printed(3.5, 7.16),
     "cvpr-column": _printed(3.25, 3.25),
@@ -197,36 +204,34 @@ _STYLES: Final[Mapping[str, _Style]] = {
 }
 
 
-_NOTEBOOK: Final = _Style(dpi=100, rc=_FONTS)
-
-
-_current: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK)
+_NOTEBOOK_STYLE: Final = _Style(dpi=100, rc=_FONTS)
+_selected_style: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK_STYLE)
 
 
 @contextmanager
 def own_settings(style: _Style | None = None) -> Iterator[None]:
-    """Matplotlib's own settings and those of a style (None: the current one) in place of the user's, for `with`.
+    """Replace the user's settings by matplotlib's own and a style's, for `with`.
 
-    All that renders passes here, so that a picture depends on nothing but its style: a user's font, grid or
-    `image.origin` would change what it says.
+    The style is the current one for None. All rendering uses this, so that a picture depends only
+    on its style: a user's font, grid or `image.origin` would change its message.
     """
     from matplotlib import style as styles
 
-    chosen = style or current_style()
-    if _applied.get() is chosen:
+    applied = style or current_style()
+    if _applied_style.get() is applied:
         yield
         return
-    settings: Any = ["default", {**chosen.rc, "savefig.dpi": chosen.dpi}]
-    with _ONE_AT_A_TIME, styles.context(settings):
-        token = _applied.set(chosen)
+    settings: Any = ["default", {**applied.rc, "savefig.dpi": applied.dpi}]
+    with _SETTINGS_LOCK, styles.context(settings):
+        token = _applied_style.set(applied)
         try:
             yield
         finally:
-            _applied.reset(token)
+            _applied_style.reset(token)
 
 
 def in_own_settings(function: Drawing) -> Drawing:
-    """Before a function that renders: it does so with `own_settings`."""
+    """Make a function render in `own_settings`, as a decorator."""
     return own_settings()(function)
 
 
@@ -237,19 +242,20 @@ def style(
     title: bool = True,
     color_by: Literal["role", "class"] = "role",
 ) -> Iterator[None]:
-    """In a `with` statement: new pictures have the size, panels and letters that a paper or a slide needs.
+    """Give new pictures the size, panels and letters of a paper or a slide, in a `with` statement.
 
     Args:
-        name: `cvpr-column` (3.25 inches wide), `cvpr-page` (6.875), `ieee-column` (3.5) and `ieee-page` (7.16), for
-            papers: letters of 7 points or more, 300 pixels an inch. `paper`: an IEEE column, or with several panels a
-            page. `slide`: 16 to 9, with large letters, 1920 × 1080 pixels. None: as in a notebook. In papers and on
-            slides views of many panels show fewer, and nothing has tokens.
-        title: whether pictures have a title; a paper's caption may say it.
-        color_by: what the colours of boxes mean: the `role` in the accident, or the `class`, with a hue for each; the
-            pair is red in both.
+        name: `cvpr-column` (3.25 inches wide), `cvpr-page` (6.875), `ieee-column` (3.5) and
+            `ieee-page` (7.16), for papers: letters of 7 points or more, 300 pixels an inch.
+            `paper`: an IEEE column, or with several panels a page. `slide`: 16 to 9, with large
+            letters, 1920 × 1080 pixels. None: as in a notebook. In papers and on slides views of
+            many panels show fewer, and nothing has tokens.
+        title: Whether pictures have a title; a paper's caption may replace it.
+        color_by: Meaning of the colours of boxes: the `role` in the accident, or the `class`, with
+            a hue for each; the pair is red in both.
 
     Raises:
-        ChoiceError: no such style or way to colour.
+        ChoiceError: No such style or way to colour.
     """
     from matplotlib import rc_context
 
@@ -258,28 +264,31 @@ def style(
             f"style: expected one of {', '.join(get_args(StyleName))}, found {name!r}"
         )
     by_class = choice("color_by", color_by, ("role", "class")) == "class"
-    chosen = replace(_NOTEBOOK if name is None else _STYLES[name], titled=title, by_class=by_class)
-    token = _current.set(chosen)
+    base = _NOTEBOOK_STYLE if name is None else _STYLES[name]
+    selected = replace(base, titled=title, by_class=by_class)
+    token = _selected_style.set(selected)
     try:
-        with rc_context(cast("Any", {**chosen.rc, "savefig.dpi": chosen.dpi})):
+        with rc_context(cast("Any", {**selected.rc, "savefig.dpi": selected.dpi})):
             yield
     finally:
-        _current.reset(token)
+        _selected_style.reset(token)
 
 
 def current_style() -> _Style:
-    """The style of pictures that are made now."""
-    return _current.get()
+    """Return the style of new pictures."""
+    return _selected_style.get()
 
 
 def category_colors() -> Mapping[str, str]:
-    """The colours of classes in pictures that are made now."""
-    return CLASS_COLORS if _current.get().by_class else CATEGORY_COLORS
+    """Return the colours of classes in new pictures."""
+    if current_style().by_class:
+        return CLASS_COLORS
+    return CATEGORY_COLORS
 
 
 def text_size() -> float:
-    """Points of the smallest letters of pictures that are made now: they can be read in print."""
-    return _current.get().letters
+    """Return the size of the smallest letters of new pictures, points; it is readable in print."""
+    return current_style().letters
 
 
 def size_in_style(
@@ -288,17 +297,18 @@ def size_in_style(
     panels: Literal["one", "several"],
     heights: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[float, float]:
-    """Inches in the current style of a picture that would have this size in a notebook.
+    """Return the size in inches, in the current style, of a picture of this size in a notebook.
 
-    `heights` are those of `page` and `column`, in widths, where a view has other panels there.
+    `heights` are the heights in `page` and `column`, in widths, if a view has other panels there.
     """
-    chosen = _current.get()
-    width = chosen.panel if panels == "one" else chosen.figure
+    selected = current_style()
+    width = selected.panel if panels == "one" else selected.figure
     if width is None:
         return size
-    if chosen.ratio is not None:
-        return width, width / chosen.ratio
-    if chosen.room in heights:
-        return width, width * heights[chosen.room]
+    if selected.ratio is not None:
+        return width, width / selected.ratio
+    if selected.room in heights:
+        return width, width * heights[selected.room]
     share = width / size[0]
-    return width, share * size[1] + max(0.0, 1 - share) * _ROOM_FOR_WORDS
+    words_height = max(0.0, 1 - share) * _WORDS_HEIGHT_IN
+    return width, share * size[1] + words_height

@@ -1,4 +1,4 @@
-"""Curves of a training run: losses by step, and scores on the validation split. They take plain numbers."""
+"""Curves of a training run, from plain numbers: losses by step, and validation scores."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from deepaccident_devkit.render.figures import (
     axes_or_new,
     figure_or_new,
+    hide_axes,
     report_figure,
     with_light_grid,
     write_report_figure,
@@ -29,53 +30,56 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PANEL: Final = (3.4, 2.4)
-_COLUMNS: Final = 3
+_PANEL_SIZE_IN: Final = (3.4, 2.4)
+_COLUMN_COUNT: Final = 3
 _DPI: Final = 120
-# Steps are averaged in at most so many groups, so that a curve shows its way and not its noise.
-_MEANS: Final = 60
+# Maximum number of groups of averaged steps, so that a curve shows its trend and not its noise.
+_MAX_GROUPS: Final = 60
 
 
 @in_own_settings
 def render_curve(
     steps: Sequence[int], values: Sequence[float], title: str, *, ax: Axes | None = None
 ) -> Axes:
-    """Render one number by the optimizer's step: each value as a dot, and means of groups of steps as a line."""
-    ax = axes_or_new(ax, _PANEL)
-    crowded = len(values) > _MEANS
-    ax.plot(
-        steps,
-        values,
-        ".",
-        color=MUTED_COLOR if crowded else PREDICTED_COLOR,
-        markersize=2 if crowded else 6,
-    )
-    groups = [
-        np.array_split(np.asarray(each, dtype=float), min(_MEANS, len(values)) or 1)
-        for each in (steps, values)
-    ]
-    with catch_warnings():
-        simplefilter("ignore", RuntimeWarning)  # a group of gaps alone is a gap
-        means = [[np.nanmean(group) for group in each] for each in groups]
-    ax.plot(*means, color=OWN_COLOR if crowded else PREDICTED_COLOR)
+    """Render one number by the optimizer's step.
+
+    Each value is a dot, and means of groups of steps are a line.
+    """
+    ax = axes_or_new(ax, _PANEL_SIZE_IN)
+    dot_color, dot_size, line_color = PREDICTED_COLOR, 6, PREDICTED_COLOR
+    if len(values) > _MAX_GROUPS:
+        dot_color, dot_size, line_color = MUTED_COLOR, 2, OWN_COLOR
+    ax.plot(steps, values, ".", color=dot_color, markersize=dot_size)
+    count = min(_MAX_GROUPS, len(values)) or 1
+    ax.plot(_group_means(steps, count), _group_means(values, count), color=line_color)
     ax.set_title(title, fontsize=text_size())
     ax.set_ylim(bottom=0)
     return with_light_grid(ax, "both")
+
+
+def _group_means(values: Sequence[float], count: int) -> list[Any]:
+    groups = np.array_split(np.asarray(values, dtype=float), count)
+    with catch_warnings():
+        simplefilter("ignore", RuntimeWarning)  # a group of gaps only is a gap
+        return [np.nanmean(group) for group in groups]
 
 
 @in_own_settings
 def render_training(
     rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figure | None = None
 ) -> Figure:
-    """Render the curves of a run by the rows of its log: a `step`, and numbers by name, also below `validation`."""
+    """Render the curves of a run by the rows of its log.
+
+    A row has a `step`, and numbers by name, also below `validation`.
+    """
     curves = _curves(rows)
     fig = figure_or_new(fig, _size(len(curves)))
-    axes = fig.subplots(_lines(len(curves)), _COLUMNS, squeeze=False).ravel()
+    axes = fig.subplots(_lines(len(curves)), _COLUMN_COUNT, squeeze=False).ravel()
     for ax, (name, points) in zip(axes, curves.items(), strict=False):
-        render_curve([step for step, _ in points], [value for _, value in points], name, ax=ax)
-    for ax in axes[len(curves) :]:
-        ax.set_axis_off()
-    for ax in axes[max(len(curves) - _COLUMNS, 0) : len(curves)]:
+        steps = [step for step, _ in points]
+        render_curve(steps, [value for _, value in points], name, ax=ax)
+    hide_axes(axes[len(curves) :])
+    for ax in axes[max(len(curves) - _COLUMN_COUNT, 0) : len(curves)]:
         ax.set_xlabel("step")
     fig.suptitle(title)
     return fig
@@ -83,21 +87,23 @@ def render_training(
 
 def save_training(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
     """Write `render_training` into a PNG file, as `write_report_figure` does. Raises OSError."""
-    write_report_figure(
-        render_training(rows, title, fig=report_figure(_size(len(_curves(rows))))), path, dpi=_DPI
-    )
+    fig = report_figure(_size(len(_curves(rows))))
+    write_report_figure(render_training(rows, title, fig=fig), path, dpi=_DPI)
 
 
 def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[int, float]]]:
-    """Name → (step, value): losses first, their total before them, then scores.
+    """Return name → (step, value): losses first, their total before them, then scores.
 
-    A loss of exactly 0 was computed of nothing, and is a gap (NaN).
+    A loss of exactly 0 was computed from nothing, and is a gap (NaN).
     """
     losses: dict[str, list[tuple[int, float]]] = {}
     scores: dict[str, list[tuple[int, float]]] = {}
     for row in rows:
         parts = row.get("losses") or {}
-        total = {"total": row["loss"]} if "loss" in row and parts else {}
+        if "loss" in row and parts:
+            total = {"total": row["loss"]}
+        else:
+            total = {}
         for name, value in (total | parts).items():
             losses.setdefault(name, []).append((row["step"], value or math.nan))
         for name, value in (row.get("validation") or {}).items():
@@ -106,9 +112,9 @@ def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[int, floa
 
 
 def _size(curves: int) -> tuple[float, float]:
-    return _PANEL[0] * _COLUMNS, _PANEL[1] * _lines(curves) + 0.4
+    return _PANEL_SIZE_IN[0] * _COLUMN_COUNT, _PANEL_SIZE_IN[1] * _lines(curves) + 0.4
 
 
 def _lines(curves: int) -> int:
-    """Rows of panels; one, though empty, of a log without any numbers."""
-    return max(-(-curves // _COLUMNS), 1)
+    """Return the number of rows of panels; one, though empty, for a log without any numbers."""
+    return max(-(-curves // _COLUMN_COUNT), 1)

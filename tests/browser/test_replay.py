@@ -20,7 +20,7 @@ from wording import holding, lacking
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, box_truth
-from deepaccident_devkit.render.boxes import EDGES, NEAREST_DRAWN, camera_name, segments_in_image
+from deepaccident_devkit.render.boxes import EDGES, NEAR_PLANE_M, camera_name, segments_in_image
 from deepaccident_devkit.render.replay import recording_of, render_replay
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
@@ -450,7 +450,7 @@ def test_boxes_are_where_the_camera_has_them(
         for actor, path in drawn_:
             (corners,) = optical.select(optical.actor_id == actor).corners()
             wanted, there = segments_in_image(corners[np.array(EDGES)], da.camera(sample, channel))
-            cut += int((corners[:, 2] < NEAREST_DRAWN).any())
+            cut += int((corners[:, 2] < NEAR_PLANE_M).any())
             found = np.array([float(each) for each in re.findall(r"-?[\d.]+", path)]).reshape(
                 -1, 2, 2
             )

@@ -25,7 +25,7 @@ from deepaccident_devkit.release.images import picture_bytes
 from deepaccident_devkit.release.store.store import FileCache
 from deepaccident_devkit.render.boxes import EDGES, actor_color, recorders_of, segments_in_image
 from deepaccident_devkit.render.camera import best_view
-from deepaccident_devkit.render.captions import is_there
+from deepaccident_devkit.render.captions import has_sensor_file
 from deepaccident_devkit.render.figures import figure_png
 from deepaccident_devkit.render.replay import recording_of, served_replay
 from deepaccident_devkit.render.replay.entries import ReplayRecording
@@ -264,10 +264,10 @@ def _last_images(dataset: Dataset, record: ScenarioRecord) -> tuple[int, list[tu
 def _camera(dataset: Dataset, samples: list[str], pair: Boxes) -> str | None:
     """The camera (token) that is shown, of no pair a front one if there is any; None where no image is there."""
     view = best_view(dataset, samples, pair) if len(pair) else None
-    if view is not None and is_there(dataset, view.camera):
+    if view is not None and has_sensor_file(dataset, view.camera):
         return view.camera
     cameras = (f"{sample}/{channel}" for channel in CAMERAS for sample in samples)
-    return next((camera for camera in cameras if is_there(dataset, camera)), None)
+    return next((camera for camera in cameras if has_sensor_file(dataset, camera)), None)
 
 
 def _photo(dataset: Dataset, camera: str, pair: Boxes) -> Any:

@@ -1,4 +1,7 @@
-"""Figures of an evaluation, and the report with all of them. A panel's function takes `ax=` and returns the Axes."""
+"""Figures of an evaluation, and the report with all of them.
+
+The function of a panel takes `ax=` and returns the Axes.
+"""
 
 from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome
 from deepaccident_devkit.render.evaluation.over_bytes import render_over_bytes

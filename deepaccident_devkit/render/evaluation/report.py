@@ -32,56 +32,53 @@ from deepaccident_devkit.support.files import place_in, writable_folder, write_b
 from deepaccident_devkit.support.pages import document, result_text, scalar
 from deepaccident_devkit.support.reading import read_bytes
 
-_BETTER: Final = {True: "higher", False: "lower", None: ""}
+# `higher_is_better` of a headline → word of the report.
+_BETTER_WORDS: Final = {True: "higher", False: "lower", None: ""}
 # Field of a result → heading of its table.
-_PARTS: Final = {
+_TABLE_HEADINGS: Final = {
     "truths": "Actors in the samples' true accidents",
     "within": "By the allowed distance (m)",
     "ranges": "By range",
     "classes": "By class",
     "beside": "With other choices, always reported as well",
 }
-# What is known of a class without true boxes.
-_COUNTED: Final = ("thresholds", "truths", "detections")
-# Fields that results give about themselves and that are shown at the top, if there are any.
-_SHOWN_META: Final = ("method", "name", "authors", "url", "date")
+# Known values of a class without true boxes.
+_KNOWN_WITHOUT_TRUTH: Final = ("thresholds", "truths", "detections")
+# Fields of the results' own metadata that the header shows, if present.
+_HEADER_META: Final = ("method", "name", "authors", "url", "date")
 REPORT_FILE: Final = "report.html"
 FIGURES_FOLDER: Final = "figures"
 
 
 def report_context(run: EvaluationRun) -> dict[str, Any]:
-    """All that the template `evaluation_report.html` shows of a run, apart from pictures."""
-    told, summary = run.result.as_dict(), run.summary()
-    everything = next((each for each in run.breakdowns if each.by == EVERYTHING), None)
-    group = everything.groups[0] if everything is not None and everything.groups else None
-    percent = "" if everything is None else f"{100 * everything.resampling.confidence:g} % "
-    same = {
-        each.by: each.groups[0].value or UNKNOWN for each in run.breakdowns if len(each.groups) == 1
+    """Return the data of a run for the template `evaluation_report.html`, without pictures."""
+    fields, summary = run.result.as_dict(), run.summary()
+    everything = next((item for item in run.breakdowns if item.by == EVERYTHING), None)
+    group, percent = None, ""
+    if everything is not None:
+        percent = f"{100 * everything.resampling.confidence:g} % "
+        group = next(iter(everything.groups), None)
+    common_values = {
+        item.by: item.groups[0].value or UNKNOWN for item in run.breakdowns if len(item.groups) == 1
     }
     return {
         "title": f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}",
         "partial": "" if run.partial is None else run.partial.text(),
         "header": _header(run, summary),
-        "headlines": [
-            [each.name, each.text(), _interval_text(each, group), _BETTER[each.higher_is_better]]
-            for each in _headlines(run.result)
-        ],
+        "headlines": _headline_rows(run.result, group),
         "interval": f"{percent}interval",
         "interval_notes": () if group is None or group.intervals else group.notes,
-        "predictors": [*predictor_tables(told), *means_tables(summary).values()],
-        "further": {
-            each.title.capitalize(): (each.tables(part), [*part["notes"], *part["interval_notes"]])
-            for each, part in further_results(summary)
-        },
+        "predictors": [*predictor_tables(fields), *means_tables(summary).values()],
+        "further": _further_tables(summary),
         "whole_numbers": {
-            name: result_text(value) for name, value in told.items() if isinstance(value, int)
+            name: result_text(value) for name, value in fields.items() if isinstance(value, int)
         },
-        "said": [*(told.get("notes") or ()), *reading_notes(summary)],
-        "counts": _counts(run.result, told),
-        "breakdowns": [_breakdown(each) for each in run.breakdowns if each.by not in same],
+        "said": [*(fields.get("notes") or ()), *reading_notes(summary)],
+        "counts": _counts(run.result, fields),
+        "breakdowns": [_breakdown(item) for item in run.breakdowns if item.by not in common_values],
         "same": [
             f"{name.replace('_', ' ')} {value}"
-            for name, value in same.items()
+            for name, value in common_values.items()
             if name != EVERYTHING
         ],
         "sanity": None if run.sanity is None else SanityReport(**run.sanity),
@@ -89,95 +86,123 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
     }
 
 
+def _headline_rows(result: Any, group: Group[Any] | None) -> list[list[str]]:
+    rows = []
+    for headline in _headlines(result):
+        interval = _interval_text(headline, group)
+        direction = _BETTER_WORDS[headline.higher_is_better]
+        rows.append([headline.name, headline.text(), interval, direction])
+    return rows
+
+
+def _further_tables(summary: Mapping[str, Any]) -> dict[str, tuple[Any, list[str]]]:
+    tables = {}
+    for extra, part in further_results(summary):
+        notes = [*part["notes"], *part["interval_notes"]]
+        tables[extra.title.capitalize()] = (extra.tables(part), notes)
+    return tables
+
+
 def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
-    """What was evaluated, and how."""
-    setup = run.setup
-    changed = ", ".join(f"{name} = {scalar(value)}" for name, value in setup.switches.items())
-    return {
-        "task": setup.task,
-        "protocol": setup.protocol + (f", but {changed}" if changed else ""),
-        **{
-            name: scalar(run.results.meta[name]) for name in _SHOWN_META if name in run.results.meta
-        },
-        "samples": f"{summary['counts']['samples']:,} of {summary['counts']['scenarios']:,} scenarios",
+    """Return what was evaluated, and how."""
+    setup, results, counts = run.setup, run.results, summary["counts"]
+    protocol = setup.protocol
+    changes = [f"{name} = {scalar(value)}" for name, value in setup.switches.items()]
+    if changes:
+        protocol += f", but {', '.join(changes)}"
+    header = {"task": setup.task, "protocol": protocol}
+    header |= {name: scalar(results.meta[name]) for name in _HEADER_META if name in results.meta}
+    header |= {
+        "samples": f"{counts['samples']:,} of {counts['scenarios']:,} scenarios",
         "selection": run.selection.text(),
-        **({"horizon": f"{setup.horizon:g} s"} if run.evaluator.has_horizon else {}),
-        "results": run.results.path,
-        "results' hash": run.results.fingerprint,
-        **({"bytes": sent.text()} if (sent := sent_bytes(summary)) else {}),
+    }
+    if run.evaluator.has_horizon:
+        header["horizon"] = f"{setup.horizon:g} s"
+    header |= {"results": results.path, "results' hash": results.fingerprint}
+    sent = sent_bytes(summary)
+    if sent:
+        header["bytes"] = sent.text()
+    versions = [f"{name} {version}" for name, version in summary["environment"].items()]
+    return header | {
         "release": f"{run.release.version}, {run.release.dataroot}",
         "release's hash": run.release.fingerprint,
         "devkit": summary["devkit_version"],
-        "made with": ", ".join(
-            f"{name} {version}" for name, version in summary["environment"].items()
-        ),
+        "made with": ", ".join(versions),
     }
 
 
-def _counts(result: object, told: Mapping[str, Any]) -> dict[str, Any]:
-    """Heading → what was counted, as `_columns` gives it."""
+def _counts(result: object, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return heading → counts, in the form of `_columns`."""
     for name in _absent_classes(result):
-        row = told["classes"][name]
-        row.update({key: None for key in row if key not in _COUNTED})
-    return {title: _columns(told[name]) for name, title in _PARTS.items() if told.get(name)}
+        row = fields["classes"][name]
+        row.update({key: None for key in row if key not in _KNOWN_WITHOUT_TRUTH})
+    counts = {}
+    for name, title in _TABLE_HEADINGS.items():
+        if fields.get(name):
+            counts[title] = _columns(fields[name])
+    return counts
 
 
 def _columns(value: Any) -> Any:
-    """Pairs as a text of ranges, a mapping of numbers as texts by name, one of mappings as rows with a heading."""
+    """Return the form of a value in the report.
+
+    Pairs become a text of ranges, a mapping of numbers texts by name, and a mapping of mappings
+    rows with a heading.
+    """
     if not isinstance(value, Mapping):
-        return "; ".join(
-            f"{low:g} m and more" if high is None else f"{low:g} to {high:g} m"
-            for low, high in value
-        )
-    if not all(isinstance(each, Mapping) for each in value.values()):
-        return {str(name): result_text(each) for name, each in value.items()}
-    names = list(dict.fromkeys(name for each in value.values() for name in each))
-    plain = [
-        name
-        for name in names
-        if not any(isinstance(each.get(name), Mapping) for each in value.values())
-    ]
-    return [
-        ["", *plain],
-        *([key, *(result_text(each.get(name)) for name in plain)] for key, each in value.items()),
-    ]
+        return "; ".join(_range_text(low, high) for low, high in value)
+    if not all(isinstance(row, Mapping) for row in value.values()):
+        return {str(name): result_text(number) for name, number in value.items()}
+    columns: dict[str, bool] = {}  # name → whether its values are plain
+    for row in value.values():
+        for name, cell in row.items():
+            columns[name] = columns.get(name, True) and not isinstance(cell, Mapping)
+    names = [name for name, is_plain in columns.items() if is_plain]
+    rows = [["", *names]]
+    for key, row in value.items():
+        rows.append([key, *(result_text(row.get(name)) for name in names)])
+    return rows
+
+
+def _range_text(low: float, high: float | None) -> str:
+    if high is None:
+        return f"{low:g} m and more"
+    return f"{low:g} to {high:g} m"
 
 
 def _breakdown(broken: Breakdown[Any]) -> dict[str, Any]:
-    """A table for an attribute, and one of only the vehicles if the numbers of samples differ."""
-    vehicles = broken.without_infrastructure
-    differ = sum(each.samples for each in vehicles) != sum(each.samples for each in broken.groups)
+    """Return a table for an attribute, and one of only the vehicles if sample numbers differ."""
+    groups, vehicle_groups = broken.groups, broken.without_infrastructure
+    vehicle_samples = sum(group.samples for group in vehicle_groups)
+    vehicles = None
+    if vehicle_samples != sum(group.samples for group in groups):
+        vehicles = _groups(broken, vehicle_groups, "without the roadside")
     return {
         "by": broken.by.replace("_", " "),
-        "all": _groups(broken, broken.groups, "all agents"),
-        "vehicles": _groups(broken, vehicles, "without the roadside") if differ else None,
+        "all": _groups(broken, groups, "all agents"),
+        "vehicles": vehicles,
     }
 
 
-def _groups(broken: Breakdown[Any], groups: Sequence[Group[Any]], whose: str) -> dict[str, Any]:
-    names = list(dict.fromkeys(each.name for group in groups for each in _headlines(group.result)))
+def _groups(broken: Breakdown[Any], groups: Sequence[Group[Any]], agents: str) -> dict[str, Any]:
+    headlines_of_groups = [_headlines(group.result) for group in groups]
+    names = list(dict.fromkeys(item.name for row in headlines_of_groups for item in row))
     rows = []
-    for group in groups:
-        known = {
-            each.name: (each.text(), _interval_text(each, group))
-            for each in _headlines(group.result)
-        }
+    for group, group_headlines in zip(groups, headlines_of_groups, strict=True):
+        cells = {item.name: (item.text(), _interval_text(item, group)) for item in group_headlines}
         label = UNKNOWN if group.value is None else group.value
-        rows.append(
-            [
-                label,
-                f"{group.samples:,}",
-                f"{group.scenarios:,}",
-                *(known.get(name, "–") for name in names),
-            ]
-        )
-    how = f"{100 * broken.resampling.confidence:g} % intervals, if there are {LEAST_CLUSTERS} clusters"
-    heading = [broken.by.replace("_", " "), "samples", "scenarios", *names]
-    return {"heading": heading, "rows": rows, "caption": f"{whose}; {how}"}
+        counts = [f"{group.samples:,}", f"{group.scenarios:,}"]
+        rows.append([label, *counts, *(cells.get(name, "–") for name in names)])
+    percent = 100 * broken.resampling.confidence
+    return {
+        "heading": [broken.by.replace("_", " "), "samples", "scenarios", *names],
+        "rows": rows,
+        "caption": f"{agents}; {percent:g} % intervals, if there are {LEAST_CLUSTERS} clusters",
+    }
 
 
 def _choices(run: EvaluationRun) -> Iterator[tuple[str, Any]]:
-    """Every switch of the protocol, and all other settings."""
+    """Yield every switch of the protocol, and all other settings."""
     yield "Every switch of the protocol", run.setup.as_dict()["settings"]
     yield "Selection of samples", run.selection.as_dict()
     if run.results.form is not None:
@@ -187,31 +212,35 @@ def _choices(run: EvaluationRun) -> Iterator[tuple[str, Any]]:
 
 
 def _headlines(result: Any) -> list[Headline]:
-    """The headlines as a report shows them: a class without true boxes has no value, also where the rules count 0."""
+    """Return the headlines as a report shows them.
+
+    A class without true boxes has no value, even if the rules count 0.
+    """
     paths = {f"class_average_precision/{name}" for name in _absent_classes(result)}
-    return [replace(each, value=None) if each.path in paths else each for each in headlines(result)]
+    shown_headlines = []
+    for headline in headlines(result):
+        absent = headline.path in paths
+        shown_headlines.append(replace(headline, value=None) if absent else headline)
+    return shown_headlines
 
 
 def _absent_classes(result: object) -> list[str]:
-    """Classes without true boxes, of a detection's result."""
+    """Return classes without true boxes in a result of detection."""
     if not isinstance(result, DetectionResult):
         return []
-    return [
-        name
-        for name, truths in zip(result.classes, result.truths.sum(axis=1), strict=True)
-        if not truths
-    ]
+    truths = result.truths.sum(axis=1)
+    return [name for name, count in zip(result.classes, truths, strict=True) if not count]
 
 
 def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
-    low, high = (
-        (math.nan, math.nan)
-        if group is None
-        else group.intervals.get(headline.path, (math.nan, math.nan))
-    )
-    if headline.value is None or math.isnan(low) or math.isnan(high):
+    if group is None or headline.value is None:
         return ""
-    digits = 2 if headline.unit == "%" else 3
+    low, high = group.intervals.get(headline.path, (math.nan, math.nan))
+    if math.isnan(low) or math.isnan(high):
+        return ""
+    digits = 3
+    if headline.unit == "%":
+        digits = 2
     return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
@@ -224,35 +253,41 @@ def save_report(
 ) -> Path:
     """Write `report.html` and `figures/*.png` into a folder; the same run makes the same bytes.
 
-    The report needs no other file: it can be sent as it is. In a partial run each section and each figure says that it
-    is partial.
+    The report needs no other file and can be sent as it is. In a partial run each section and each
+    figure is marked as partial.
 
     Args:
-        run: of `evaluate_results`.
-        folder: where; it is made if it is not there, and files of an earlier report there are replaced.
-        dataset: the release; with it and `results` the report also shows the worst and the best samples.
-        results: the predictions that were evaluated.
+        run: Result of `evaluate_results`.
+        folder: Folder to write into; it is made if it does not exist, and files of an earlier
+            report in it are replaced.
+        dataset: The release; with it and `results` the report also shows the worst and the best
+            samples.
+        results: The predictions that were evaluated.
 
     Returns:
         The report's path.
 
     Raises:
-        ConfigError: the folder cannot be written to, or is a file.
-        OutputFolderError: its `figures` is a link.
+        ConfigError: The folder cannot be written to, or is a file.
+        OutputFolderError: Its `figures` is a link.
     """
     target = writable_folder(folder)
-    drawn = [*run_figures(run)]
+    unsaved_figures = [*run_figures(run)]
     if dataset is not None and results is not None:
-        drawn += sample_figures(run, dataset, results)
-    pictures = place_in(target, FIGURES_FOLDER, opened=True)
-    figures = [(each, save_figure(run, each, pictures)) for each in drawn]
+        unsaved_figures += sample_figures(run, dataset, results)
+    figures_folder = place_in(target, FIGURES_FOLDER, opened=True)
+    figures = []
+    for run_figure in unsaved_figures:
+        figures.append((run_figure, save_figure(run, run_figure, figures_folder)))
     write_bytes(target / REPORT_FILE, report_html(run, figures).encode())
     return target / REPORT_FILE
 
 
 def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -> str:
-    """The complete page, of which the figures' PNG files become part."""
-    pictures = [(read_bytes(path, "image"), each.alt, each.caption) for each, path in figures]
+    """Return the complete page, with the figures' PNG files as a part of it."""
+    pictures = []
+    for figure, path in figures:
+        pictures.append((read_bytes(path, "image"), figure.alt, figure.caption))
     return document(
         "evaluation_report.html", style=page_style(), pictures=pictures, **report_context(run)
     )

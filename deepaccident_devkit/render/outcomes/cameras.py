@@ -1,4 +1,4 @@
-"""A prediction over the truth in the agent's cameras: boxes, cells on the ground, and the places of accidents."""
+"""A prediction over the truth in cameras: boxes, cells on the ground, places of accidents."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from deepaccident_devkit.render.boxes import (
     write_beside,
 )
 from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image
-from deepaccident_devkit.render.captions import draw_legend, is_there, set_scene_title
+from deepaccident_devkit.render.captions import draw_legend, has_sensor_file, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, settled
 from deepaccident_devkit.render.motion_maps import MotionMaps
@@ -52,39 +52,39 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Metres: the height of the posts at places, since rings far away are flat.
-_POST: Final = 1.5
+# Metres: the height of the posts at positions, since distant rings look flat.
+_POST_HEIGHT_M: Final = 1.5
 # Points around a post that no words cover: left, low, right and high.
-_MARK: Final = (-6.0, -6.0, 6.0, 6.0)
+_MARK_MARGIN_PT: Final = (-6.0, -6.0, 6.0, 6.0)
 # Points by which the casing of a line is wider.
-_CASING: Final = 1.4
-# Edges around lines that are pale; others have white edges.
+_CASING_WIDTH_PT: Final = 1.4
+# Line colour → colour of its casing, for pale lines; other casings are white.
 CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
-# Inches.
-_SIZE: Final = (14.7, 7.1125)
-_TURN: Final = np.linspace(0, 2 * np.pi, 33)
-_RING: Final = [np.column_stack([np.cos(_TURN), np.sin(_TURN)])]
-# The ring around a true place and the cross at a foreseen one, of a radius of 1 m.
+_FIGURE_SIZE_IN: Final = (14.7, 7.1125)
+_ANGLES_RAD: Final = np.linspace(0, 2 * np.pi, 33)
+# The ring around a true position and the cross at a foreseen one, of a radius of 1 m.
+_RING: Final = [np.column_stack([np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)])]
 _CROSS: Final = [np.sqrt(0.5) * np.array(arm) for arm in ([[-1, -1], [1, 1]], [[-1, 1], [1, -1]])]
-# Points around the middle of a panel's upper edge, where words about a missing image are: left, low, right, high.
-_MISSING: Final = (-58.0, -48.0, 58.0, 0.0)
-# How opaque the ground of instances is.
-_FILL: Final = 0.3
+# Points around the middle of a panel's upper edge, where the words about a missing image are:
+# left, low, right, high.
+_MISSING_WORDS_MARGIN_PT: Final = (-58.0, -48.0, 58.0, 0.0)
+# Opacity of the ground of instances.
+_GROUND_OPACITY: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraView:
-    """A camera's panel, and what lies on the ground in it.
+    """A camera's panel, and the ground in it.
 
     The ground is flat: z = 0 in a vehicle's ego frame, `POLE_HEIGHT` below the infrastructure's.
 
     Attributes:
-        camera: token of the image (sample data).
-        sample: token; the image is its own, or that of another agent at its moment.
-        lens: the camera's intrinsics.
-        optical_from_ego: of the sample.
-        ground: z of the ground in the ego frame, metres.
-        ax: in pixels.
+        camera: Token of the image (sample data).
+        sample: Token; the image is its own, or that of another agent at its moment.
+        lens: Intrinsics of the camera.
+        optical_from_ego: Pose of the sample's ego frame in the optical frame.
+        ground: Height z of the ground in the ego frame, metres.
+        ax: Axes in pixels.
     """
 
     camera: str
@@ -94,29 +94,33 @@ class CameraView:
     ground: float
     ax: Axes
 
-    def optical(self, places: FloatArray, height: float = 0.0) -> FloatArray:
-        """Points (N, 3) of the optical frame, so many metres above places (N, 2) of the ego frame."""
-        return self.optical_from_ego.apply(
-            np.column_stack([places, np.full(len(places), self.ground + height)])
-        )
+    def optical(self, positions: FloatArray, height: float = 0.0) -> FloatArray:
+        """Return points (N, 3) of the optical frame, above positions (N, 2) of the ego frame.
+
+        The height above the ground is in metres.
+        """
+        z = np.full(len(positions), self.ground + height)
+        points = np.column_stack([positions, z])
+        return self.optical_from_ego.apply(points)
 
     def on_ground(self, lines: Sequence[FloatArray]) -> list[FloatArray]:
-        """Lines (P, 2) on the ground, metres of the ego frame, as pixels (V, 2) of their parts in front of the camera.
+        """Return the visible parts (V, 2), pixels, of lines (P, 2) on the ground, in the ego frame.
 
-        The ends of a cut are far below the image, and so is the line between two of them.
+        Visible parts are in front of the camera. The ends of a cut are far below the image, and so
+        is the line between two of them.
         """
         if not lines:
             return []
-        points, owner = (
-            self.optical(np.concatenate(lines)),
-            np.repeat(np.arange(len(lines)), [*map(len, lines)]),
-        )
-        within = owner[1:] == owner[:-1]
-        pixels, drawn = segments_in_image(
-            np.stack([points[:-1], points[1:]], axis=1)[within], self.lens
-        )
-        rows, starts = np.unique(owner[1:][within][drawn], return_index=True)
-        return np.split(pixels.reshape(-1, 2), 2 * starts[1:]) if len(rows) else []
+        points = self.optical(np.concatenate(lines))
+        line_numbers = np.repeat(np.arange(len(lines)), [*map(len, lines)])
+        within_line = line_numbers[1:] == line_numbers[:-1]
+        segments = np.stack([points[:-1], points[1:]], axis=1)[within_line]
+        pixels, drawn = segments_in_image(segments, self.lens)
+        drawn_numbers = line_numbers[1:][within_line][drawn]
+        numbers, starts = np.unique(drawn_numbers, return_index=True)
+        if not len(numbers):
+            return []
+        return np.split(pixels.reshape(-1, 2), 2 * starts[1:])
 
     def draw_lines(
         self, lines: Sequence[FloatArray], color: str, *, width: float, dashed: bool = False
@@ -124,47 +128,58 @@ class CameraView:
         """Render lines (V, 2) in pixels, on wider ones that set them off from the image."""
         from matplotlib.collections import LineCollection
 
-        below = LineCollection(
-            lines, colors=CASINGS.get(color, CASING_COLOR), linewidths=width + _CASING, alpha=0.7
+        casing_color = CASINGS.get(color, CASING_COLOR)
+        casings = LineCollection(
+            lines, colors=casing_color, linewidths=width + _CASING_WIDTH_PT, alpha=0.7
         )
-        above = LineCollection(
-            lines, colors=color, linewidths=width, linestyles=DASHED if dashed else "solid"
-        )
-        self.ax.add_collection(below, autolim=False)  # the image has set the limits
-        self.ax.add_collection(above, autolim=False)
+        line_style = DASHED if dashed else "solid"
+        collection = LineCollection(lines, colors=color, linewidths=width, linestyles=line_style)
+        self.ax.add_collection(casings, autolim=False)  # the image has set the limits
+        self.ax.add_collection(collection, autolim=False)
 
-    def posts(self, places: FloatArray) -> FloatArray:
-        """Feet and tops (V, 2, 2), pixels, of posts at places (N, 2) of the ego frame; of those in front alone."""
-        pixels, _ = segments_in_image(
-            np.stack([self.optical(places), self.optical(places, _POST)], axis=1), self.lens
-        )
+    def posts(self, positions: FloatArray) -> FloatArray:
+        """Return feet and tops (V, 2, 2), pixels, of posts at positions (N, 2) of the ego frame.
+
+        Only posts in front of the camera are returned.
+        """
+        ends = [self.optical(positions), self.optical(positions, _POST_HEIGHT_M)]
+        pixels, _ = segments_in_image(np.stack(ends, axis=1), self.lens)
         return pixels
 
-    def write(self, words: str, places: FloatArray, color: str) -> None:
-        """Write words beside places (N, 2) of the ego frame: between the feet of the posts that the image shows."""
-        posts = self.posts(places)
-        seen = posts[self.lens.in_image(posts[:, 0])]
-        if len(seen):
-            u, v = seen[:, 0].mean(axis=0).tolist()
-            keep_free(self.ax, seen, margin=_MARK)
+    def write(self, words: str, positions: FloatArray, color: str) -> None:
+        """Write words beside positions (N, 2) of the ego frame.
+
+        The words are between the feet of the posts in the image.
+        """
+        posts = self.posts(positions)
+        visible = posts[self.lens.in_image(posts[:, 0])]
+        if len(visible):
+            u, v = visible[:, 0].mean(axis=0).tolist()
+            keep_free(self.ax, visible, margin=_MARK_MARGIN_PT)
             write_beside(self.ax, words, (u, v), color)
 
 
 def view_of(
     dataset: Dataset, sample: str, camera: str, ax: Axes, *, image: bool = True
 ) -> CameraView:
-    """A panel with an image of a sample, or of another agent at its moment (both are tokens), or with its absence."""
+    """Return a panel with an image of a sample's moment, or with words on its absence.
+
+    The image is that of any agent; sample and camera are tokens.
+    """
     lens = camera_of(dataset, camera)
     draw_image(dataset, dataset.get("sample_data", camera), ax, image=image)
-    if not is_there(dataset, camera):
-        keep_free(ax, [[(lens.width / 2, 0.0)]], margin=_MISSING)
+    if not has_sensor_file(dataset, camera):
+        keep_free(ax, [[(lens.width / 2, 0.0)]], margin=_MISSING_WORDS_MARGIN_PT)
+    optical_from_world = dataset.world_from(*camera.rsplit("/", 1)).inverse()
+    ground = 0.0
+    if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE:
+        ground = -POLE_HEIGHT
     return CameraView(
         camera=camera,
         sample=sample,
         lens=lens,
-        optical_from_ego=dataset.world_from(*camera.rsplit("/", 1)).inverse()
-        @ dataset.world_from(sample, "ego"),
-        ground=-POLE_HEIGHT if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE else 0.0,
+        optical_from_ego=optical_from_world @ dataset.world_from(sample, "ego"),
+        ground=ground,
         ax=ax,
     )
 
@@ -181,25 +196,31 @@ def render_outcome_in_cameras(
     frame: int | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render a model's prediction over the truth in the cameras of the sample's agent, by a protocol's verdict.
+    """Render a prediction over the truth in the cameras of the sample's agent.
 
-    Detections: matched and false boxes, missed true boxes dashed, and thin the true boxes that were found. Motion: the
-    cells of predicted instances on the ground, right or false, and of missed true ones, dashed. Accidents: boxes of
-    the pair, red rings at the places where two collide, black crosses at the foreseen places, with their times; posts
-    of 1.5 m stand on both. What does not count, such as boxes and instances beyond the protocol's range, is not
-    rendered, nor the agent's own box, which is around its cameras.
+    The outcome is that of a protocol's verdict. Detections: matched and false boxes, missed true
+    boxes dashed, and matched true boxes with thin lines. Motion: the cells of predicted instances
+    on the ground, right or false, and of missed true ones, dashed. Accidents: boxes of the pair,
+    red rings at the positions where two collide, black crosses at the foreseen positions, with
+    their times; posts of 1.5 m stand on both. What does not count, such as boxes and instances
+    beyond the protocol's range, is not rendered, nor is the agent's own box, which is around its
+    cameras.
 
-    The ground is taken to be flat: the plane z = 0 of a vehicle's ego frame, and for the infrastructure 4 m below its
-    LiDAR. Occlusion is ignored: boxes and places are rendered even if other things hide them.
+    The ground is assumed to be flat: the plane z = 0 of a vehicle's ego frame, and for the
+    infrastructure 4 m below its LiDAR. Occlusion is ignored: boxes and positions are rendered even
+    if other things hide them.
 
-    Arguments and errors are those of `render_evaluation`. The `frame` is one of motion (None: the present): later ones
-    show where instances will be, in the image of now.
+    Arguments and errors are as for `render_evaluation`. The `frame` is one of motion (None: the
+    present): later ones show where instances will be, in the present image.
     """
     verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
     number = _checked_frame(verdict, frame)
-    ahead = number * verdict.outcome.true.step if isinstance(verdict, MotionVerdict) else 0.0
-    words = f"instances in {ahead:.1f} s" if ahead else ""
-    fig = figure_or_new(fig, _SIZE)
+    seconds, words = 0.0, ""
+    if isinstance(verdict, MotionVerdict):
+        seconds = number * verdict.outcome.true.step
+    if seconds:
+        words = f"instances in {seconds:.1f} s"
+    fig = figure_or_new(fig, _FIGURE_SIZE_IN)
     for channel, ax in fig.subplot_mosaic([[*row] for row in CAMERA_GRID]).items():
         draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
     draw_legend(fig, _handles(verdict))
@@ -216,7 +237,11 @@ def draw_outcome_in_camera(
     frame: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Render one panel (a channel) of `render_outcome_in_cameras`, in pixels. Raises ChoiceError."""
+    """Render one panel (a channel) of `render_outcome_in_cameras`, in pixels.
+
+    Raises:
+        ChoiceError: No such camera, or no such frame.
+    """
     channel, number = choice("camera", camera, CAMERAS), _checked_frame(verdict, frame)
     ax = axes_or_new(ax, (8, 5))
     token = f"{verdict.sample}/{channel}"
@@ -233,30 +258,29 @@ def draw_outcome_in_camera(
 def draw_accidents_in_camera(
     dataset: Dataset, verdict: AccidentVerdict, camera: str, ax: Axes, *, image: bool = True
 ) -> Axes:
-    """Render accidents over the truth in an image (a token), of any agent at the moment: places, and boxes of the pair.
+    """Render positions of accidents and boxes of the pair in an image (a token) of any agent.
 
-    The true accident is below the foreseen ones, and its words find their place first.
+    The true accident is below the foreseen ones, and its words are placed first.
     """
     view, true = view_of(dataset, verdict.sample, camera, ax, image=image), verdict.compared.true
     record, boxes = dataset.get("sample_data", camera), boxes_of(dataset, verdict)
-    own = dataset.get("agent", dataset.get("sample", record["sample_token"])["agent_token"])[
-        "actor_id"
-    ]
-    optical = boxes.transform(
-        dataset.world_from(*camera.rsplit("/", 1)).inverse(), record["channel"]
-    )
-    draw_camera_boxes(dataset, record, optical.select(boxes.actor_id != own), {"boxes"}, ax)
+    agent_token = dataset.get("sample", record["sample_token"])["agent_token"]
+    own_actor = dataset.get("agent", agent_token)["actor_id"]
+    optical_from_world = dataset.world_from(*camera.rsplit("/", 1)).inverse()
+    optical = boxes.transform(optical_from_world, record["channel"])
+    pair = optical.select(boxes.actor_id != own_actor)
+    draw_camera_boxes(dataset, record, pair, {"boxes"}, ax)
     if true is not None:
-        _draw_places(true.positions, _RING, COLLIDER_COLOR, view)
+        _draw_positions(true.positions, _RING, COLLIDER_COLOR, view)
         view.write(f"in {true.time:.1f} s", true.positions, COLLIDER_COLOR)
     for alarm in verdict.compared.predicted:
-        _draw_places(alarm.positions, _CROSS, FORESEEN_COLOR, view)
+        _draw_positions(alarm.positions, _CROSS, FORESEEN_COLOR, view)
         view.write(alarm_words(alarm), alarm.positions, FORESEEN_COLOR)
     return ax
 
 
 def _checked_frame(verdict: Verdict, frame: int | None) -> int:
-    """The number of a frame of motion, 0 for None; raises ChoiceError."""
+    """Return the number of a frame of motion, 0 for None; raises ChoiceError."""
     if frame is None:
         return 0
     if not isinstance(verdict, MotionVerdict):
@@ -268,33 +292,32 @@ def _checked_frame(verdict: Verdict, frame: int | None) -> int:
 
 
 def _draw_detection(verdict: DetectionVerdict, dataset: Dataset, view: CameraView) -> None:
-    """The true boxes that are found below the detections, of which the nearest are on top."""
+    """Draw matched true boxes below the detections, and these with the nearest on top.
+
+    The agent's own box is left out.
+    """
     sample, channel, matches = view.sample, view.camera.rsplit("/", 1)[1], verdict.matches
-    own = verdict.truth.actor_id == OWN_ACTOR_ID
-    others, missed = ~own[matches.truth], matches.missed[~own[matches.missed]]
-    optical = dataset.world_from(sample, channel).inverse() @ dataset.world_from(
-        sample, verdict.rules.frame
-    )
-    truth, detected = (
-        each.transform(optical, channel) for each in (verdict.truth, verdict.detected.boxes)
-    )
-    _draw_edges(truth.select(matches.truth[others]), "black", view, width=0.7)
-    boxes = detected.select(np.concatenate([matches.detection[others], matches.false]))
-    kinds = np.repeat(["right", "false"], [int(others.sum()), len(matches.false)])
+    is_own = verdict.truth.actor_id == OWN_ACTOR_ID
+    counted = ~is_own[matches.truth]
+    missed = matches.missed[~is_own[matches.missed]]
+    optical_from_world = dataset.world_from(sample, channel).inverse()
+    optical = optical_from_world @ dataset.world_from(sample, verdict.rules.frame)
+    truth = verdict.truth.transform(optical, channel)
+    detected = verdict.detected.boxes.transform(optical, channel)
+    _draw_edges(truth.select(matches.truth[counted]), "black", view, width=0.7)
+    boxes = detected.select(np.concatenate([matches.detection[counted], matches.false]))
+    kinds = np.repeat(["right", "false"], [int(counted.sum()), len(matches.false)])
     order = np.argsort(-boxes.center[:, 2], kind="stable")
-    draw_boxes_in_image(
-        boxes.select(order),
-        view.lens,
-        view.ax,
-        [OUTCOME_COLORS[kind] for kind in kinds[order].tolist()],
-    )
+    colors = [OUTCOME_COLORS[kind] for kind in kinds[order].tolist()]
+    draw_boxes_in_image(boxes.select(order), view.lens, view.ax, colors)
     _draw_edges(truth.select(missed), OUTCOME_COLORS["missed"], view, width=1.6, dashed=True)
 
 
 def _draw_edges(
     optical: Boxes, color: str, view: CameraView, *, width: float, dashed: bool = False
 ) -> None:
-    pixels, _ = segments_in_image(optical.corners()[:, EDGES].reshape(-1, 2, 3), view.lens)
+    edges = optical.corners()[:, EDGES].reshape(-1, 2, 3)
+    pixels, _ = segments_in_image(edges, view.lens)
     view.draw_lines(list(pixels), color, width=width, dashed=dashed)
 
 
@@ -304,39 +327,37 @@ def _draw_motion(verdict: MotionVerdict, frame: int, view: CameraView) -> None:
     outcome = verdict.outcome
     missed = outcome.judged("true", frame)["missed"]
     for name, ids in outcome.judged("predicted", frame).items():
+        color = OUTCOME_COLORS[name]
         areas = view.on_ground(_outlines(outcome.predicted, frame, ids))
-        filled = PolyCollection(
-            areas, facecolors=OUTCOME_COLORS[name], alpha=_FILL, edgecolors="none"
-        )
-        view.ax.add_collection(filled, autolim=False)
-        view.draw_lines(areas, OUTCOME_COLORS[name], width=1.6)
-    view.draw_lines(
-        view.on_ground(_outlines(outcome.true, frame, missed)),
-        OUTCOME_COLORS["missed"],
-        width=1.6,
-        dashed=True,
-    )
+        polygons = PolyCollection(areas, facecolors=color, alpha=_GROUND_OPACITY, edgecolors="none")
+        view.ax.add_collection(polygons, autolim=False)
+        view.draw_lines(areas, color, width=1.6)
+    areas = view.on_ground(_outlines(outcome.true, frame, missed))
+    view.draw_lines(areas, OUTCOME_COLORS["missed"], width=1.6, dashed=True)
 
 
 def _outlines(maps: MotionMaps, frame: int, ids: AnyArray) -> list[FloatArray]:
-    """Closed lines (P, 2), metres of the ego frame, around the cells of instances; holes have none."""
+    """Return closed lines (P, 2), metres of the ego frame, around the cells of instances.
+
+    Holes have no lines.
+    """
     low, _, size = np.array([maps.grid.x, maps.grid.y]).T
-    polygons = [
-        part
-        for identity in ids.tolist()
-        for part in outlines(maps.instance[frame] == identity, np.zeros(2), 1.0).geoms
-    ]
-    return [low + np.asarray(part.exterior.coords) * size for part in polygons]
+    lines = []
+    for identity in ids.tolist():
+        cells = maps.instance[frame] == identity
+        for polygon in outlines(cells, np.zeros(2), 1.0).geoms:
+            lines.append(low + np.asarray(polygon.exterior.coords) * size)
+    return lines
 
 
-def _draw_places(
-    places: FloatArray, mark: Sequence[FloatArray], color: str, view: CameraView
+def _draw_positions(
+    positions: FloatArray, mark: Sequence[FloatArray], color: str, view: CameraView
 ) -> None:
-    """A mark and a post at each of two places (2, 2), and a thin line from one to the other."""
-    view.draw_lines([*view.on_ground([places]), *view.posts(places)], color, width=1.2)
-    view.draw_lines(
-        view.on_ground([place + line for place in places for line in mark]), color, width=1.8
-    )
+    """Draw a mark and a post at each of two positions (2, 2), and a thin line between them."""
+    thin_lines = [*view.on_ground([positions]), *view.posts(positions)]
+    view.draw_lines(thin_lines, color, width=1.2)
+    marks = [position + line for position in positions for line in mark]
+    view.draw_lines(view.on_ground(marks), color, width=1.8)
 
 
 def _handles(verdict: Verdict) -> list[Artist]:
@@ -344,7 +365,7 @@ def _handles(verdict: Verdict) -> list[Artist]:
     from matplotlib.patches import Patch
 
     if isinstance(verdict, AccidentVerdict):
-        how: dict[str, Any] = {"linestyle": "none", "markersize": 9, "markeredgewidth": 1.8}
+        style: dict[str, Any] = {"linestyle": "none", "markersize": 9, "markeredgewidth": 1.8}
         ring = Line2D(
             [],
             [],
@@ -352,19 +373,20 @@ def _handles(verdict: Verdict) -> list[Artist]:
             fillstyle="none",
             color=COLLIDER_COLOR,
             label="accident to come",
-            **how,
+            **style,
         )
-        return [ring, Line2D([], [], marker="x", color=FORESEEN_COLOR, label="foreseen", **how)]
-    detects = isinstance(verdict, DetectionVerdict)
-    fills: list[Artist] = [
-        Patch(label=words, facecolor=(OUTCOME_COLORS[kind], 0.4), edgecolor=OUTCOME_COLORS[kind])
-        for kind, words in {"right": "detected" if detects else "right", "false": "false"}.items()
-    ]
+        cross = Line2D([], [], marker="x", color=FORESEEN_COLOR, label="foreseen", **style)
+        return [ring, cross]
+    is_detection = isinstance(verdict, DetectionVerdict)
+    handles: list[Artist] = []
+    for kind in ("right", "false"):
+        label = "detected" if is_detection and kind == "right" else kind
+        color = OUTCOME_COLORS[kind]
+        handles.append(Patch(label=label, facecolor=(color, 0.4), edgecolor=color))
     pale = OUTCOME_COLORS["missed"]
-    missed = Patch(label="missed", facecolor=pale, edgecolor=CASINGS[pale], linestyle=DASHED)
-    found = (
-        [Line2D([], [], color="black", linewidth=0.9, label="true box of a detection")]
-        if detects
-        else []
-    )
-    return [*fills, missed, *found]
+    handles.append(Patch(label="missed", facecolor=pale, edgecolor=CASINGS[pale], linestyle=DASHED))
+    if is_detection:
+        handles.append(
+            Line2D([], [], color="black", linewidth=0.9, label="true box of a detection")
+        )
+    return handles

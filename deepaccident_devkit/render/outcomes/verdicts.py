@@ -1,4 +1,4 @@
-"""What a protocol says of a sample's prediction: a verdict of motion, of accidents or of detections."""
+"""The verdict of a protocol on a sample's prediction of motion, accidents or detections."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ from deepaccident_devkit.v2x import cooperative_boxes
 
 Judged: TypeAlias = MotionOutput | list[Accident] | DetectedBoxes
 # Half a second from frame to frame, two seconds ahead.
-_RELEASED: Final = MotionLabelConfig()
+_RELEASED_CONFIG: Final = MotionLabelConfig()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionVerdict(ShortRepr):
-    """Predicted instances against the labels'.
+    """Predicted instances compared with the labels' instances.
 
     Attributes:
-        sample: token.
-        label: the truth.
-        outcome: which instances match, frame by frame.
-        words: the numbers of each range.
+        sample: Token.
+        label: Ground truth.
+        outcome: Matching instances, frame by frame.
+        words: Numbers of each range.
     """
 
     sample: str
@@ -63,13 +63,13 @@ class MotionVerdict(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AccidentVerdict(ShortRepr):
-    """Foreseen accidents against the one to come.
+    """Foreseen accidents compared with the one to come.
 
     Attributes:
-        sample: token.
-        compared: the accidents that the protocol compares, in the present ego frame.
-        truth: the actors around; None if it is not known.
-        words: what the sample counts as, by the allowed distance.
+        sample: Token.
+        compared: Accidents that the protocol compares, in the present ego frame.
+        truth: Actors around; None if unknown.
+        words: Outcome of the sample, by the allowed distance.
     """
 
     sample: str
@@ -80,15 +80,16 @@ class AccidentVerdict(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DetectionVerdict(ShortRepr):
-    """Detected boxes against the true ones.
+    """Detected boxes compared with the true ones.
 
     Attributes:
-        sample: token.
-        rules: the protocol.
-        detected: in its frame.
-        truth: the true boxes in that frame.
-        matches: at the threshold of the protocol's errors or, if it has none, at the middle one.
-        words: the mean average precision of the sample.
+        sample: Token.
+        rules: The protocol.
+        detected: Detections in its frame.
+        truth: True boxes in that frame.
+        matches: Matches at the threshold of the protocol's errors or, if it has none, at the middle
+            one.
+        words: Mean average precision of the sample.
     """
 
     sample: str
@@ -103,17 +104,26 @@ Verdict: TypeAlias = MotionVerdict | AccidentVerdict | DetectionVerdict
 
 
 def judged_as(prediction: object, task: str | None) -> tuple[Judged, str]:
-    """A prediction, explicit accidents as a list, and the task that it is judged in: the one given, or its own.
+    """Return a checked prediction and its task: the one given, or the prediction's own.
 
-    Raises ChoiceError if the prediction is not of the task, EvaluationError if it is no prediction.
+    Explicit accidents become a list.
+
+    Raises:
+        ChoiceError: The prediction is not of the task.
+        EvaluationError: The object is no prediction.
     """
-    given = prediction if isinstance(prediction, DetectedBoxes) else checked_prediction(prediction)
-    possible: tuple[str, ...] = ("accident",)
-    if isinstance(given, DetectedBoxes):
-        possible = ("detection",)
-    elif isinstance(given, MotionOutput):
-        possible = ("motion", "accident")
-    return given, possible[0] if task is None else choice("task of this prediction", task, possible)
+    if isinstance(prediction, DetectedBoxes):
+        return prediction, _chosen_task(task, ("detection",))
+    checked = checked_prediction(prediction)
+    if isinstance(checked, MotionOutput):
+        return checked, _chosen_task(task, ("motion", "accident"))
+    return checked, _chosen_task(task, ("accident",))
+
+
+def _chosen_task(task: str | None, possible: tuple[str, ...]) -> str:
+    if task is None:
+        return possible[0]
+    return choice("task of this prediction", task, possible)
 
 
 def sample_verdict(
@@ -125,102 +135,114 @@ def sample_verdict(
     protocol: Any = None,
     label: MotionLabels | None = None,
 ) -> Verdict:
-    """Judge a prediction for a sample; arguments and errors are those of `render_evaluation`."""
-    given, chosen = judged_as(prediction, task)
+    """Judge a prediction for a sample; arguments and errors are as for `render_evaluation`."""
+    checked, task = judged_as(prediction, task)
     token = dataset.get("sample", sample)["token"]
-    if isinstance(given, DetectedBoxes):
-        return _of_detection(dataset, token, given, protocol or "released")
-    if isinstance(given, MotionOutput) and chosen == "motion":
-        judge = MotionEvaluator(protocol or "released")
-        return _of_motion(
-            token, given, label or _label(dataset, token, given, judge.protocol.labels), judge
-        )
-    default = "released" if isinstance(given, MotionOutput) else "boxes"
-    return _of_accident(dataset, token, given, label, AccidentEvaluator(protocol or default))
+    if isinstance(checked, DetectedBoxes):
+        return _detection_verdict(dataset, token, checked, protocol or "released")
+    if isinstance(checked, MotionOutput) and task == "motion":
+        evaluator = MotionEvaluator(protocol or "released")
+        label = label or _label(dataset, token, checked, evaluator.protocol.labels)
+        return _motion_verdict(token, checked, label, evaluator)
+    default = "boxes"
+    if isinstance(checked, MotionOutput):
+        default = "released"
+    accident_evaluator = AccidentEvaluator(protocol or default)
+    return _accident_verdict(dataset, token, checked, label, accident_evaluator)
 
 
-def _of_motion(
-    token: str, given: MotionOutput, label: MotionLabels, judge: MotionEvaluator
+def _motion_verdict(
+    token: str, output: MotionOutput, label: MotionLabels, evaluator: MotionEvaluator
 ) -> MotionVerdict:
-    judge.update(token, given, label)
-    ranges = [
-        f"{name} m: IoU {within.iou:.1f} %, VPQ {within.pq:.1f} %, {within.true_positive} TP, "
-        f"{within.false_positive} FP, {within.false_negative} FN"
-        for name, within in judge.compute().ranges.items()
-    ]
-    return MotionVerdict(
-        sample=token, label=label, outcome=motion_outcome(given, label), words="; ".join(ranges)
-    )
+    evaluator.update(token, output, label)
+    ranges = []
+    for name, within in evaluator.compute().ranges.items():
+        ranges.append(
+            f"{name} m: IoU {within.iou:.1f} %, VPQ {within.pq:.1f} %, "
+            f"{within.true_positive} TP, {within.false_positive} FP, {within.false_negative} FN"
+        )
+    outcome = motion_outcome(output, label)
+    return MotionVerdict(sample=token, label=label, outcome=outcome, words="; ".join(ranges))
 
 
-def _of_accident(
+def _accident_verdict(
     dataset: Dataset,
     token: str,
-    given: Prediction,
+    prediction: Prediction,
     label: MotionLabels | None,
-    judge: AccidentEvaluator,
+    evaluator: AccidentEvaluator,
 ) -> AccidentVerdict:
-    if label is None and hasattr(judge.protocol, "labels"):
-        label = _label(dataset, token, given, judge.protocol.labels)
-    context = accident_context(dataset, token, _horizon(given))
-    judge.update(token, given, label, context)
+    if label is None and hasattr(evaluator.protocol, "labels"):
+        label = _label(dataset, token, prediction, evaluator.protocol.labels)
+    context = accident_context(dataset, token, _horizon(prediction))
+    evaluator.update(token, prediction, label, context)
     return AccidentVerdict(
         sample=token,
-        compared=compared_accidents(given, label, context, judge.protocol),
+        compared=compared_accidents(prediction, label, context, evaluator.protocol),
         truth=context.truth,
-        words=f"accident: {verdict_words(judge.compute())}",
+        words=f"accident: {verdict_words(evaluator.compute())}",
     )
 
 
-def _of_detection(
-    dataset: Dataset, token: str, given: DetectedBoxes, protocol: Any
+def _detection_verdict(
+    dataset: Dataset, token: str, prediction: DetectedBoxes, protocol: Any
 ) -> DetectionVerdict:
     rules = detection_protocol(protocol)
     truth = detection_truth(dataset, token, rules)
-    here = dataset.world_from(token, rules.frame).inverse() @ dataset.world_from(
-        token, given.boxes.frame
-    )
-    detected = DetectedBoxes(boxes=given.boxes.transform(here, rules.frame), scores=given.scores)
-    judge = DetectionEvaluator(rules)
-    judge.update(token, detected, truth)
+    world_from_prediction = dataset.world_from(token, prediction.boxes.frame)
+    pose = dataset.world_from(token, rules.frame).inverse() @ world_from_prediction
+    boxes = prediction.boxes.transform(pose, rules.frame)
+    detected = DetectedBoxes(boxes=boxes, scores=prediction.scores)
+    evaluator = DetectionEvaluator(rules)
+    evaluator.update(token, detected, truth)
+    precision = evaluator.compute().mean_average_precision
     return DetectionVerdict(
         sample=token,
         rules=rules,
         detected=detected,
         truth=truth,
         matches=detection_matches(detected, truth, rules),
-        words=f"detection: mean average precision of this sample {judge.compute().mean_average_precision:.1f} %",
+        words=f"detection: mean average precision of this sample {precision:.1f} %",
     )
 
 
-def _frames(given: Prediction) -> int | None:
-    """How many frames motion has; None for other predictions."""
-    if not isinstance(given, MotionOutput):
+def _frames(prediction: Prediction) -> int | None:
+    """Return how many frames motion has; None for other predictions."""
+    if not isinstance(prediction, MotionOutput):
         return None
-    if given.instances is not None:
-        return int(given.instances.shape[1])
-    return len((given.heads or ())[-1].segmentation)
+    if prediction.instances is not None:
+        return int(prediction.instances.shape[1])
+    return len((prediction.heads or ())[-1].segmentation)
 
 
-def _horizon(given: Prediction) -> float:
-    frames = _frames(given)
-    ahead = _RELEASED.future_frames if frames is None else frames - 1
-    return ahead * _RELEASED.step * FRAME_PERIOD
+def _horizon(prediction: Prediction) -> float:
+    future_frames, frames = _RELEASED_CONFIG.future_frames, _frames(prediction)
+    if frames is not None:
+        future_frames = frames - 1
+    return future_frames * _RELEASED_CONFIG.step * FRAME_PERIOD
 
 
-def _label(dataset: Dataset, token: str, given: Prediction, protocol: str | None) -> MotionLabels:
-    config, frames = replace(_RELEASED, protocol=protocol or "released"), _frames(given)
-    if isinstance(given, MotionOutput) and frames is not None:
-        config = replace(config, grid=given.grid, future_frames=frames - 1)
+def _label(
+    dataset: Dataset, token: str, prediction: Prediction, protocol: str | None
+) -> MotionLabels:
+    config = replace(_RELEASED_CONFIG, protocol=protocol or "released")
+    frames = _frames(prediction)
+    if isinstance(prediction, MotionOutput) and frames is not None:
+        config = replace(config, grid=prediction.grid, future_frames=frames - 1)
     return motion_labels(dataset, token, config)
 
 
 def boxes_of(dataset: Dataset, verdict: AccidentVerdict) -> Boxes:
-    """The boxes, now and in world, of who collides by meta, or else of whom the first alarm names."""
+    """Return the present boxes of the pair of an accident, in world.
+
+    The pair is the colliding one by meta, or otherwise the one that the first alarm names.
+    """
     record = dataset.get("sample", verdict.sample)
     collision = dataset.get("scenario", record["scenario_token"])["collision"]
-    named = next((alarm.ids for alarm in verdict.compared.predicted), None)
+    ids: Any = ()
+    if collision is not None:
+        ids = collision["ids"]
+    elif verdict.compared.predicted:
+        ids = verdict.compared.predicted[0].ids or ()
     boxes = cooperative_boxes(dataset, record)
-    return boxes.select(
-        np.isin(boxes.actor_id, (named or ()) if collision is None else collision["ids"])
-    )
+    return boxes.select(np.isin(boxes.actor_id, ids))

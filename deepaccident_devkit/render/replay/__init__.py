@@ -1,4 +1,7 @@
-"""A scenario as one HTML file that plays in a browser without a network; its parts serve other pages too."""
+"""A scenario as one HTML file that plays in a browser without a network.
+
+Its parts serve other pages too.
+"""
 
 from deepaccident_devkit.render.replay.entries import recording_of
 from deepaccident_devkit.render.replay.page import (

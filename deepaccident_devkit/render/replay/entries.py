@@ -1,4 +1,4 @@
-"""What a replay's page has of a scenario: its agents, actors and cameras at each moment, and what a model foresees."""
+"""Agents, actors, cameras and foreseen accidents of a scenario in the form of a replay page."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from deepaccident_devkit.evaluation.predictions import checked_prediction
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
-from deepaccident_devkit.geometry import SE3, quaternions, time_to_collision
+from deepaccident_devkit.geometry import SE3, Boxes, quaternions, time_to_collision
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import actor_color, agent_letters, camera_name, recorders_of
@@ -51,23 +51,24 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 # A results file of motion or accidents, or predictions by sample token.
-Foreseen = Results | Mapping[str, MotionOutput | Iterable[Accident]]
-_RULES: Final = BoxAccidents()
-# The most alarms of a sample that are shown: right alarms first, then the surest ones.
-_SHOWN: Final = 3
+ReplayPrediction = Results | Mapping[str, MotionOutput | Iterable[Accident]]
+_PROTOCOL: Final = BoxAccidents()
+# Maximum number of shown alarms of a sample: right alarms first, then the most confident ones.
+_MAX_ALARMS: Final = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ReplayRecording(FrozenArrays):
-    """A scenario and the agents whose view is shown.
+    """A scenario and the agents with a view on the page.
 
     Attributes:
-        dataset: the release.
-        scenario: its record.
-        agents: in the order of `taxonomy.AGENTS`.
-        contact: how the accident happened; None if nobody collides, or if that is not known.
-        unknown: a sentence that says why it is not known; empty if it is known, or if nobody collides.
-        origin: (2,) float64 x and y in world, metres: the origin of the page's coordinates.
+        dataset: The release.
+        scenario: Record of the scenario.
+        agents: Names in the order of `taxonomy.AGENTS`.
+        contact: How the accident happened; None if nobody collides, or if it is not known.
+        unknown: Sentence on why the contact is not known; empty if it is known, or if nobody
+            collides.
+        origin: Origin of the page's coordinates in world, (2,) float64 x and y, metres.
     """
 
     dataset: Dataset
@@ -79,48 +80,52 @@ class ReplayRecording(FrozenArrays):
 
     @property
     def frames(self) -> range:
-        """The frame numbers, from 1."""
+        """Frame numbers, from 1."""
         return range(1, self.scenario["num_frames"] + 1)
 
     @property
     def pair(self) -> tuple[int, ...]:
-        """The actor ids of the two that collide; empty if nobody does."""
-        told = self.scenario["collision"]
-        return () if told is None else tuple(told["ids"])
+        """Actor ids of the colliding pair; empty if nobody collides."""
+        collision = self.scenario["collision"]
+        if collision is None:
+            return ()
+        return tuple(collision["ids"])
 
     def sample(self, agent: str, frame: int) -> str:
-        """The token of a sample."""
+        """Return the token of a sample."""
         return sample_token(self.scenario["token"], agent, frame)
 
     @property
     def recorders(self) -> dict[int, AgentName]:
-        """Actor id → agent, for all agents in the release that are vehicles with a known id, shown or not."""
+        """Actor id → agent, for all agents in the release that are vehicles with a known id."""
         return recorders_of(self.dataset, self.scenario["token"])
 
     def actor_of(self, agent: str) -> int | None:
-        """The actor id of an agent; None for the infrastructure, and if meta does not give it."""
-        actor: int | None = self.dataset.get("agent", f"{self.scenario['token']}/{agent}")[
-            "actor_id"
-        ]
+        """Return the actor id of an agent; None for the infrastructure, or if meta lacks it."""
+        token = f"{self.scenario['token']}/{agent}"
+        actor: int | None = self.dataset.get("agent", token)["actor_id"]
         return actor
 
-    def places(self, xy: ArrayLike) -> list[Any]:
-        """Places (…, 2) in world, metres, as the page has them: whole centimetres from the origin."""
-        return list(np.rint((as_floats(xy) - self.origin) * 100).astype(np.int64).tolist())
+    def page_coordinates(self, xy: ArrayLike) -> list[Any]:
+        """Return positions (…, 2) in world, metres, as whole centimetres from the page's origin."""
+        centimetres = np.rint((as_floats(xy) - self.origin) * 100)
+        return list(centimetres.astype(np.int64).tolist())
 
 
 def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents) -> ReplayRecording:
-    """A scenario of a release: by default the first that ends in an accident or, without any, the first one.
+    """Return the recording of a scenario, by default the first that ends in an accident.
 
-    Agents are as `cooperating_agents` takes them, seen from the first that is there; its errors are raised, and
-    NotAvailableError if the release has no scenario.
+    Without any accident the default is the first scenario. Agents are as for `cooperating_agents`,
+    from the view of the first agent that is present; its errors are raised.
+
+    Raises:
+        NotAvailableError: The release has no scenario.
     """
-    record = dataset.scenario[
-        dataset.getind("scenario", default_scenario(dataset) if scenario is None else scenario)
-    ]
-    chosen = cooperating_agents(
-        dataset, sample_token(record["token"], agents_of(dataset, record)[0], 1), agents
-    )
+    if scenario is None:
+        scenario = default_scenario(dataset)
+    record = dataset.scenario[dataset.getind("scenario", scenario)]
+    sample = sample_token(record["token"], agents_of(dataset, record)[0], 1)
+    names = cooperating_agents(dataset, sample, agents)
     contact, unknown = None, ""
     try:
         contact = collision(dataset, record)
@@ -129,7 +134,7 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
     return ReplayRecording(
         dataset=dataset,
         scenario=record,
-        agents=tuple(agent for agent in AGENTS if agent in chosen),
+        agents=tuple(agent for agent in AGENTS if agent in names),
         contact=contact,
         unknown=unknown,
         origin=_origin(dataset, record, contact),
@@ -137,93 +142,98 @@ def recording_of(dataset: Dataset, scenario: RowArgument | None, agents: Agents)
 
 
 def _origin(dataset: Dataset, record: ScenarioRecord, contact: Contact | None) -> FloatArray:
-    """The place of the impact or, without one, the middle of the agents at the end; in whole metres."""
+    """Return the point of impact, or the centre of the agents at the end, in whole metres."""
     if contact is not None:
         return as_floats(np.round(contact.point[:2]))
-    poses = [
-        dataset.world_from(sample, "ego").translation
-        for sample in dataset.samples_of(record["last_frame_token"])
-    ]
-    return as_floats(np.round(np.mean(poses, axis=0)[:2]))
+    samples = dataset.samples_of(record["last_frame_token"])
+    positions = [dataset.world_from(sample, "ego").translation for sample in samples]
+    return as_floats(np.round(np.mean(positions, axis=0)[:2]))
 
 
 def agent_entries(recording: ReplayRecording) -> list[dict[str, Any]]:
-    """The agents as the page has them: names, colour, actor id, and one pose for each frame (cm, cm, mrad)."""
-    described = []
+    """Return the agents' names, colours, actor ids and poses at each frame (cm, cm, mrad)."""
+    entries = []
     for agent in recording.agents:
-        poses = [
-            recording.dataset.world_from(recording.sample(agent, frame), "ego")
-            for frame in recording.frames
-        ]
-        yaw = quaternions.yaw_of(np.array([pose.quaternion.elements for pose in poses]))
-        places = recording.places([pose.translation[:2] for pose in poses])
-        described.append(
+        samples = [recording.sample(agent, frame) for frame in recording.frames]
+        poses = [recording.dataset.world_from(sample, "ego") for sample in samples]
+        yaws = quaternions.yaw_of(np.array([pose.quaternion.elements for pose in poses]))
+        positions = recording.page_coordinates([pose.translation[:2] for pose in poses])
+        coded_poses = []
+        for position, yaw in zip(positions, yaws.tolist(), strict=True):
+            coded_poses.append([*position, _milliradians(yaw)])
+        entries.append(
             {
                 "name": agent,
                 "title": short_name(agent),
                 "short": agent_letters(agent),
                 "color": AGENT_COLORS[agent],
                 "actor": recording.actor_of(agent),
-                "poses": [
-                    [*place, _milliradians(turn)]
-                    for place, turn in zip(places, yaw.tolist(), strict=True)
-                ],
+                "poses": coded_poses,
             }
         )
-    return described
+    return entries
 
 
 def actor_entries(recording: ReplayRecording) -> list[dict[str, Any]]:
-    """The actors as the page has them: the colliding pair, the agents, then the others by id.
+    """Return the entries of the actors: the colliding pair, the agents, then the others by id.
 
-    Each has its name, role and colour, the letters of the agent that it is, length, width and height (cm), one state
-    for each frame, and for each frame a bit mask over the page's agents: who sees it by the released rule. A state is
-    null if nobody annotated the actor, else x and y of its centre (cm), yaw (mrad), speed (dm/s or null), z of the
-    centre in world (cm), and x and y of the box's upward axis (thousandths).
+    Each has its name, role and colour, the letters of the agent that it is, length, width and
+    height (cm), one state for each frame, and for each frame a bit mask over the page's agents:
+    which of them see it by the released rule. A state is null if nobody annotated the actor.
+    Otherwise it is x and y of its centre (cm), yaw (mrad), speed (dm/s or null), z of the centre in
+    world (cm), and x and y of the box's upward axis (thousandths).
     """
     tracks = scenario_tracks(recording.dataset, recording.scenario)
     recorders = recording.recorders
     ids = np.unique(tracks.actor_id)
-    seen = _seen(recording, ids)
-    order = sorted(
-        range(len(ids)),
-        key=lambda row: (ids[row] not in recording.pair, int(ids[row]) not in recorders, ids[row]),
-    )
-    return [_actor(recording, tracks, int(ids[row]), recorders, seen[row]) for row in order]
+    seen = _seen_masks(recording, ids)
+
+    def priority(row: int) -> tuple[bool, bool, int]:
+        return ids[row] not in recording.pair, int(ids[row]) not in recorders, ids[row]
+
+    rows = sorted(range(len(ids)), key=priority)
+    return [_actor(recording, tracks, int(ids[row]), recorders, seen[row]) for row in rows]
 
 
 def pair_entries(recording: ReplayRecording) -> dict[str, list[int | None]] | None:
-    """How near the colliding pair is at each frame: its gap (cm), and its time to collision if both go on (ds).
+    """Return how near the colliding pair is at each frame; None if nobody collides.
 
-    As `interactions` has them, seen from above; null where one of the two is not annotated or has no known velocity,
-    and where they would never touch. None if nobody collides.
+    The values are its gap (cm), and its time to collision if both go on (ds), as `interactions`
+    computes them from above; null where one of the two is not annotated or has no known velocity,
+    and where they would never touch.
     """
     if not recording.pair:
         return None
     tracks = scenario_tracks(recording.dataset, recording.scenario)
-    boxes, velocity = (np.full((2, len(recording.frames), width), np.nan) for width in (5, 2))
-    for place, actor in enumerate(recording.pair):
+    boxes = np.full((2, len(recording.frames), 5), np.nan)
+    velocity = np.full((2, len(recording.frames), 2), np.nan)
+    for member, actor in enumerate(recording.pair):
         rows = np.flatnonzero(tracks.actor_id == actor)
-        own, at = tracks.boxes.select(rows), tracks.index[rows] - 1
-        boxes[place, at] = np.column_stack([own.center[:, :2], own.size[:, :2], own.yaw])
-        velocity[place, at] = own.velocity[:, :2]
-    values = {"gap": gaps_of_pairs(*boxes) * 100, "ttc": time_to_collision(*boxes, *velocity) * 10}
+        track, frame = tracks.boxes.select(rows), tracks.index[rows] - 1
+        columns = [track.center[:, :2], track.size[:, :2], track.yaw]
+        boxes[member, frame] = np.column_stack(columns)
+        velocity[member, frame] = track.velocity[:, :2]
     return {
-        name: [round(each) if math.isfinite(each) else None for each in found.tolist()]
-        for name, found in values.items()
+        "gap": _rounded_or_null(gaps_of_pairs(*boxes) * 100),
+        "ttc": _rounded_or_null(time_to_collision(*boxes, *velocity) * 10),
     }
 
 
-def camera_entries(recording: ReplayRecording) -> list[list[dict[str, Any]]]:
-    """For each agent its cameras as the page has them, so that the page can project boxes into their pictures.
+def _rounded_or_null(values: AnyArray) -> list[int | None]:
+    return [round(value) if math.isfinite(value) else None for value in values.tolist()]
 
-    A camera has its title, its lens (width and height of the image, fx, fy, cx, cy; pixels), and for each frame the
-    pose world_from_camera, with optical axes: x, y (cm from the page's origin), z (cm), and a unit quaternion w, x, y,
-    z (ten thousandths).
+
+def camera_entries(recording: ReplayRecording) -> list[list[dict[str, Any]]]:
+    """Return the cameras of each agent, so that the page can project boxes into their pictures.
+
+    A camera has its title, its lens (width and height of the image, fx, fy, cx, cy; pixels), and
+    for each frame the pose world_from_camera, with optical axes: x, y (cm from the page's origin),
+    z (cm), and a unit quaternion w, x, y, z (ten thousandths).
     """
-    return [
-        [_camera(recording, agent, channel) for channel in CAMERAS] for agent in recording.agents
-    ]
+    entries = []
+    for agent in recording.agents:
+        entries.append([_camera(recording, agent, channel) for channel in CAMERAS])
+    return entries
 
 
 def _camera(recording: ReplayRecording, agent: str, channel: str) -> dict[str, Any]:
@@ -231,20 +241,17 @@ def _camera(recording: ReplayRecording, agent: str, channel: str) -> dict[str, A
     lens = recording.dataset.camera(samples[0], channel)
     poses = [recording.dataset.world_from(sample, channel) for sample in samples]
     (fx, _, cx), (_, fy, cy) = lens.intrinsic[:2].tolist()
-    turns = (
-        np.rint(np.array([pose.quaternion.elements for pose in poses]) * 10_000)
-        .astype(int)
-        .tolist()
-    )
-    places = recording.places([pose.translation[:2] for pose in poses])
-    heights = [round(float(pose.translation[2]) * 100) for pose in poses]
+    quaternion = np.array([pose.quaternion.elements for pose in poses])
+    rotations = np.rint(quaternion * 10_000).astype(int).tolist()
+    positions = recording.page_coordinates([pose.translation[:2] for pose in poses])
+    coded_poses = []
+    for pose, position, rotation in zip(poses, positions, rotations, strict=True):
+        height = round(float(pose.translation[2]) * 100)
+        coded_poses.append([*position, height, *rotation])
     return {
         "title": camera_name(channel),
-        "lens": [lens.width, lens.height, *(round(each, 2) for each in (fx, fy, cx, cy))],
-        "poses": [
-            [*place, height, *turn]
-            for place, height, turn in zip(places, heights, turns, strict=True)
-        ],
+        "lens": [lens.width, lens.height, *(round(pixels, 2) for pixels in (fx, fy, cx, cy))],
+        "poses": coded_poses,
     }
 
 
@@ -259,126 +266,142 @@ def _actor(
     boxes, agent = tracks.boxes.select(rows), recorders.get(actor)
     category = boxes.category_names[0]
     length, width, height = np.rint(boxes.size[0] * 100).astype(int).tolist()
-    role = "pair" if actor in recording.pair else "other" if agent is None else "agent"
-    states: list[Any] = [None] * len(recording.frames)
-    moments = zip(
-        tracks.index[rows].tolist(),
-        recording.places(boxes.center[:, :2]),
-        boxes.yaw.tolist(),
-        np.linalg.norm(boxes.velocity[:, :2], axis=1).tolist(),
-        np.rint(boxes.center[:, 2] * 100).astype(int).tolist(),
-        np.rint(quaternions.to_matrix(boxes.rotation)[:, :2, 2] * 1000).astype(int).tolist(),
-        strict=True,
-    )
-    for frame, place, yaw, speed, z, lean in moments:
-        known = None if math.isnan(speed) else round(speed * 10)
-        states[frame - 1] = [*place, _milliradians(yaw), known, z, *lean]
+    title, tag, role = f"{category} {actor}", "", "other"
+    if agent:
+        title += f" ({short_name(agent)})"
+    if agent is not None:
+        tag, role = agent_letters(agent), "agent"
+    if actor in recording.pair:
+        role = "pair"
     return {
         "id": actor,
-        "title": f"{category} {actor}" + (f" ({short_name(agent)})" if agent else ""),
+        "title": title,
         "category": category,
         "role": role,
-        "tag": "" if agent is None else agent_letters(agent),
+        "tag": tag,
         "color": actor_color(category, agent, collides=role == "pair"),
         "length": length,
         "width": width,
         "height": height,
-        "states": states,
+        "states": _states(recording, boxes, tracks.index[rows]),
         "seen": seen.tolist(),
     }
 
 
-def _seen(recording: ReplayRecording, ids: IntArray) -> AnyArray:
-    """(actors, frames) uint8: bit masks over the recording's agents."""
-    seen = np.zeros((len(ids), len(recording.frames)), dtype=np.uint8)
+def _states(recording: ReplayRecording, boxes: Boxes, frames: IntArray) -> list[Any]:
+    """Return the states of an actor for `actor_entries`, from its boxes at frames (N,)."""
+    heights = np.rint(boxes.center[:, 2] * 100)
+    upward_axes = quaternions.to_matrix(boxes.rotation)[:, :2, 2]
+    states: list[Any] = [None] * len(recording.frames)
+    moments = zip(
+        frames.tolist(),
+        recording.page_coordinates(boxes.center[:, :2]),
+        boxes.yaw.tolist(),
+        np.linalg.norm(boxes.velocity[:, :2], axis=1).tolist(),
+        heights.astype(int).tolist(),
+        np.rint(upward_axes * 1000).astype(int).tolist(),
+        strict=True,
+    )
+    for frame, position, yaw, speed, height, axis in moments:
+        coded_speed = None
+        if not math.isnan(speed):
+            coded_speed = round(speed * 10)
+        states[frame - 1] = [*position, _milliradians(yaw), coded_speed, height, *axis]
+    return states
+
+
+def _seen_masks(recording: ReplayRecording, ids: IntArray) -> AnyArray:
+    """Return bit masks over the recording's agents, (actors, frames) uint8."""
+    masks = np.zeros((len(ids), len(recording.frames)), dtype=np.uint8)
     for bit, agent in enumerate(recording.agents):
         for column, frame in enumerate(recording.frames):
-            visible = visible_actors(
-                recording.dataset, recording.sample(agent, frame), agents=[agent]
-            )
-            seen[np.isin(ids, visible), column] |= 1 << bit
-    return seen
+            sample = recording.sample(agent, frame)
+            visible = visible_actors(recording.dataset, sample, agents=[agent])
+            masks[np.isin(ids, visible), column] |= 1 << bit
+    return masks
 
 
 def _milliradians(angle: float) -> int:
     return round(angle * 1000)
 
 
-def foreseen_entries(recording: ReplayRecording, prediction: Foreseen) -> dict[str, Any]:
-    """The foreseen accidents as the page has them: the rule in words, and each sample of the agents with a prediction.
+def prediction_entries(recording: ReplayRecording, prediction: ReplayPrediction) -> dict[str, Any]:
+    """Return the rule in words, and the foreseen accidents of each sample with a prediction.
 
-    Instance maps given by token have the orientation of the released labels. Raises NotAvailableError if no prediction
-    is of this scenario and these agents, or a sample has no label.
+    Instance maps by token have the orientation of the released labels.
+
+    Raises:
+        NotAvailableError: No prediction is of this scenario and these agents, or a sample has no
+            label.
     """
     horizon = _horizon(prediction)
-    samples = [
-        _sample(recording, prediction, agent, frame, horizon)
-        for frame in recording.frames
-        for agent in recording.agents
-        if recording.sample(agent, frame) in prediction
-    ]
+    samples = []
+    for frame in recording.frames:
+        for agent in recording.agents:
+            if recording.sample(agent, frame) in prediction:
+                samples.append(_sample(recording, prediction, agent, frame, horizon))
     if not samples:
         raise NotAvailableError(
-            f"prediction: has no sample of {recording.scenario['token']} and {', '.join(recording.agents)}; "
+            f"prediction: has no sample of {recording.scenario['token']} "
+            f"and {', '.join(recording.agents)}; "
             "choose a scenario and agents that it has, or replay without it"
         )
     rule = (
-        f"Protocol boxes: an accident within {horizon:g} s counts as foreseen if the errors of the two places "
-        f"are less than {ERRORS_AT:g} m in sum."
+        f"Protocol boxes: an accident within {horizon:g} s counts as foreseen "
+        f"if the errors of the two places are less than {ERRORS_AT:g} m in sum."
     )
     return {"rule": rule, "samples": samples}
 
 
-def _horizon(prediction: Foreseen) -> float:
-    form = prediction.form if isinstance(prediction, Results) else None
-    return (
-        RELEASED_HORIZON if form is None else min(RELEASED_HORIZON, (form.frames - 1) * form.step)
-    )
+def _horizon(prediction: ReplayPrediction) -> float:
+    if not isinstance(prediction, Results) or prediction.form is None:
+        return RELEASED_HORIZON
+    return min(RELEASED_HORIZON, (prediction.form.frames - 1) * prediction.form.step)
 
 
 def _sample(
-    recording: ReplayRecording, prediction: Foreseen, agent: str, frame: int, horizon: float
+    recording: ReplayRecording,
+    prediction: ReplayPrediction,
+    agent: str,
+    frame: int,
+    horizon: float,
 ) -> dict[str, Any]:
     token = recording.sample(agent, frame)
-    given, label, context = _loaded(recording, prediction, token, horizon)
+    foreseen, label, context = _loaded(recording, prediction, token, horizon)
     truth = context.truth
     if truth is None:  # only for the type checker: a context with a horizon has a truth
         raise NotAvailableError(f"{token}: has no truth to compare with; choose a labelled sample")
     world_from_ego = recording.dataset.world_from(token, "ego")
-    alarms = [
-        _alarm(recording, accident, ids, context, world_from_ego)
-        for accident, ids in named_alarms(given, label, truth, _RULES.reading)
-    ]
+    alarms = []
+    for accident, ids in named_alarms(foreseen, label, truth, _PROTOCOL.reading):
+        alarms.append(_alarm(recording, accident, ids, context, world_from_ego))
     return {
         "frame": frame - 1,
         "agent": recording.agents.index(agent),
-        "verdict": _verdict(given, label, context),
+        "verdict": _verdict(foreseen, label, context),
         "text": f"{short_name(agent)} at frame {frame}: {_truth_text(context)}",
-        "alarms": sorted(alarms, key=lambda alarm: not alarm["right"])[:_SHOWN],
-        "more": max(0, len(alarms) - _SHOWN),
+        "alarms": sorted(alarms, key=lambda alarm: not alarm["right"])[:_MAX_ALARMS],
+        "more": max(0, len(alarms) - _MAX_ALARMS),
     }
 
 
 def _loaded(
-    recording: ReplayRecording, prediction: Foreseen, token: str, horizon: float
+    recording: ReplayRecording, prediction: ReplayPrediction, token: str, horizon: float
 ) -> tuple[MotionOutput | list[Accident], MotionLabels | None, AccidentContext]:
     if isinstance(prediction, Results):
         setup = EvaluationSetup(task="accident", protocol="boxes", horizon=horizon)
-        given, label, context = SampleLoader(recording.dataset, prediction, setup)(token)
-        return checked_prediction(given), label, context
-    return (
-        checked_prediction(prediction[token]),
-        None,
-        accident_context(recording.dataset, token, horizon),
-    )
+        foreseen, label, context = SampleLoader(recording.dataset, prediction, setup)(token)
+        return checked_prediction(foreseen), label, context
+    checked = checked_prediction(prediction[token])
+    return checked, None, accident_context(recording.dataset, token, horizon)
 
 
-def _verdict(given: Prediction, label: MotionLabels | None, context: AccidentContext) -> str:
-    """What the sample counts as, or `not judged`."""
-    counts = _RULES.counts(given, label, context)
+def _verdict(foreseen: Prediction, label: MotionLabels | None, context: AccidentContext) -> str:
+    """Return what the sample counts as, or `not judged`."""
+    counts = _PROTOCOL.counts(foreseen, label, context)
     if counts["unjudged"] and not (counts["positive"] or counts["alarms"]):
         return "not judged"
-    return count_words(_RULES.result([counts]).within[ERRORS_AT])
+    return count_words(_PROTOCOL.result([counts]).within[ERRORS_AT])
 
 
 def _alarm(
@@ -388,26 +411,27 @@ def _alarm(
     context: AccidentContext,
     world_from_ego: SE3,
 ) -> dict[str, Any]:
-    counts = _RULES.counts([accident], None, context)
-    off = counts["alarms"][0] if counts["alarms"] else None
-    right = bool(off and hit_of([off], ERRORS_AT))
+    counts = _PROTOCOL.counts([accident], None, context)
+    error = None
+    if counts["alarms"]:
+        error = counts["alarms"][0]
     text = f"foreseen in {accident.time:.1f} s, score {accident.score:.2g}"
-    if off and off["position"] is not None:
-        text += f": places off by {off['position']:.1f} m, time by {off['time']:+.1f} s"
-    elif off is None:
+    if error and error["position"] is not None:
+        text += f": places off by {error['position']:.1f} m, time by {error['time']:+.1f} s"
+    elif error is None:
         text += ": it would be after the end of the recording"
     if ids is not None:
-        right_two = context.pair is not None and set(ids) == set(context.pair)
-        names = " and ".join("an unknown actor" if each is None else str(each) for each in ids)
-        text += f"; names {names}{', who collide' if right_two else ''}"
+        names = ["an unknown actor" if actor is None else str(actor) for actor in ids]
+        text += f"; names {' and '.join(names)}"
+        if context.pair is not None and set(ids) == set(context.pair):
+            text += ", who collide"
+    points = [[x, y, 0.0] for x, y in accident.positions.tolist()]
     return {
-        "places": recording.places(
-            world_from_ego.apply([[x, y, 0.0] for x, y in accident.positions.tolist()])[:, :2]
-        ),
-        "right": right,
+        "places": recording.page_coordinates(world_from_ego.apply(points)[:, :2]),
+        "right": bool(error and hit_of([error], ERRORS_AT)),
         "time": round(accident.time, 1),
         "text": text,
-        "actors": [each for each in ids or () if each is not None],
+        "actors": [actor for actor in ids or () if actor is not None],
     }
 
 

@@ -228,7 +228,8 @@ def test_where_there_is_little_room_the_agents_that_see_the_pair_best_are_shown(
     *named, above = [texts(ax)[-1] for ax in few.axes[::4]]
     views = {agent: [pair.view(agent, index)[1] for index in (3, 4, 5, 6)] for agent in AGENTS}
     shares = {
-        short_name(agent): sum(each.shown for each in seen if each) for agent, seen in views.items()
+        short_name(agent): sum(each.total_share for each in seen if each)
+        for agent, seen in views.items()
     }
     assert (len(named), named[0], above) == (2, "ego", "from above")
     assert shares[named[1]] == max(share for name, share in shares.items() if name != "ego")
@@ -241,5 +242,5 @@ def test_a_scenario_without_an_accident_has_no_countdown(da: DeepAccident, tmp_p
         tmp_path / "v.gif",
     )
     with pytest.raises(NotAvailableError, match="'frame'"):
-        render_scenario_video(da, normal, path, what="accident", workers=1, progress=False)
+        render_scenario_video(da, normal, path, views="accident", workers=1, progress=False)
     assert not path.exists()

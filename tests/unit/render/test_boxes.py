@@ -15,7 +15,7 @@ from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, PinholeCamera
 from deepaccident_devkit.render import draw_box
 from deepaccident_devkit.render.boxes import (
-    NEAREST_DRAWN,
+    NEAR_PLANE_M,
     bounds_in_image,
     draw_boxes_from_above,
     draw_boxes_in_image,
@@ -129,7 +129,7 @@ def test_edges_are_cut_off_before_the_camera() -> None:
     segments = np.array([through, behind, before, through[::-1]])
     pixels, drawn = segments_in_image(segments, CAMERA)
     assert drawn.tolist() == [True, False, True, True]
-    cut = CAMERA.project(np.array([[0, 0.5, NEAREST_DRAWN]]))[0][0]
+    cut = CAMERA.project(np.array([[0, 0.5, NEAR_PLANE_M]]))[0][0]
     np.testing.assert_allclose(
         pixels, [[[200, 150], cut], [[300, 250], [250, 200]], [cut, [200, 150]]]
     )
@@ -209,7 +209,7 @@ def test_a_box_beside_the_camera_is_cut_off_at_the_camera() -> None:
     assert draw_boxes_in_image(both, CAMERA, ax, [RED, RED]).tolist() == [True, False]
     (front,) = next(each for each in ax.collections if isinstance(each, PolyCollection)).get_paths()
     across = front.vertices[:, 0]
-    assert (across.min(), across.max()) == pytest.approx((300, 200 + 200 * 2 / NEAREST_DRAWN))
+    assert (across.min(), across.max()) == pytest.approx((300, 200 + 200 * 2 / NEAR_PLANE_M))
 
 
 def test_the_pair_is_red_other_recorders_have_hues_and_the_rest_shades(

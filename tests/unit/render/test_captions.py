@@ -204,9 +204,9 @@ def test_accident_video_and_replay_are_rendered(
     da_partial: DeepAccident, scenario: str, tmp_path: Path
 ) -> None:
     assert set(missing_words(da_partial.render_accident(scenario))) <= {FRONT}
-    what = ["sample", "Camera_Front", "calibration"]
+    views = ["sample", "Camera_Front", "calibration"]
     da_partial.render_scenario_video(
-        scenario, tmp_path / "v.gif", what=what, frames=[3], size=(480, 180), workers=1
+        scenario, tmp_path / "v.gif", views=views, frames=[3], size=(480, 180), workers=1
     )
     da_partial.render_replay(scenario, tmp_path / "replay.html")
     assert len([path for path in tmp_path.iterdir() if path.stat().st_size > 0]) == 2

@@ -34,7 +34,7 @@ from deepaccident_devkit.render import (
     draw_motion_trail,
 )
 from deepaccident_devkit.render.boxes import collider_ids
-from deepaccident_devkit.render.motion_maps import PALEST
+from deepaccident_devkit.render.motion_maps import MIN_TRAIL_OPACITY
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     COLLIDER_COLOR,
@@ -214,7 +214,7 @@ def test_a_trail_is_opaque_at_the_present_and_paler_after(labels: MotionLabels) 
     for frame, column in zip(instance, columns, strict=True):
         frame[100:104, column : column + 8] = 1
     ax = draw_motion_trail(instances_of(instance, grid), marked={1}, ax=new_axes())
-    opacity = [1, 1, (1 + PALEST) / 2, PALEST]  # the present is on top
+    opacity = [1, 1, (1 + MIN_TRAIL_OPACITY) / 2, MIN_TRAIL_OPACITY]  # the present is on top
     expected = 1 - np.outer(opacity, 1 - np.array(to_rgb(COLLIDER_COLOR)))
     np.testing.assert_allclose(picture(ax)[101, [51, 57, 60, 69]], expected)
     np.testing.assert_allclose(picture(ax)[90, 51], 1)

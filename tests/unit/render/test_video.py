@@ -32,7 +32,7 @@ from deepaccident_devkit.taxonomy import CAMERAS
 def test_two_workers_and_an_executor_write_the_same_bytes_as_one(
     video: Callable[..., Path],
 ) -> None:
-    how = {"what": [grey, "bev"], "frames": slice(0, 3)}
+    how = {"views": [grey, "bev"], "frames": slice(0, 3)}
     one, two = (video(f"{count}.mp4", workers=count, **how) for count in (1, 2))
     with ThreadPoolExecutor(3) as executor:
         sent = video("sent.mp4", executor=executor, **how)
@@ -72,7 +72,7 @@ def test_what_is_interrupted_leaves_the_old_file_alone(
 
     (tmp_path / f"v{suffix}").write_text("old")
     with pytest.raises(type(stop)):
-        video(f"v{suffix}", what=breaks)
+        video(f"v{suffix}", views=breaks)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(f"v{suffix}", "old")]
 
 
@@ -89,14 +89,14 @@ def test_errors_come_before_anything_is_drawn(video: Callable[..., Path], tmp_pa
         ),
         (write(size=(0, 90)), ChoiceError, ("size", "at least 16 pixels")),
         (write(fps=0), ChoiceError, ("fps", "above 0")),
-        (write(what="film"), ChoiceError, ("what", "frame, sample, accident", "'film'")),
-        (write(what=[]), ChoiceError, ("what", "at least one of frame")),
-        (write(what="bev", layers=["image"]), ChoiceError, ("layers", "bev", "'image'")),
+        (write(views="film"), ChoiceError, ("what", "frame, sample, accident", "'film'")),
+        (write(views=[]), ChoiceError, ("what", "at least one of frame")),
+        (write(views="bev", layers=["image"]), ChoiceError, ("layers", "bev", "'image'")),
         (write(frames=[1, 7]), ChoiceError, ("frames", "1 to 6", "found 7")),
         (write(frames=slice(9, None)), ChoiceError, ("frames", "1 to 6", "found none")),
         (write(agents=["pole"]), ChoiceError, ("agent", "ego_vehicle", "'pole'")),
         (
-            write(what=lambda *_: None, workers=2),
+            write(views=lambda *_: None, workers=2),
             ChoiceError,
             ("cannot be sent to other processes", "a module"),
         ),
@@ -120,7 +120,7 @@ def video(da: DeepAccident, accident: str, tmp_path: Path) -> Callable[..., Path
             da,
             accident,
             tmp_path / name,
-            **{"what": grey, "size": SIZE, "progress": False, **options},
+            **{"views": grey, "size": SIZE, "progress": False, **options},
         )
 
     return write
@@ -175,7 +175,7 @@ def test_each_view_draws_those_of_the_layers_that_it_has() -> None:
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
 def test_colors_are_right_in_the_file(video: Callable[..., Path], suffix: str) -> None:
-    picture = decoded(video(f"v{suffix}", what=colors, frames=[1]))[0]
+    picture = decoded(video(f"v{suffix}", views=colors, frames=[1]))[0]
     np.testing.assert_allclose(picture[45, 40], (255, 0, 0), atol=20)
     np.testing.assert_allclose(picture[45, 120], (0, 0, 255), atol=20)
 
@@ -224,6 +224,6 @@ def test_without_av_mp4_is_refused_before_anything_is_drawn(
     monkeypatch.setitem(sys.modules, "av", None)
     told = ("MP4 needs PyAV", "[video]", ".gif or .webp")
     assert_refused(
-        (lambda: video(name, what=lambda *_: pytest.fail("drawn")), MissingExtraError, told)
+        (lambda: video(name, views=lambda *_: pytest.fail("drawn")), MissingExtraError, told)
     )
     assert not list(tmp_path.iterdir())

@@ -26,7 +26,7 @@ from deepaccident_devkit.evaluation import (
 from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
-from deepaccident_devkit.render.boxes import NEAREST_DRAWN
+from deepaccident_devkit.render.boxes import NEAR_PLANE_M
 from deepaccident_devkit.render.outcomes import (
     draw_outcome_in_camera,
     render_outcome_in_cameras,
@@ -116,11 +116,11 @@ def test_detected_boxes_are_where_the_labels_have_them(da: DeepAccident, approac
         ax, boxes = in_camera(da, verdict, channel, size=(4, 2.5)), da.boxes(approach, channel)
         lens = camera_of(da, f"{approach}/{channel}")
         corners = boxes.corners()[np.isin(boxes.actor_id, [*counted])].reshape(-1, 3)
-        pixels, depth = lens.project(corners[corners[:, 2] > NEAREST_DRAWN])
+        pixels, depth = lens.project(corners[corners[:, 2] > NEAR_PLANE_M])
         for color in (OUTCOME_COLORS["right"], "black"):
             assert gaps(pixels, lines_in(ax, color, dashed=False)).max(initial=0) < 1e-6
         assert set(outcomes(ax)) <= {"right"}
-        inside = pixels[lens.in_image(pixels, depth, min_depth=NEAREST_DRAWN, margin=2)]
+        inside = pixels[lens.in_image(pixels, depth, min_depth=NEAR_PLANE_M, margin=2)]
         seen += len(inside)
         if channel == "Camera_Front":
             picture = rendered(ax)

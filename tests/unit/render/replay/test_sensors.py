@@ -20,15 +20,15 @@ from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.replay import render_replay, sensors
 from deepaccident_devkit.render.replay.entries import ReplayRecording, actor_entries, recording_of
 from deepaccident_devkit.render.replay.sensors import (
-    PAGE_POINTS,
+    PAGE_CLOUD_BYTES,
     Followed,
     Jpegs,
     PictureSettings,
     camera_files,
     camera_pictures,
     follow_pair,
-    most_points,
-    steady,
+    max_cloud_points,
+    steady_choice,
 )
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -37,7 +37,7 @@ from deepaccident_devkit.v2x.tracks import scenario_tracks
 def test_points_lie_on_those_of_the_lidar(da: DeepAccident, data: dict[str, Any]) -> None:
     scenario = accident(da)
     origin = recording_of(da, scenario, None).origin
-    most = most_points(30, PAGE_POINTS)
+    most = max_cloud_points(30, PAGE_CLOUD_BYTES)
     for agent, clouds in zip(AGENTS, data["points"], strict=True):
         for frame, coded in enumerate(clouds, 1):
             shown = np.frombuffer(base64.b64decode(coded), dtype="<i2").reshape(-1, 3) / 10 + [
@@ -97,8 +97,11 @@ def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident) -> N
             channel: [each is not None for each in all_]
             for channel, all_ in jpegs["infrastructure"].items()
         }
-        follows = [frame % settings.every == 0 for frame in range(6)]
-        others = [bool(settings.others) and frame % settings.others == 0 for frame in range(6)]
+        follows = [frame % settings.frame_step == 0 for frame in range(6)]
+        others = [
+            bool(settings.other_frame_step) and frame % settings.other_frame_step == 0
+            for frame in range(6)
+        ]
         expected = {
             CAMERAS[0]: follows,
             "Camera_BackLeft": others,
@@ -106,7 +109,7 @@ def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident) -> N
         }
         assert {channel: given.get(channel, [False] * 6) for channel in expected} == expected
     assert sizes == sorted(sizes, reverse=True)
-    assert (settings.others, settings.every > 1) == (0, True)
+    assert (settings.other_frame_step, settings.frame_step > 1) == (0, True)
     assert taken(da, 10)[1] == {}
 
 
@@ -189,14 +192,14 @@ def test_the_pair_is_in_the_picture_at_the_impact(
     ],
 )
 def test_changes_are_worth_their_cost(scores: list[list[float]], chosen: list[int]) -> None:
-    assert steady(np.array(scores)) == chosen
+    assert steady_choice(np.array(scores)) == chosen
 
 
 def test_other_cameras_have_smaller_pictures(
     da: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sensors, "LEAST_OTHER", 8)
-    monkeypatch.setattr(sensors, "LADDER", [(40, 60)])
+    monkeypatch.setattr(sensors, "MIN_OTHER_WIDTH_PX", 8)
+    monkeypatch.setattr(sensors, "PICTURE_LADDER", [(40, 60)])
     jpegs = taken(da, math.inf)[1]["other_vehicle"]
     large, small = (40, 22), (20, 11)
     expected = {"Front": [large] * 6, "Back": [small] * 3 + [large] * 3, "FrontRight": [small] * 6}
