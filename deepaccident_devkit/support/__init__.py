@@ -1,1 +1,1 @@
-"""Help that all packages use: arrays and texts checked, files read and written, reports, pages, plug-ins."""
+"""Helpers of all packages: arrays, texts, files, reports, pages, bulk work, plug-ins."""

@@ -1,4 +1,4 @@
-"""Array aliases, and the checks of the arrays and numbers that a caller passes."""
+"""Array aliases, and checks of the arrays and numbers that a caller passes."""
 
 from __future__ import annotations
 
@@ -21,29 +21,32 @@ BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
 AnyArray = NDArray[Any]
 _FLOAT64: Final = np.dtype(np.float64)
-# Kinds of element types.
-_NUMBERS: Final = "biuf"
-# Metres, m/s, pixels, …: a larger number in a file is damage and counts as infinite; squares would overflow.
+# Kinds of the element types of numbers.
+_NUMBER_KINDS: Final = "biuf"
+# Largest number of metres, m/s, pixels, …: a larger one in a file is damage and counts as infinite,
+# since squares would overflow.
 LARGEST_NUMBER: Final = 1e9
-_LONGEST_FIELDS: Final = 160
-_LONGEST_VALUE: Final = 80
-# In texts of records: characters of all fields and of one, and entries of a collection that are shown.
-_FEW: Final = 4
+# Limits of the text of a record: characters of all fields and of one, and entries of a collection.
+_MAX_FIELDS_LENGTH: Final = 160
+_MAX_VALUE_LENGTH: Final = 80
+_MAX_ENTRIES: Final = 4
 
 
 def keep_freed(size: int = 31 * 2**20) -> None:
-    """Have the allocator (of Linux) keep freed blocks of up to `size` bytes, 31 MiB at most, for what is made next.
+    """Make the allocator (of Linux) keep freed blocks of up to `size` bytes, 31 MiB at most.
 
-    Else it returns them to the system each time, and to get their pages again takes as long as much of the work. It
-    does so after it has once freed a block as large, which is never touched.
+    Otherwise memory is returned to the system each time, and page faults take as long as much of
+    the work. The allocator does so after it has once freed a block as large, which is never
+    touched.
     """
     np.empty(min(size, 31 * 2**20), dtype=np.uint8)
 
 
 class ShortRepr:
-    """Base of dataclasses that hold arrays: their text is one line of fewer than 200 characters, with shapes of arrays.
+    """Base of dataclasses that hold arrays, with a text of one line.
 
-    The text that a dataclass makes would have the arrays' numbers. A subclass may have a `__repr__` of its own.
+    It has fewer than 200 characters, with the shapes of arrays; the text of an ordinary dataclass
+    would have the arrays' numbers. A subclass may have a `__repr__` of its own.
     """
 
     __slots__ = ()
@@ -51,15 +54,16 @@ class ShortRepr:
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         inherited = cls.__repr__
-        cls.__repr__ = inherited  # type: ignore[method-assign]  # a dataclass replaces one that is not the class's own
+        # A dataclass replaces a `__repr__` that is not the class's own.
+        cls.__repr__ = inherited  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
-        """The class and its fields, as far as they fit."""
+        """Return the class and its fields, as far as they fit."""
         kind: type[Any] = type(self)
         text = ""
         for number, name in enumerate(_field_names(kind)):
             part = f"{', ' * (number > 0)}{name}={_value_text(getattr(self, name))}"
-            if len(text) + len(part) > _LONGEST_FIELDS:
+            if len(text) + len(part) > _MAX_FIELDS_LENGTH:
                 text += ", …"
                 break
             text += part
@@ -67,7 +71,7 @@ class ShortRepr:
 
 
 class FrozenArrays(ShortRepr):
-    """Base of frozen dataclasses that hold arrays: these are read-only, from the start and in every copy.
+    """Base of frozen dataclasses with arrays that are read-only, from the start and in every copy.
 
     numpy forgets on pickling and on `copy.deepcopy` that an array was read-only.
     """
@@ -75,22 +79,22 @@ class FrozenArrays(ShortRepr):
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        """Freeze the arrays; a class that checks them freezes them itself."""
+        """Freeze the arrays; a class that checks its arrays freezes them itself."""
         kind: type[Any] = type(self)
         for field in fields(kind):
-            if isinstance(value := getattr(self, field.name), np.ndarray):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
                 object.__setattr__(self, field.name, readonly(value))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copies go without `__init__`, since what they hold was checked."""
-        return _restored, (
-            type(self),
-            {name: getattr(self, name) for name in _field_names(type(self))},
-        )
+        """Return a copy's constructor, which skips `__init__` since the values were checked."""
+        kind = type(self)
+        values = {name: getattr(self, name) for name in _field_names(kind)}
+        return _restore_arrays, (kind, values)
 
 
 class BitView(Sequence[bool]):
-    """A bool column as Arrow packs it, eight rows a byte; rows are unpacked when asked for."""
+    """A bool column as Arrow packs it, eight rows a byte; rows are unpacked on access."""
 
     def __init__(self, packed: ByteArray, length: int) -> None:
         """View `length` bits, lowest first."""
@@ -103,36 +107,43 @@ class BitView(Sequence[bool]):
         return iter(self[:].tolist())
 
     def __getitem__(self, rows: Any) -> Any:
-        """One row as bool; of a slice with step 1, or of an array of rows, a new bool array."""
+        """Return one row as bool, or a bool array of a slice (step 1) or of an array of rows."""
         if isinstance(rows, slice):
             start, stop, _ = rows.indices(self._length)
-            return self._unpacked(start, max(start, stop))
+            return self._unpack(start, max(start, stop))
         if isinstance(rows, np.ndarray):
             return (self._packed[rows >> 3] >> (rows & 7).astype(np.uint8) & 1).view(np.bool_)
         return bool(self._packed.item(rows >> 3) >> (rows & 7) & 1)
 
-    def _unpacked(self, start: int, stop: int) -> BoolArray:
+    def _unpack(self, start: int, stop: int) -> BoolArray:
         window = self._packed[start >> 3 : (stop + 7) >> 3]
-        first = start & 7
-        return np.unpackbits(window, bitorder="little")[first : first + stop - start].view(np.bool_)
+        offset = start & 7
+        return np.unpackbits(window, bitorder="little")[offset : offset + stop - start].view(
+            np.bool_
+        )
 
 
 def checked(
     name: str, values: ArrayLike, shape: Sequence[int | None], dtype: DTypeLike | None = np.float64
 ) -> AnyArray:
-    """`values` as an array of `dtype`, or GeometryError if they are no numbers or not of `shape` (None: any length).
+    """Return `values` as an array of `dtype` and `shape` (None: any length); raise GeometryError.
 
-    With dtype None they keep theirs; an array that has it already is not copied. For integers, numbers must be whole
-    and in range.
+    With dtype None they keep their own; an array that has it already is not copied. For integers,
+    numbers must be whole and in range.
     """
-    if type(values) is np.ndarray and values.dtype.kind in _NUMBERS and _fits(values.shape, shape):
-        # as nearly always; many small arrays of a sample's labels come here
-        return values if values.dtype == dtype else as_numbers(name, values, dtype=dtype)
+    if (
+        type(values) is np.ndarray
+        and values.dtype.kind in _NUMBER_KINDS
+        and _has_shape(values.shape, shape)
+    ):
+        # The fast path: many small arrays of a sample's labels come here.
+        if values.dtype == dtype:
+            return values
+        return as_numbers(name, values, dtype=dtype)
     array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
-    if not _fits(array.shape, shape):
-        remedy = (
-            "; transpose it (.T)" if array.ndim == 2 and _fits(array.shape[::-1], shape) else ""
-        )
+    if not _has_shape(array.shape, shape):
+        is_transposed = array.ndim == 2 and _has_shape(array.shape[::-1], shape)
+        remedy = "; transpose it (.T)" if is_transposed else ""
         raise GeometryError(
             f"{name}: expected shape {_shape_text(shape)}, found {array.shape}{remedy}"
         )
@@ -142,37 +153,39 @@ def checked(
 def as_numbers(
     name: str, values: ArrayLike, expected: str = "numbers", dtype: DTypeLike | None = np.float64
 ) -> AnyArray:
-    """`checked` for any shape: the one way in for a caller's arrays, of any framework.
+    """Return what `checked` returns, for any shape: the one way in for a caller's arrays.
 
-    Everything is taken that numpy can read without a copy from another device: its own arrays, sequences, and objects
-    with `__array__` or DLPack, such as torch tensors on the processor. Nothing is detached, fetched from an accelerator
-    or unmasked silently; the error says how. Numbers must be in the range of a float type too (NaN and inf pass).
+    Everything is accepted that numpy can read without a copy from another device: its own arrays,
+    sequences, and objects with `__array__` or DLPack, such as torch tensors on the processor.
+    Nothing is detached, fetched from an accelerator or unmasked silently; the error explains how.
+    Numbers must be in the range of a float type too (NaN and inf pass).
     """
-    given = _read(name, values, expected)
-    wanted = given.dtype if dtype is None else np.dtype(dtype)
-    if given.dtype.kind not in _NUMBERS:
+    source = _to_array(name, values, expected)
+    target = source.dtype if dtype is None else np.dtype(dtype)
+    if source.dtype.kind not in _NUMBER_KINDS:
         raise GeometryError(
-            f"{name}: expected {expected}, found {type(values).__name__} (no numbers: {given.dtype}){_remedy(values)}"
+            f"{name}: expected {expected}, found {type(values).__name__} (no numbers: "
+            f"{source.dtype}){_remedy(values)}"
         )
-    if given.dtype == wanted:
-        return given
-    if np.can_cast(given.dtype, wanted, "safe"):
-        return given.astype(wanted)
+    if source.dtype == target:
+        return source
+    if np.can_cast(source.dtype, target, "safe"):
+        return source.astype(target)
     with np.errstate(invalid="ignore", over="ignore"):
-        array = given.astype(wanted)
-    if wanted.kind in "iu":
-        if not np.array_equal(array, given):
-            other = given[array != given].flat[0]
-            raise GeometryError(f"{name}: expected whole numbers of {wanted}, found {other}")
+        array = source.astype(target)
+    if target.kind in "iu":
+        if not np.array_equal(array, source):
+            other = source[array != source].flat[0]
+            raise GeometryError(f"{name}: expected whole numbers of {target}, found {other}")
     elif (
-        wanted.kind == "f"
-        and wanted.itemsize < given.dtype.itemsize
+        target.kind == "f"
+        and target.itemsize < source.dtype.itemsize
         and not np.isfinite(array).all()
     ):
-        lost = np.isinf(array) & np.isfinite(given)
-        if lost.any():
+        overflowed = np.isinf(array) & np.isfinite(source)
+        if overflowed.any():
             raise GeometryError(
-                f"{name}: expected numbers within {wanted}'s range, found {given[lost][0]}"
+                f"{name}: expected numbers within {target}'s range, found {source[overflowed][0]}"
             )
     return array
 
@@ -183,13 +196,13 @@ def checked_number(
     expected: str = "a number",
     error: type[DeepAccidentError] = GeometryError,
 ) -> float:
-    """A single number, numpy's scalars among them, as Python's float; or raise `error`, which says what is expected."""
+    """Return a single number, also one of numpy's scalars, as Python's float; or raise `error`."""
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     try:
         if isinstance(value, Real):
             return float(value)
-    except OverflowError:  # a whole number of hundreds of digits
+    except OverflowError:  # an integer of hundreds of digits
         pass
     raise error(f"{name}: expected {expected}, found {value!r}")
 
@@ -200,7 +213,7 @@ def checked_whole(
     expected: str = "a whole number",
     error: type[DeepAccidentError] = GeometryError,
 ) -> int:
-    """A single whole number, numpy's integers among them, as Python's int; or raise `error`."""
+    """Return a single whole number, also an integer of numpy, as Python's int; or raise `error`."""
     try:
         return operator.index(value)  # type: ignore[arg-type]  # everything else is refused
     except TypeError:
@@ -208,72 +221,71 @@ def checked_whole(
 
 
 def checked_flag(name: str, value: object) -> bool:
-    """True or False, or ConfigError."""
+    """Return True or False; raise ConfigError."""
     if not isinstance(value, bool | np.bool_):
         raise ConfigError(f"{name}: expected True or False, found {value!r}")
     return bool(value)
 
 
-def checked_count(name: str, value: object, what: str, most: int) -> int:
-    """A whole number from 1 to `most`, or ConfigError, which says what it counts."""
-    expected = f"a whole number from 1 to {most:,} ({what})"
-    found = (
-        0
-        if isinstance(value, bool | np.bool_)
-        else checked_whole(name, value, expected, ConfigError)
-    )
-    if not 1 <= found <= most:
+def checked_count(name: str, value: object, subject: str, maximum: int) -> int:
+    """Return a whole number from 1 to `maximum`, or raise ConfigError, which names the subject."""
+    expected = f"a whole number from 1 to {maximum:,} ({subject})"
+    count = 0
+    if not isinstance(value, bool | np.bool_):
+        count = checked_whole(name, value, expected, ConfigError)
+    if not 1 <= count <= maximum:
         raise ConfigError(f"{name}: expected {expected}, found {value!r}")
-    return found
+    return count
 
 
 def checked_setting(
-    name: str, value: object, expected: str, least: float = -math.inf, most: float = math.inf
+    name: str, value: object, expected: str, minimum: float = -math.inf, maximum: float = math.inf
 ) -> float:
-    """A finite number from `least` to `most`, or ConfigError."""
-    found = (
-        math.nan
-        if isinstance(value, bool | np.bool_)
-        else checked_number(name, value, expected, ConfigError)
-    )
-    if not (math.isfinite(found) and least <= found <= most):
+    """Return a finite number from `minimum` to `maximum`, or raise ConfigError."""
+    number = math.nan
+    if not isinstance(value, bool | np.bool_):
+        number = checked_number(name, value, expected, ConfigError)
+    if not (math.isfinite(number) and minimum <= number <= maximum):
         raise ConfigError(f"{name}: expected {expected}, found {value!r}")
-    return found
+    return number
 
 
-def check_least(record: object, **least: float) -> None:
-    """Raise ConfigError if a field of a configuration is less than it may be, or NaN."""
-    for name, lowest in least.items():
-        if not (value := getattr(record, name)) >= lowest:
-            raise ConfigError(f"{name}: expected a number from {lowest}, found {value!r}")
+def check_least(record: object, **minima: float) -> None:
+    """Raise ConfigError if a field of a configuration is below its minimum, or NaN."""
+    for name, minimum in minima.items():
+        value = getattr(record, name)
+        if not value >= minimum:
+            raise ConfigError(f"{name}: expected a number from {minimum}, found {value!r}")
 
 
 def as_floats(values: ArrayLike) -> FloatArray:
-    """`values` as float64; arrays that are float64 already are not copied. Raises GeometryError."""
-    given = _read("", values, "numbers")
-    if given.dtype == _FLOAT64:
-        return given
+    """Return `values` as float64, without copying arrays of float64; raise GeometryError."""
+    array = _to_array("", values, "numbers")
+    if array.dtype == _FLOAT64:
+        return array
     try:
-        if given.dtype.kind == "c":
-            raise TypeError(f"no real numbers: {given.dtype}")
-        return given.astype(_FLOAT64)
+        if array.dtype.kind == "c":
+            raise TypeError(f"no real numbers: {array.dtype}")
+        return array.astype(_FLOAT64)
     except (TypeError, ValueError) as error:
         raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
 
 
 def in_range(numbers: AnyArray | float) -> BoolArray:
-    """Which numbers are neither NaN nor infinite, nor as large as no sound file has them."""
-    small: BoolArray = np.abs(numbers) <= np.float64(LARGEST_NUMBER)  # half precision has no 1e9
-    return small
+    """Return which numbers are neither NaN, infinite, nor larger than any valid file contains."""
+    is_small: BoolArray = np.abs(numbers) <= np.float64(LARGEST_NUMBER)  # half precision has no 1e9
+    return is_small
 
 
 def known(values: ArrayLike | None, digits: int | None = None) -> Any:
-    """Numbers as JSON holds them, in lists as deep as the array, rounded; None for what is not finite."""
+    """Return numbers for JSON, in lists as deep as the array, rounded; None if not finite."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim:
-        return [known(each, digits) for each in array]
+        return [known(row, digits) for row in array]
     number = array.item() if np.isfinite(array) else None
-    return number if number is None or digits is None else round(number, digits)
+    if number is None or digits is None:
+        return number
+    return round(number, digits)
 
 
 def readonly(array: AnyArray) -> AnyArray:
@@ -283,15 +295,15 @@ def readonly(array: AnyArray) -> AnyArray:
     return view
 
 
-def _read(name: str, values: Any, expected: str) -> AnyArray:
-    """`values` as an array of any type, or GeometryError with the remedy."""
+def _to_array(name: str, values: Any, expected: str) -> AnyArray:
+    """Return `values` as an array of any type; raise GeometryError with the remedy."""
     if type(values) is np.ndarray:
         return values
     prefix = f"{name}: " if name else ""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise GeometryError(
-            f"{prefix}expected {expected}, found {np.count_nonzero(values.mask)} masked values; pass "
-            "array.filled(value) with the value that is to stand there"
+            f"{prefix}expected {expected}, found {np.count_nonzero(values.mask)} masked values; "
+            "pass array.filled(value) with the value that is to stand there"
         )
     try:
         if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
@@ -303,14 +315,18 @@ def _read(name: str, values: Any, expected: str) -> AnyArray:
         ) from error
 
 
-def _fits(found: Sequence[int], shape: Sequence[int | None]) -> bool:
-    return len(found) == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, found, strict=True)
-    )
+def _has_shape(actual: Sequence[int], shape: Sequence[int | None]) -> bool:
+    if len(actual) != len(shape):
+        return False
+    lengths = zip(shape, actual, strict=True)
+    return all(expected is None or expected == length for expected, length in lengths)
 
 
 def _remedy(values: object) -> str:
-    """The remedy for a point cloud, or another framework's array that numpy does not read; empty for the rest."""
+    """Return the remedy for a point cloud, or another framework's array that numpy does not read.
+
+    Empty for all other values.
+    """
     if hasattr(values, "xyz"):
         return "; give its array, .xyz"
     if hasattr(values, "corners"):  # boxes, whose own error has the remedy
@@ -319,36 +335,41 @@ def _remedy(values: object) -> str:
         hasattr(values, "__array__") or hasattr(values, "__dlpack__")
     ):
         return ""
-    return "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 numpy array"
+    return (
+        "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 "
+        "numpy array"
+    )
 
 
-def _restored(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:
+def _restore_arrays(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:
     """Undo `FrozenArrays.__reduce__`."""
     result = object.__new__(kind)
     for name, value in values.items():
-        object.__setattr__(
-            result, name, readonly(value) if isinstance(value, np.ndarray) else value
-        )
+        frozen = readonly(value) if isinstance(value, np.ndarray) else value
+        object.__setattr__(result, name, frozen)
     return result
 
 
 def _value_text(value: object) -> str:
-    """An array's shape and type; of what is long, only its type, and how many it holds."""
+    """Return an array's shape and type, and only the type and length of long collections."""
     if isinstance(value, np.ndarray):
         return f"{value.shape} {value.dtype}"
     if isinstance(value, float):
         return f"{value:.6g}"
-    if isinstance(value, Mapping | list | tuple) and (len(value) > _FEW or _holds_arrays(value)):
-        return (
-            f"<{len(value)} in a {'dict' if isinstance(value, Mapping) else type(value).__name__}>"
-        )
+    if isinstance(value, Mapping | list | tuple) and (
+        len(value) > _MAX_ENTRIES or _holds_arrays(value)
+    ):
+        kind = "dict" if isinstance(value, Mapping) else type(value).__name__
+        return f"<{len(value)} in a {kind}>"
     text = repr(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{type(value).__name__}(…)"
+    if len(text) <= _MAX_VALUE_LENGTH:
+        return text
+    return f"{type(value).__name__}(…)"
 
 
-def _holds_arrays(values: Mapping[Any, Any] | Sequence[Any]) -> bool:
-    each = values.values() if isinstance(values, Mapping) else values
-    return any(isinstance(one, np.ndarray | Mapping | list | tuple) for one in each)
+def _holds_arrays(collection: Mapping[Any, Any] | Sequence[Any]) -> bool:
+    values = collection.values() if isinstance(collection, Mapping) else collection
+    return any(isinstance(value, np.ndarray | Mapping | list | tuple) for value in values)
 
 
 def _field_names(kind: type[Any]) -> Iterable[str]:
@@ -356,4 +377,5 @@ def _field_names(kind: type[Any]) -> Iterable[str]:
 
 
 def _shape_text(shape: Sequence[int | None]) -> str:
-    return "(" + ", ".join("N" if length is None else str(length) for length in shape) + ")"
+    lengths = ["N" if length is None else str(length) for length in shape]
+    return f"({', '.join(lengths)})"

@@ -1,4 +1,7 @@
-"""Names of the nuScenes devkit that this devkit does not have, and what to use here; docs/reading.md has all."""
+"""Names of the nuScenes devkit that this devkit lacks, and their counterparts here.
+
+docs/reading.md lists all.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,8 @@ _PAGE: Final = "docs/reading.md"
 _HINTS: Final = json.loads(Path(__file__).with_suffix(".json").read_bytes())
 
 
-def _hints(of: str) -> Mapping[str, str]:
-    return {name: hint for hint, names in _HINTS[of].items() for name in names}
+def _hints(kind: str) -> Mapping[str, str]:
+    return {name: hint for hint, names in _HINTS[kind].items() for name in names}
 
 
 # nuScenes' tables → what to use here.
@@ -34,21 +37,22 @@ CLOUD: Final = _hints("cloud")
 KEYWORDS: Final = _hints("keywords")
 # Fields of nuScenes' records → what to use here.
 FIELD_HINTS: Final = _hints("fields")
-# What to use here in place of making nuScenes' `Box`.
+# What to use here instead of constructing nuScenes' `Box`.
 BOX_MADE: Final = (
-    "boxes[0] picks one, and nuScenes' Box(center, wlh, orientation) is Box.from_wlh(center, wlh, orientation, "
-    f"frame='ego') (see {_PAGE})"
+    "boxes[0] picks one, and nuScenes' Box(center, wlh, orientation) is Box.from_wlh(center, wlh, "
+    f"orientation, frame='ego') (see {_PAGE})"
 )
 
 
 class AbsentName:
-    """Stands in a class for a name of nuScenes' class: to read it raises MissingNameError, so `hasattr` is False.
+    """A name of nuScenes' class in one of ours: reading it raises MissingNameError.
 
-    A `__getattr__` of the class would do the same, but make all its other attributes slower.
+    So `hasattr` is False. A `__getattr__` of the class would do the same, but slow down all other
+    attributes.
     """
 
     def __init__(self, name: str, counterpart: str) -> None:
-        """Note the name, and what to use here."""
+        """Store the name, and what to use here."""
         self._name = name
         self._counterpart = counterpart
 
@@ -57,53 +61,60 @@ class AbsentName:
 
 
 def without_names(counterparts: Mapping[str, str]) -> Callable[[type[_T]], type[_T]]:
-    """A decorator of a class that has none of these names, and says so with the counterpart of each."""
+    """Return a decorator of a class that lacks these names, and names the counterpart of each."""
 
-    def put(owner: type[_T]) -> type[_T]:
+    def add_absent_names(owner: type[_T]) -> type[_T]:
         for name, counterpart in counterparts.items():
             setattr(owner, name, AbsentName(name, counterpart))
         return owner
 
-    return put
+    return add_absent_names
 
 
 def missing_name(owner: type, name: str, counterpart: str) -> MissingNameError:
-    """The error of a class that has no such name."""
+    """Return the error of a class that lacks a name."""
     return MissingNameError(f"{owner.__name__} has no {name!r}: {counterpart} (see {_PAGE})")
 
 
 def with_keywords_named(function: Callable[P, _T], module: str | None = None) -> Callable[P, _T]:
-    """Return the same function, which raises a KeywordError for an argument that it does not have.
+    """Return the same function, which raises a KeywordError for unknown arguments.
 
-    Of an argument of nuScenes' the error says what to use, of others which one may be meant. `module` is where the
-    result lies, and where pickle finds it; None for the place of the function itself.
+    For an argument of nuScenes' functions the error names the counterpart, for others a similar
+    one. `module` is the module of the result, where pickle finds it; None for that of the function
+    itself.
     """
-    known = signature(function).parameters
-    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values())
-    called = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
+    parameters = signature(function).parameters
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    function_name = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
     @wraps(function)
-    def checked(*arguments: P.args, **named: P.kwargs) -> _T:
-        for name in sorted(named.keys() - known.keys()) if named else ():
+    def checked(*arguments: P.args, **keywords: P.kwargs) -> _T:
+        for name in sorted(keywords.keys() - parameters.keys()) if keywords else ():
             if name in KEYWORDS:
                 raise KeywordError(
-                    f"{called} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})"
+                    f"{function_name} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})"
                 )
             if not takes_any:
-                raise KeywordError(f"{called} has no argument {name!r}{meant_text(name, known)}")
-        return function(*arguments, **named)
+                raise KeywordError(
+                    f"{function_name} has no argument {name!r}{meant_text(name, parameters)}"
+                )
+        return function(*arguments, **keywords)
 
     checked.__module__ = module or function.__module__
     return checked
 
 
 def table_remedy(name: object) -> str:
-    """What to say of a table that is nuScenes'; empty for all others."""
+    """Return the end of a message about a table of nuScenes; empty for all others."""
     counterpart = TABLES.get(name) if isinstance(name, str) else None
-    return f"; of nuScenes' table {name!r}: {counterpart} (see {_PAGE})" if counterpart else ""
+    if counterpart:
+        return f"; of nuScenes' table {name!r}: {counterpart} (see {_PAGE})"
+    return ""
 
 
 def field_remedy(name: object) -> str:
-    """What to say of a record's field that is nuScenes'; empty for all others."""
+    """Return the end of a message about a field of nuScenes' records; empty for all others."""
     counterpart = FIELD_HINTS.get(name) if isinstance(name, str) else None
-    return f": {counterpart} (see {_PAGE})" if counterpart else ""
+    if counterpart:
+        return f": {counterpart} (see {_PAGE})"
+    return ""

@@ -1,6 +1,6 @@
-"""Pages and parts of them by the templates in `templates/`: whatever is not `Markup` is escaped, so no name adds tags.
+"""Pages and parts of them from the templates in `templates/`.
 
-Jinja2 is imported when the first page is made.
+All texts except `Markup` are escaped, so no name adds tags. Jinja2 is imported for the first page.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
 
 # A browser loads nothing and runs nothing, even if a name in the results tries to.
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-_MOST_DIGITS: Final = 6
-# Where a name may be broken.
-_JOINTS: Final = re.compile(r"(?<=[/_=])(?=\w)|(?=@)")
+_MAX_DIGITS: Final = 6
+# Positions where a name may be broken.
+_BREAK_POINTS: Final = re.compile(r"(?<=[/_=])(?=\w)|(?=@)")
 
 
 @cache
 def environment() -> Environment:
-    """The templates; a name that is not there is an error."""
+    """Return the templates; an undefined name is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    made = Environment(
+    templates = Environment(
         loader=PackageLoader("deepaccident_devkit.support"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
     )
-    made.filters |= {
+    templates.filters |= {
         "agent": short_name,
         "breakable": breakable,
         "counted": counted,
@@ -53,22 +53,26 @@ def environment() -> Environment:
         "scalar": scalar,
         "thousands": "{:,}".format,
     }
-    made.globals["version"] = __version__
-    return made
+    templates.globals["version"] = __version__
+    return templates
 
 
 def rendered(template: str, **context: Any) -> str:
-    """A template of this name as text, with all that it shows; control characters are shown as in JSON."""
+    """Return a filled template as text; control characters are shown as in JSON."""
     return escaped(environment().get_template(template).render(**context))
 
 
 def document(
     template: str, *, style: str, policy: str = _POLICY, script: str = "", **context: Any
 ) -> str:
-    """A page that is one file, by a template that extends `document.html`, and the context that it shows.
+    """Return a page that is one file, from a template that extends `document.html`.
 
-    `policy` is the Content-Security-Policy: what a browser may load and run. `script` is the only one that runs, after
-    the page is read; the policy then allows it too.
+    Args:
+        template: Name of the template.
+        style: Style sheet.
+        policy: Content-Security-Policy: what a browser may load and run.
+        script: The only script that runs, after the page is read; the policy then allows it too.
+        **context: Further variables of the template.
     """
     if script:
         policy += f"; script-src '{source_hash(script)}'"
@@ -76,64 +80,68 @@ def document(
 
 
 def part(name: str) -> str:
-    """A file beside the templates that is no template, such as a script."""
+    """Return a file beside the templates that is no template, such as a script."""
     return (files("deepaccident_devkit.support") / "templates" / name).read_text(encoding="utf-8")
 
 
 def source_hash(text: str) -> str:
-    """A source in a content security policy that allows only this text."""
+    """Return a source in a content security policy that only allows this text."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
 
 
 def breakable(text: str) -> Markup:
-    """A text, escaped, whose names may be broken after `/`, `_` and `=` and before `@`; `Markup` as it is."""
+    """Return an escaped text with names that may be broken after `/`, `_` and `=` and before `@`.
+
+    `Markup` stays as it is.
+    """
     from markupsafe import Markup, escape
 
-    return escape(text) if hasattr(text, "__html__") else Markup("<wbr>").join(_JOINTS.split(text))
+    if hasattr(text, "__html__"):
+        return escape(text)
+    return Markup("<wbr>").join(_BREAK_POINTS.split(text))
 
 
 def path_in_address(text: str) -> str:
-    """A token as a part of an address."""
+    """Return a token as a part of an address."""
     return quote(text, safe="/")
 
 
 def png_address(content: bytes) -> str:
-    """A PNG picture as an address that holds it."""
+    """Return a PNG picture as an address that contains it."""
     return f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def scalar(value: Any) -> str:
-    """A value as text: numbers with few digits, a dash for an unknown value, `none` for no value at all."""
+    """Return a value as text: numbers with few digits, a dash if unknown, `none` if empty."""
     if isinstance(value, list | tuple | Mapping) and not value:
         return "none"
     if isinstance(value, list | tuple):
-        return _listed(value, scalar)
+        return _join_texts(value, scalar)
     if isinstance(value, Mapping):
-        return ", ".join(f"{name}: {scalar(each)}" for name, each in value.items())
+        return ", ".join(f"{name}: {scalar(member)}" for name, member in value.items())
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.{_MOST_DIGITS}g}" if isinstance(value, float) else str(value)
+    return f"{value:.{_MAX_DIGITS}g}" if isinstance(value, float) else str(value)
 
 
 def result_text(value: Any) -> str:
-    """A result as text: three decimals, and three digits from 10 on; whole numbers whole; a dash for an unknown one."""
+    """Return a result as text: three decimals, and three digits from 10 on.
+
+    Whole numbers are whole; an unknown one is a dash.
+    """
     if isinstance(value, list | tuple):
-        return _listed(value, result_text)
+        return _join_texts(value, result_text)
     if isinstance(value, bool | str) or value is None or not math.isfinite(value):
         return scalar(value)
-    if value == round(value):
+    if value == round(value) or abs(value) >= 1000:
         return f"{value:,.0f}"
-    return (
-        f"{value:.3f}"
-        if abs(value) < 10
-        else f"{value:.3g}"
-        if abs(value) < 1000
-        else f"{value:,.0f}"
-    )
+    if abs(value) < 10:
+        return f"{value:.3f}"
+    return f"{value:.3g}"
 
 
-def _listed(values: Sequence[Any], text: Callable[[Any], str]) -> str:
-    between = "; " if any(isinstance(each, list | tuple) for each in values) else ", "
-    return between.join(map(text, values))
+def _join_texts(values: Sequence[Any], text: Callable[[Any], str]) -> str:
+    separator = "; " if any(isinstance(value, list | tuple) for value in values) else ", "
+    return separator.join(map(text, values))

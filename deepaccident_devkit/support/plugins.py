@@ -1,8 +1,8 @@
-"""Plug-ins: products that stand on the core and add verbs, formats, tasks and more to it (docs/plugins.md).
+"""Plug-ins: products on top of the core that add verbs, formats, tasks and more (docs/plugins.md).
 
-Our own are the folders of `deepaccident_devkit/plugins` that have a `plugin.py`. Other people's are installed packages
-with an entry point in the group `deepaccident_devkit.plugins`. Either offers one object, a `Plugin`. What it offers is
-imported when it is used.
+Our own are the folders of `deepaccident_devkit/plugins` with a `plugin.py`. Others are installed
+packages with an entry point in the group `deepaccident_devkit.plugins`. Either has one object, a
+`Plugin`. Its offers are imported when they are used.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ _PACKAGE: Final = f"{__package__.partition('.')[0]}.plugins"
 
 
 class LazyVerb(NamedTuple):
-    """A verb of the command line: one line for the list of verbs, and a function that imports the verb."""
+    """A verb of the command line: a line for the list of verbs, and a function that imports it."""
 
     summary: str
     load: Callable[[], click.Command]
 
 
 class LazyFormat(NamedTuple):
-    """A format of `deepaccident export`: one line for the list of formats, and a function that imports it."""
+    """A format of `deepaccident export`: a line for the list, and a function that imports it."""
 
     summary: str
     load: Callable[[], type[Format]]
 
 
 class LazyTask(NamedTuple):
-    """A task of `deepaccident evaluate`: one line for the list of tasks, and a function that imports its evaluator."""
+    """A task of `deepaccident evaluate`: a line for the list, and a function that imports it."""
 
     summary: str
     load: Callable[[], type[Evaluator[Any]]]
@@ -59,8 +59,8 @@ class Opener(NamedTuple):
     """A function that opens dataroots of another dataset, and one that recognizes them.
 
     Attributes:
-        recognizes: folder → whether it is such a dataroot.
-        open_release: folder, folder for the index or None → the release.
+        recognizes: Folder → whether it is such a dataroot.
+        open_release: Folder, folder for the index or None → the release.
     """
 
     recognizes: Callable[[Path], bool]
@@ -69,7 +69,7 @@ class Opener(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Plugin:
-    """What a plug-in offers, by name; it is imported when it is used.
+    """The offers of a plug-in, by name; each is imported when it is used.
 
     Attributes:
         name: Name that messages use.
@@ -90,7 +90,7 @@ class Plugin:
     extra_results: Mapping[str, Callable[[], ExtraResult]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the kinds of what is offered; raises TypeError."""
+        """Check the types of the offers; raise TypeError."""
         kinds = {
             "verbs": LazyVerb,
             "openers": Opener,
@@ -114,10 +114,10 @@ Offered = TypeVar("Offered")
 
 @dataclass(frozen=True, slots=True)
 class Offers(Generic[Offered]):
-    """What plug-ins offer of one kind.
+    """The offers of one kind by all plug-ins.
 
     Attributes:
-        by_name: Name → what is offered.
+        by_name: Name → offer.
         refused: Plug-in → why it, or one of its names, is left out.
     """
 
@@ -137,20 +137,21 @@ def offers(
     *,
     own: bool = False,
 ) -> Offers[Offered]:
-    """Collect what plug-ins offer of one kind.
+    """Collect the offers of one kind by all plug-ins.
 
     Args:
-        read: Takes it out of a plug-in.
+        read: Function that returns the offers of a plug-in.
         core: Names that the core has; a plug-in cannot offer them.
-        own: Whether to ask the devkit's own plug-ins only, which reads no entry points.
+        own: Whether to ask only the devkit's own plug-ins, which reads no entry points.
 
     Returns:
-        The names that one plug-in offers. Of several with one name the devkit's own has it, or nobody.
+        The names that one plug-in offers. If several offer a name, the devkit's own has it, or
+        nobody.
     """
-    found = own_plugins() if own else all_plugins()
-    refused = dict(found.refused)
+    installed = own_plugins() if own else all_plugins()
+    refused = dict(installed.refused)
     owners: dict[str, list[tuple[str, Offered]]] = {}
-    for plugin in found.plugins:
+    for plugin in installed.plugins:
         for name, value in read(plugin).items():
             owners.setdefault(name, []).append((plugin.name, value))
     by_name = {}
@@ -165,15 +166,13 @@ def offers(
             by_name[name] = owned[0][1]
             refused |= dict.fromkeys(names[1:], f"it offers {name!r}, which {names[0]} offers, too")
         else:
-            refused |= {
-                owner: f"{' and '.join(names)} both offer {name!r}; uninstall one of them"
-                for owner in names
-            }
+            reason = f"{' and '.join(names)} both offer {name!r}; uninstall one of them"
+            refused |= dict.fromkeys(names, reason)
     return Offers(by_name, refused)
 
 
 class Installed(NamedTuple):
-    """The plug-ins that were loaded, and for each that was not, why."""
+    """The loaded plug-ins, and the reason for each that was not loaded."""
 
     plugins: tuple[Plugin, ...]
     refused: Mapping[str, str]
@@ -181,7 +180,7 @@ class Installed(NamedTuple):
 
 @cache
 def own_plugins() -> Installed:
-    """Load the objects of the devkit's own plug-ins, without the packages that they describe."""
+    """Load the devkit's own plug-ins, without the packages that they describe."""
     return _loaded(
         (path.parent.name, _from_file, path) for path in sorted(_FOLDER.glob("*/plugin.py"))
     )
@@ -189,22 +188,23 @@ def own_plugins() -> Installed:
 
 @cache
 def all_plugins() -> Installed:
-    """Load the devkit's own plug-ins and, unless they are switched off, those of other installed packages."""
+    """Load the devkit's own plug-ins and, unless switched off, other installed plug-ins."""
     from importlib.metadata import entry_points  # reading them takes milliseconds
 
     own = own_plugins()
     if os.environ.get(OFF_SWITCH, "").lower() == "off":
         return own
     points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name)
-    others = _loaded((point.name, lambda point: point.load(), point) for point in points)
-    return Installed((*own.plugins, *others.plugins), {**own.refused, **others.refused})
+    external = _loaded((point.name, lambda point: point.load(), point) for point in points)
+    return Installed((*own.plugins, *external.plugins), {**own.refused, **external.refused})
 
 
 def need_plugin(name: str, purpose: str) -> None:
-    """Raise MissingPluginError, which says what for, if one of the devkit's own plug-ins is not installed."""
+    """Raise MissingPluginError with the purpose if one of the devkit's own plug-ins is missing."""
     if not (_FOLDER / name / "plugin.py").is_file():
         raise MissingPluginError(
-            f"{purpose}: needs the plug-in {name}, which this installation lacks; install the whole devkit"
+            f"{purpose}: needs the plug-in {name}, which this installation lacks; install the "
+            "whole devkit"
         )
 
 
@@ -222,7 +222,8 @@ def _loaded(sources: Iterator[tuple[str, Callable[[Any], Any], Any]]) -> Install
         elif plugin.protocol_version != PROTOCOL_VERSION:
             version = plugin.protocol_version
             refused[name] = (
-                f"it is for version {version} of the plug-in protocol, this devkit has {PROTOCOL_VERSION}"
+                f"it is for version {version} of the plug-in protocol, this devkit has "
+                f"{PROTOCOL_VERSION}"
             )
         else:
             plugins.append(plugin)
@@ -230,7 +231,7 @@ def _loaded(sources: Iterator[tuple[str, Callable[[Any], Any], Any]]) -> Install
 
 
 def _from_file(path: Path) -> Any:
-    """Return the plug-in object of a `plugin.py`; its package, which may be slow to import, is not imported."""
+    """Return the object of a `plugin.py` without its package, which may be slow to import."""
     spec = importlib.util.spec_from_file_location(f"{_PACKAGE}.{path.parent.name}.plugin", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path}: cannot be imported")

@@ -1,6 +1,6 @@
-"""JavaScript modules bundled into one script, for pages that are a single file or are opened without a server.
+"""JavaScript modules bundled into one script, for single-file pages and pages without a server.
 
-Browsers load no modules from a disk, and the policy of a single page allows only one script.
+Browsers load no modules from a disk, and the policy of a single page only allows one script.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ _IMPORT: Final = re.compile(
 _EXPORT: Final = re.compile(
     r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE
 )
-# A comment of types, which browsers do not need.
+# A comment with types, which browsers do not need.
 _TYPES: Final = re.compile(r"^ */\*\*(?:(?!\*/).)*\*/\n", re.MULTILINE | re.DOTALL)
 _UNKNOWN: Final = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
 
 def bundled(read: Callable[[str], str], name: str) -> str:
-    """Return a module and all that it imports as one script, which makes no global names and has no comments of types.
+    """Return a module and all its imports as one script, without global names and type comments.
 
     Args:
         read: Function that returns the text of a module in the same folder, such as `clock.js`.
@@ -29,7 +29,8 @@ def bundled(read: Callable[[str], str], name: str) -> str:
 
     Raises:
         ValueError: Modules import each other, or one has an import or export of another form than
-            `import { a, b } from "./name.js";` and `export` before a function, a class or a constant.
+            `import { a, b } from "./name.js";` and `export` before a function, a class or a
+            constant.
         OSError: `read` does not find a module.
     """
     modules: dict[str, str] = {}
@@ -40,7 +41,7 @@ def bundled(read: Callable[[str], str], name: str) -> str:
 def _add(
     read: Callable[[str], str], name: str, importers: tuple[str, ...], modules: dict[str, str]
 ) -> None:
-    """Add a module after those that it imports."""
+    """Add a module after its imports."""
     if name in importers:
         raise ValueError(f"modules import each other: {' imports '.join((*importers, name))}")
     if name in modules:
@@ -50,6 +51,7 @@ def _add(
         _add(read, imported[2], (*importers, name), modules)
     exports = ", ".join(_EXPORT.findall(text))
     body = _EXPORT.sub("", _IMPORT.sub(r"const {\1} = module_\2;", text))
-    if unknown := _UNKNOWN.search(body):
+    unknown = _UNKNOWN.search(body)
+    if unknown:
         raise ValueError(f"{name}.js: the bundler does not know this form: {unknown[0]}")
     modules[name] = f"const module_{name} = (() => {{\n{body}return {{ {exports} }};\n}})();\n"

@@ -1,8 +1,8 @@
 """Sketches: a few numbers from which the distance between two long vectors is estimated.
 
-Each number is the sum of all values, each with a sign drawn at random, the same signs everywhere. The differences
-between the numbers of two sketches are then, on average, as large as the vectors are apart: the square root of the sum
-of their values' squared differences.
+Each number is the sum of all values, each with a sign drawn at random, the same signs everywhere.
+The differences between the numbers of two sketches are then, on average, as large as the vectors
+are apart: the square root of the sum of their values' squared differences.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _PERIOD: Final = 1 << 18
 def sketch(values: Any) -> Sketch:
     """Return the sketch of an array's values, in their order."""
     flat = np.asarray(values, dtype=np.float32).ravel()
-    return whole_numbers(_signs().take(np.arange(flat.size), axis=1, mode="wrap") @ flat)
+    signs = _signs().take(np.arange(flat.size), axis=1, mode="wrap")
+    return whole_numbers(signs @ flat)
 
 
 def whole_numbers(sums: Any) -> Sketch:
@@ -35,15 +36,16 @@ def whole_numbers(sums: Any) -> Sketch:
     return tuple(map(round, np.nan_to_num(sums, nan=_UNKNOWN).tolist()))
 
 
-def distance(one: Sketch, other: Sketch) -> float:
-    """Estimate how far the vectors of two sketches are apart; infinite if one of them is none."""
-    if len(one) != _SUM_COUNT or len(other) != _SUM_COUNT:
+def distance(left_sketch: Sketch, right_sketch: Sketch) -> float:
+    """Estimate how far the vectors of two sketches are apart; infinite if one is no sketch."""
+    if len(left_sketch) != _SUM_COUNT or len(right_sketch) != _SUM_COUNT:
         return math.inf
-    return math.dist(one, other) / math.sqrt(_SUM_COUNT)
+    return math.dist(left_sketch, right_sketch) / math.sqrt(_SUM_COUNT)
 
 
 @cache
 def _signs() -> Float32Array:
     """Return the signs of a period's values in each sum, (8, P) of −1 and 1."""
-    drawn = np.frombuffer(hashlib.shake_256(b"sketches").digest(_PERIOD), dtype=np.uint8)
-    return readonly(np.unpackbits(drawn).reshape(_SUM_COUNT, _PERIOD).astype(np.float32) * 2 - 1)
+    random_bytes = hashlib.shake_256(b"sketches").digest(_PERIOD)
+    bits = np.unpackbits(np.frombuffer(random_bytes, dtype=np.uint8))
+    return readonly(bits.reshape(_SUM_COUNT, _PERIOD).astype(np.float32) * 2 - 1)

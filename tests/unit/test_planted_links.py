@@ -15,7 +15,7 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import DeepAccidentError, OutputFolderError
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.motion import MotionLabelConfig, write_label_files
-from deepaccident_devkit.plugins.explore.explorer import KeptFiles
+from deepaccident_devkit.plugins.explore.explorer import FileStore
 from deepaccident_devkit.plugins.synth import SynthConfig, generate, make_release
 from deepaccident_devkit.plugins.synth.scenario import RecordingJob
 from deepaccident_devkit.support.files import place_in, remove_in, write_bytes
@@ -92,7 +92,7 @@ def an_index(dataset: DeepAccident, folder: Path) -> None:
     opened = DeepAccident(dataroot=folder / "release", verbose=False)
     for row in opened.scenario:
         opened.interactions(row["token"])
-    KeptFiles(opened).get("one", "a.jpg", lambda: b"made")
+    FileStore(opened).get("one", "a.jpg", lambda: b"made")
 
 
 WRITERS: dict[str, tuple[Writer, Writer]] = {

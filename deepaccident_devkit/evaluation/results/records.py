@@ -325,7 +325,7 @@ def json_excerpt(value: object) -> str:
     return f"{text[:_MAX_VALUE_LENGTH]}…"
 
 
-def parsed_json(content: bytes, levels: int = json_text.MOST_LEVELS) -> Any:
+def parsed_json(content: bytes, levels: int = json_text.MAX_LEVELS) -> Any:
     """Return the value of JSON text; raises ContentError that names the location of a fault."""
     try:
         return json_text.parsed_json(content, levels=levels)

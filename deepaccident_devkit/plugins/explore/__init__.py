@@ -1,7 +1,8 @@
-"""Pages in the browser: find a scenario, watch it, see what a model says of it (extra `explore`).
+"""Pages in the browser: find a scenario, watch it, see a model's predictions (extra `explore`).
 
-`explore` serves them, `export_pages` writes those of some scenarios as files; `make_app` gives the ASGI application
-itself, without a guard. Everything is read-only: nothing that a browser sends changes a file of the release.
+`explore` serves them, `export_pages` writes the pages of some scenarios as files; `make_app`
+returns the ASGI application itself, without access control. Everything is read-only: nothing that a
+browser sends changes a file of the release.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Explorer", "explore", "export_pages", "make_app"]
 
-# Where names are that the help of the command does without; all but the first need the extra.
-_LATER = {"Explorer": "explorer", "export_pages": "static_pages", "make_app": "pages"}
+# Name → its module, for names that the help of the command does not need; all but the first need
+# the extra.
+_LAZY_MODULES = {"Explorer": "explorer", "export_pages": "static_pages", "make_app": "pages"}
 
 
 def explore(
@@ -31,20 +33,22 @@ def explore(
 ) -> None:
     """Serve the pages of an explorer until Ctrl-C.
 
-    Only who has the token in the printed address can read them; docs/explore.md says how they are reached through an
-    SSH tunnel or a notebook's proxy, and what is checked.
+    Only a browser with the token of the printed address can read them; docs/explore.md explains how
+    they are reached through an SSH tunnel or a notebook's proxy, and what is checked.
 
     Args:
-        explorer: of a release and of models.
-        host: address to listen on; any but this machine's own, 127.0.0.1, lets other machines in.
-        port: to listen on; None for the first free one from 8765 on.
-        root_path: where a proxy shows the pages, such as `/user/me/proxy/8765`, or the whole URL.
-        open_browser: whether to open the address in a browser, if there is one.
-        say: called with each line that tells the address.
+        explorer: Explorer of a release and of models.
+        host: Address to listen on; any except this machine's own, 127.0.0.1, lets other machines
+            in.
+        port: Port to listen on; None for the first free one from 8765 on.
+        root_path: Place where a proxy shows the pages, such as `/user/me/proxy/8765`, or the
+            complete URL.
+        open_browser: Whether to open the address in a browser, if there is one.
+        say: Function that gets each line about the address.
 
     Raises:
-        MissingExtraError: the extra `explore` is not installed.
-        ConfigError: the host, port or root path cannot be.
+        MissingExtraError: The extra `explore` is not installed.
+        ConfigError: The host, port or root path is impossible.
 
     Examples:
         >>> explore(Explorer(da, bundles=["bundle"]))  # doctest: +SKIP
@@ -72,8 +76,8 @@ def explore(
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name's module when it is asked for."""
-    if name not in _LATER:
+    """Import a name's module when the name is used."""
+    if name not in _LAZY_MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
@@ -81,7 +85,7 @@ def __getattr__(name: str) -> Any:
 
     if name != "Explorer":
         need_extra()
-    return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_LAZY_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

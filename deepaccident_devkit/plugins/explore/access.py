@@ -1,8 +1,9 @@
-"""Who may see the pages: what is checked of every request before the explorer's own pages answer it.
+"""Access to the pages: what is checked of every request before the explorer's own pages answer it.
 
-The server often runs on a machine that others use too, and any of them can reach its port; so can any page that is
-open in the reader's browser. A token in the printed address keeps out the former. `Host`, `Origin` and
-`Sec-Fetch-Site` keep out the latter: pages of other sites, and other sites' names that lead to this machine.
+The server often runs on a machine that others use too, and any of them can reach its port; so can
+any page that is open in the reader's browser. A token in the printed address keeps other users out.
+`Host`, `Origin` and `Sec-Fetch-Site` keep out pages of other sites, and other sites' names that
+lead to this machine.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from deepaccident_devkit.errors import ConfigError
 
 _HOST: Final = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::([0-9]{1,5}))?")
 _ROOT: Final = re.compile(r"(/[A-Za-z0-9._~!$&'()*+,=:@%-]+)*/?")
-# Scheme → its own port.
+# Scheme → its default port.
 _SCHEME_PORTS: Final = {"http": 80, "https": 443}
 AsgiScope = MutableMapping[str, Any]
 AsgiMessage = MutableMapping[str, Any]
@@ -33,12 +34,13 @@ _log = logging.getLogger(__name__)
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 _METHODS: Final = ("GET", "HEAD")
 TICKET_SECONDS: Final = 60.0
-# What a relative address keeps as it is: all that cannot end it or a header.
-_SAFE: Final = "!$&'()*+,;=:@/?%[]|^`{}-._~"
-# Of every answer, unless the application has set another value.
+# Characters that a relative address need not quote: none of them can end it or a header.
+_SAFE_CHARACTERS: Final = "!$&'()*+,;=:@/?%[]|^`{}-._~"
+# Headers of every answer, unless the application has set another value.
 HEADERS: Final[Mapping[bytes, bytes]] = {
-    b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    b"connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; form-action 'self'; base-uri 'none'",
+    b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; "
+    b"img-src 'self' data:; connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; "
+    b"form-action 'self'; base-uri 'none'",
     b"x-content-type-options": b"nosniff",
     b"referrer-policy": b"same-origin",
     b"cross-origin-resource-policy": b"same-origin",
@@ -73,7 +75,9 @@ class HostPort:
     def __str__(self) -> str:
         """Return it as it stands in an address."""
         name = f"[{self.name}]" if ":" in self.name else self.name
-        return name if self.port is None else f"{name}:{self.port}"
+        if self.port is None:
+            return name
+        return f"{name}:{self.port}"
 
     @property
     def is_address(self) -> bool:
@@ -85,54 +89,63 @@ class HostPort:
         return True
 
     def is_at(self, scheme: str, other: HostPort) -> bool:
-        """Whether both are the same to a scheme, whose own port can be left out."""
-        usual = _SCHEME_PORTS[scheme]
-        return self.name == other.name and (self.port or usual) == (other.port or usual)
+        """Return whether both are the same to a scheme, where its default port can be left out."""
+        default_port = _SCHEME_PORTS[scheme]
+        return self.name == other.name and (self.port or default_port) == (
+            other.port or default_port
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class RootPath:
-    """Where a proxy shows the pages: nowhere else, below a path, or at a whole URL.
+    """The place where a proxy shows the pages: at the root, below a path, or at a complete URL.
 
     Attributes:
         path: `/user/me/proxy/8000`, or nothing.
         scheme: `http` or `https` of a URL.
-        place: host and port of a URL.
+        location: Host and port of a URL.
     """
 
     path: str = ""
     scheme: str = ""
-    place: HostPort | None = None
+    location: HostPort | None = None
 
     @classmethod
     def parse(cls, text: str) -> RootPath:
-        """Read a path or a URL. Raises ConfigError."""
+        """Read a path or a URL; raise ConfigError."""
         try:
             parts = urlsplit(text)
         except ValueError:  # brackets that do not match
             parts = urlsplit("?")
-        place = HostPort.parse(parts.netloc)
-        if place is not None and parts.scheme in _SCHEME_PORTS:
-            whole = f"{parts.scheme}://{parts.netloc}{parts.path}"
+        location = HostPort.parse(parts.netloc)
+        if location is not None and parts.scheme in _SCHEME_PORTS:
+            address = f"{parts.scheme}://{parts.netloc}{parts.path}"
         else:
-            whole, place = parts.path, None
-        if text != whole or not _ROOT.fullmatch(parts.path):
+            address, location = parts.path, None
+        if text != address or not _ROOT.fullmatch(parts.path):
             raise ConfigError(
                 "--root-path: expected a path such as /user/me/proxy/8000 or a URL such as "
                 f"https://hub.example.org/user/me/proxy/8000, found {text!r}"
             )
-        return cls(parts.path.rstrip("/"), parts.scheme, place)
+        return cls(parts.path.rstrip("/"), parts.scheme, location)
 
     def __str__(self) -> str:
         """Return the path or the URL, without a slash at its end."""
-        return self.path if self.place is None else f"{self.scheme}://{self.place}{self.path}"
+        if self.location is None:
+            return self.path
+        return f"{self.scheme}://{self.location}{self.path}"
 
     def below(self, path: str) -> str | None:
-        """What of a request's path comes after this one; None if it does not begin with it, segment by segment."""
-        own, given = self.path.split("/"), path.split("/")
-        if not self.path or [*map(unquote, own)] != [*map(unquote, given[: len(own)])]:
+        """Return the part of a request's path after this one.
+
+        None if it does not begin with this path, segment by segment.
+        """
+        own_segments, segments = self.path.split("/"), path.split("/")
+        if not self.path or [*map(unquote, own_segments)] != [
+            *map(unquote, segments[: len(own_segments)])
+        ]:
             return None
-        return "".join(f"/{segment}" for segment in given[len(own) :])
+        return "".join(f"/{segment}" for segment in segments[len(own_segments) :])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,12 +153,13 @@ class Access:
     """What a `Gate` lets in.
 
     Attributes:
-        port: where the server listens; it only names the cookie, since a tunnel may show another port.
-        root: where a proxy shows the pages.
-        names: the hosts that a request may name, apart from `localhost`, `127.0.0.1` and `::1`.
-        any_address: whether a request may name any IP address, as the server listens on all of the machine's.
-        token: the secret of the printed address.
-        session: the secret of the cookie.
+        port: Port of the server; it only names the cookie, since a tunnel may show another port.
+        root: Place where a proxy shows the pages.
+        names: Hosts that a request may name, apart from `localhost`, `127.0.0.1` and `::1`.
+        any_address: Whether a request may name any IP address, as the server listens on all
+            addresses of the machine.
+        token: Secret of the printed address.
+        session: Secret of the cookie.
     """
 
     port: int
@@ -157,34 +171,37 @@ class Access:
 
     @property
     def cookie(self) -> str:
-        """The cookie's name."""
+        """Name of the cookie."""
         return f"deepaccident_explore_{self.port}"
 
     def knows(self, host: HostPort) -> bool:
-        """Whether a request may name this host.
+        """Return whether a request may name this host.
 
-        Behind a proxy of which only the path is given, it may name any: the proxy passes its own name on, which only
-        the proxy knows. There the token alone keeps out names of other sites that lead to this machine.
+        Behind a proxy with only a path, it may name any: the proxy passes its own name on, which
+        only the proxy knows. There, only the token keeps out names of other sites that lead to this
+        machine.
         """
         return (
             host.name in _LOOPBACK
             or host.name in self.names
             or (self.any_address and host.is_address)
-            or (self.root.place is None and bool(self.root.path))
-            or (self.root.place is not None and host.name == self.root.place.name)
+            or (self.root.location is None and bool(self.root.path))
+            or (self.root.location is not None and host.name == self.root.location.name)
         )
 
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """An answer of the gate itself: plain text that has nothing of the request."""
+    """An answer of the gate itself: plain text that repeats nothing from the request."""
 
     status: int
     sentence: str = ""
     headers: Mapping[str, str] = field(default_factory=dict)
 
     async def send(self, send: Send, *, head: bool) -> None:
-        body = f"{self.sentence}\n".encode() if self.sentence else b""
+        body = b""
+        if self.sentence:
+            body = f"{self.sentence}\n".encode()
         headers = {
             "content-type": "text/plain; charset=utf-8",
             "content-length": str(len(body)),
@@ -195,66 +212,78 @@ class _Answer:
         await send({"type": "http.response.body", "body": b"" if head else body})
 
 
-_NO_TARGET = _Answer(400, "The request has no path.")
-_NO_HOST = _Answer(
+_PATH_MISSING = _Answer(400, "The request has no path.")
+_HOST_UNKNOWN = _Answer(
     400,
-    "The explorer does not know the host that the request names: start it with --root-path and the address that the "
-    "browser shows, if a proxy is between them, or else with --address and that host.",
+    "The explorer does not know the host that the request names: start it with --root-path and the "
+    "address that the browser shows, if a proxy is between them, or else with --address and that "
+    "host.",
 )
-_METHOD = _Answer(
+_METHOD_NOT_ALLOWED = _Answer(
     405, "The explorer only shows: it answers GET and HEAD.", {"allow": ", ".join(_METHODS)}
 )
-_FOREIGN = _Answer(
+_FOREIGN_PAGE = _Answer(
     403, "A page of another site asked for this; open the address that the command printed."
 )
-_WRONG_TOKEN = _Answer(
+_TOKEN_WRONG = _Answer(
     403,
-    "The token is wrong; open the address that the command printed. Every start of it makes a new token.",
+    "The token is wrong; open the address that the command printed. Every start of it makes a new "
+    "token.",
 )
-_NO_TOKEN = _Answer(
+_TOKEN_MISSING = _Answer(
     401, "Open the address that the command `deepaccident explore` printed: it has the token."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class _Request:
-    """What the gate looks at; the path is raw, and `kept` says whether it had the root path."""
+    """The parts of a request that the gate checks; paths are raw.
+
+    Attributes:
+        method: HTTP method.
+        target: Path of the request.
+        path: Path of the request without the root path.
+        has_root: Whether the request had the root path.
+        query: Parameters of the address.
+        headers: Name in small letters → values.
+    """
 
     method: str
-    asked: str
+    target: str
     path: str
-    kept: bool
+    has_root: bool
     query: str
     headers: Mapping[str, tuple[str, ...]]
 
     @classmethod
     def of(cls, scope: AsgiScope, root: RootPath) -> _Request:
-        raw = scope.get("raw_path") or quote(scope["path"]).encode("ascii")
-        asked = raw.partition(b"?")[0].decode("latin-1")
-        rest = root.below(asked)
+        raw_path = scope.get("raw_path") or quote(scope["path"]).encode("ascii")
+        target = raw_path.partition(b"?")[0].decode("latin-1")
+        path = root.below(target)
         headers: dict[str, tuple[str, ...]] = {}
         for raw_name, value in scope["headers"]:
             name = raw_name.decode("latin-1").lower()
             headers[name] = (*headers.get(name, ()), value.decode("latin-1"))
-        query = scope.get("query_string", b"").decode("latin-1")
         return cls(
-            scope["method"],
-            asked,
-            asked if rest is None else rest,
-            rest is not None,
-            query,
-            headers,
+            method=scope["method"],
+            target=target,
+            path=target if path is None else path,
+            has_root=path is not None,
+            query=scope.get("query_string", b"").decode("latin-1"),
+            headers=headers,
         )
 
     @property
     def host(self) -> HostPort | None:
-        """The host it names, if it is one."""
-        given = self.headers.get("host", ())
-        return HostPort.parse(given[0]) if len(given) == 1 else None
+        """The host that the request names; None if it names none, or several."""
+        values = self.headers.get("host", ())
+        if len(values) == 1:
+            return HostPort.parse(values[0])
+        return None
 
     @property
     def tokens(self) -> list[str]:
-        """The values of the parameter `token`."""
+        """Values of the parameter `token`."""
         return [
             unquote_plus(part.partition("=")[2])
             for part in self.query.split("&")
@@ -262,30 +291,35 @@ class _Request:
         ]
 
     def without_token(self) -> _Request:
-        """The same without the parameter."""
-        return replace(
-            self, query="&".join(part for part in self.query.split("&") if not _is_token(part))
-        )
+        """Return the request without the parameter `token`."""
+        parts = [part for part in self.query.split("&") if not _is_token(part)]
+        return replace(self, query="&".join(parts))
 
     def address(self, end: str = "") -> str:
-        """Its own address and, behind it, `end`: relative, so that it is right behind all proxies."""
-        address = (
-            "./" + self.asked.rpartition("/")[2] + end + (f"?{self.query}" if self.query else "")
-        )
-        return quote(address.encode("latin-1"), safe=_SAFE)
+        """Return the address of the request with `end` after its path.
+
+        It is relative, so that it is right behind all proxies.
+        """
+        query = ""
+        if self.query:
+            query = f"?{self.query}"
+        address = f"./{self.target.rpartition('/')[2]}{end}{query}"
+        return quote(address.encode("latin-1"), safe=_SAFE_CHARACTERS)
 
 
 class Gate:
-    """An ASGI application before another one: it answers what is not allowed, and passes all else on.
+    """An ASGI application in front of another: it refuses forbidden requests and passes others on.
 
-    The other one gets paths without the root path, whether the proxy has taken it off or not, and no cookies. All
-    answers, its own too, have `HEADERS`. If it fails, that is logged, and the answer is 500.
+    The application gets paths without the root path, whether the proxy has removed it or not, and
+    no cookies. All answers, also the gate's own, have `HEADERS`. If the application fails, that is
+    logged, and the answer is 500.
 
-    The right token in the address is exchanged for a cookie, so that no later address has it. Cookies do not know
-    ports: a browser sends ours to all servers of the same host name, such as others behind `localhost` at the end of
-    tunnels, and any of them could set one of the same name. So it has a secret of its own, which opens nothing but
-    this server and ends with it, and a name with the port, so that two explorers do not replace each other's. Do not
-    open pages of people whom you do not trust under the same host name.
+    The right token in the address is exchanged for a cookie, so that no later address has it.
+    Cookies do not know ports: a browser sends ours to all servers of the same host name, such as
+    others behind `localhost` at the end of tunnels, and any of them could set one of the same name.
+    So the cookie has a secret of its own, which opens nothing but this server and ends with it, and
+    a name with the port, so that two explorers do not replace each other's. Do not open pages of
+    people that you do not trust under the same host name.
     """
 
     def __init__(self, app: App, access: Access) -> None:
@@ -294,17 +328,20 @@ class Gate:
         self._access = access
         self._ticket: tuple[str, float] | None = None
         self._checks = (
-            self._target,
-            self._host,
-            self._method,
-            self._origin,
-            self._fetch,
-            self._token,
-            self._slash,
+            self._check_target,
+            self._check_host,
+            self._check_method,
+            self._check_origin,
+            self._check_fetch,
+            self._check_token,
+            self._check_slash,
         )
 
     def ticket(self) -> str:
-        """A token that is right once, and within a minute: other users see the command line that opens a browser."""
+        """Return a token that is valid once, and for a minute.
+
+        Other users can see the command line that opens a browser.
+        """
         ticket = secrets.token_urlsafe(32)
         self._ticket = ticket, time.monotonic() + TICKET_SECONDS
         return ticket
@@ -336,59 +373,70 @@ class Gate:
                 return
         path = request.path
         headers = [pair for pair in scope["headers"] if pair[0].lower() != b"cookie"]
-        passed = {
+        inner_scope = {
             **scope,
             "path": unquote(path),
             "raw_path": path.encode("latin-1"),
             "headers": headers,
         }
         try:
-            await self._app(passed, receive, send)
+            await self._app(inner_scope, receive, send)
         except Exception:  # noqa: BLE001 - an error of ours, which the reader's terminal shows
             _log.exception("a page of the explorer failed")
             if not send.started:
-                await _Answer(500, "The page failed; the terminal of the command says why.").send(
-                    send, head=head
-                )
+                failure = _Answer(500, "The page failed; the terminal of the command says why.")
+                await failure.send(send, head=head)
 
-    def _target(self, request: _Request) -> _Answer | None:
-        return None if request.asked.startswith("/") else _NO_TARGET
-
-    def _host(self, request: _Request) -> _Answer | None:
-        host = request.host
-        return None if host is not None and self._access.knows(host) else _NO_HOST
-
-    def _method(self, request: _Request) -> _Answer | None:
-        return None if request.method in _METHODS else _METHOD
-
-    def _origin(self, request: _Request) -> _Answer | None:
-        given = request.headers.get("origin")
-        if given is None:
+    def _check_target(self, request: _Request) -> _Answer | None:
+        if request.target.startswith("/"):
             return None
-        scheme, _, rest = given[0].partition("://")
-        origin = HostPort.parse(rest)
-        if len(given) > 1 or scheme not in _SCHEME_PORTS or origin is None:
-            return _FOREIGN
-        own = (request.host, self._access.root.place)
-        return (
-            None
-            if any(place is not None and origin.is_at(scheme, place) for place in own)
-            else _FOREIGN
-        )
+        return _PATH_MISSING
 
-    def _fetch(self, request: _Request) -> _Answer | None:
-        """Let other sites only link to the pages. Other ports of this host are the same site, but not the reader's."""
+    def _check_host(self, request: _Request) -> _Answer | None:
+        host = request.host
+        if host is not None and self._access.knows(host):
+            return None
+        return _HOST_UNKNOWN
+
+    def _check_method(self, request: _Request) -> _Answer | None:
+        if request.method in _METHODS:
+            return None
+        return _METHOD_NOT_ALLOWED
+
+    def _check_origin(self, request: _Request) -> _Answer | None:
+        values = request.headers.get("origin")
+        if values is None:
+            return None
+        scheme, _, host = values[0].partition("://")
+        origin = HostPort.parse(host)
+        if len(values) > 1 or scheme not in _SCHEME_PORTS or origin is None:
+            return _FOREIGN_PAGE
+        for own_host in (request.host, self._access.root.location):
+            if own_host is not None and origin.is_at(scheme, own_host):
+                return None
+        return _FOREIGN_PAGE
+
+    def _check_fetch(self, request: _Request) -> _Answer | None:
+        """Let other sites only link to the pages.
+
+        Other ports of this host are the same site, but not the reader's.
+        """
         if request.headers.get("sec-fetch-site") in (None, ("same-origin",), ("none",)):
             return None
-        followed = (request.headers.get("sec-fetch-mode"), request.headers.get("sec-fetch-dest"))
-        return None if followed == (("navigate",), ("document",)) else _FOREIGN
+        fetch = (request.headers.get("sec-fetch-mode"), request.headers.get("sec-fetch-dest"))
+        is_link = fetch == (("navigate",), ("document",))
+        if is_link:
+            return None
+        return _FOREIGN_PAGE
 
-    def _token(self, request: _Request) -> _Answer | None:
-        given = request.tokens
-        if not given:
-            return None if self._has_cookie(request) else _NO_TOKEN
-        if len(given) > 1 or not self._is_right(given[0]):
-            return _WRONG_TOKEN
+    def _check_token(self, request: _Request) -> _Answer | None:
+        tokens = request.tokens
+        if not tokens:
+            if self._has_cookie(request):
+                return None
+            return _TOKEN_MISSING
+        if len(tokens) > 1 or not self._is_right(tokens[0]):
+            return _TOKEN_WRONG
         return _Answer(
             303,
             headers={
@@ -398,47 +446,46 @@ class Gate:
             },
         )
 
-    def _slash(self, request: _Request) -> _Answer | None:
-        """Relative links of a page at the root path itself need a slash at its end."""
-        return (
-            _Answer(308, headers={"location": request.address("/")}) if request.path == "" else None
-        )
+    def _check_slash(self, request: _Request) -> _Answer | None:
+        """Add a slash to the root path, which the relative links of its page need."""
+        if request.path:
+            return None
+        return _Answer(308, headers={"location": request.address("/")})
 
     def _is_right(self, token: str) -> bool:
-        ticket, until = self._ticket or ("", 0.0)
-        if ticket and time.monotonic() < until and _same(token, ticket):
+        ticket, expiry = self._ticket or ("", 0.0)
+        if ticket and time.monotonic() < expiry and _is_same_secret(token, ticket):
             self._ticket = None
             return True
-        return _same(token, self._access.token)
+        return _is_same_secret(token, self._access.token)
 
     def _has_cookie(self, request: _Request) -> bool:
-        pairs = [
-            pair.strip().partition("=")
-            for text in request.headers.get("cookie", ())
-            for pair in text.split(";")
-        ]
-        return any(
-            name == self._access.cookie and _same(value, self._access.session)
-            for name, _, value in pairs
-        )
+        for header in request.headers.get("cookie", ()):
+            for pair in header.split(";"):
+                name, _, value = pair.strip().partition("=")
+                if name == self._access.cookie and _is_same_secret(value, self._access.session):
+                    return True
+        return False
 
     def _set_cookie(self, request: _Request) -> str:
-        """For the root path alone, if the reader may see the pages there; without a proxy they are below `/`."""
-        access, host = self._access, request.host
-        direct = not request.kept and host is not None and host.name in _LOOPBACK
-        path = "/" if direct else access.root.path or "/"
-        behind = (
-            access.root.place is not None
-            and host is not None
-            and host.name == access.root.place.name
+        """Return the cookie for the root path, if the reader may see the pages there.
+
+        Without a proxy the pages are below `/`.
+        """
+        access, root, host = self._access, self._access.root, request.host
+        is_direct = not request.has_root and host is not None and host.name in _LOOPBACK
+        path = "/" if is_direct else root.path or "/"
+        cookie = f"{access.cookie}={access.session}; Path={path}; HttpOnly; SameSite=Lax"
+        is_behind_proxy = (
+            root.location is not None and host is not None and host.name == root.location.name
         )
-        secure = behind and access.root.scheme == "https"
-        kept = f"{access.cookie}={access.session}; Path={path}; HttpOnly; SameSite=Lax"
-        return f"{kept}; Secure" if secure else kept
+        if is_behind_proxy and root.scheme == "https":
+            return f"{cookie}; Secure"
+        return cookie
 
 
 class _Sender:
-    """Sends an answer with `HEADERS`, and knows whether it has begun."""
+    """A function that sends an answer with `HEADERS`, and knows whether the answer has begun."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -447,10 +494,10 @@ class _Sender:
     async def __call__(self, message: AsgiMessage) -> None:
         if message["type"] == "http.response.start":
             self.started = True
-            given = [*message.get("headers", ())]
-            names = {name.lower() for name, _ in given}
-            added = [pair for pair in HEADERS.items() if pair[0] not in names]
-            message = {**message, "headers": [*given, *added]}
+            headers = [*message.get("headers", ())]
+            names = {name.lower() for name, _ in headers}
+            defaults = [(name, value) for name, value in HEADERS.items() if name not in names]
+            message = {**message, "headers": [*headers, *defaults]}
         await self._send(message)
 
 
@@ -458,5 +505,5 @@ def _is_token(part: str) -> bool:
     return unquote_plus(part.partition("=")[0]) == "token"
 
 
-def _same(one: str, other: str) -> bool:
-    return secrets.compare_digest(one.encode("utf-8", "replace"), other.encode())
+def _is_same_secret(text: str, secret: str) -> bool:
+    return secrets.compare_digest(text.encode("utf-8", "replace"), secret.encode())

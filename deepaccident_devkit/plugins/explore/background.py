@@ -1,4 +1,4 @@
-"""Slow work beside the pages: one piece after another in a thread of its own; what it gives stays."""
+"""Slow work beside the pages, in a thread of its own, one job after another; results are kept."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from deepaccident_devkit.errors import DeepAccidentError
 logger = logging.getLogger(__name__)
 
 State = Literal["waiting", "running", "ready", "failed"]
-_DONE: Final = ("ready", "failed")
-# Jobs that are kept: of more, the done one that was not asked for the longest goes, so that memory stays flat.
-MOST_JOBS: Final = 200
+_DONE_STATES: Final = ("ready", "failed")
+# Largest number of jobs: beyond it, the least recently used finished job is removed, so that memory
+# stays flat.
+MAX_JOBS: Final = 200
 
 
 class Job:
     """A piece of work.
 
     Attributes:
-        name: what it is known by.
-        title: what it does, for readers: `lead times`.
-        state: whether it is done.
-        result: what it gave; None until it is ready.
-        error: why it failed, for readers; empty if it did not.
-        asked: when it was asked for the last time, by a number that grows.
+        name: Name that identifies it.
+        title: What it does, for readers: `lead times`.
+        state: State of the work.
+        result: Result of the work; None until it is ready.
+        error: Reason why it failed, for readers; empty if it did not.
+        last_request: Number of the last request for it; numbers grow.
     """
 
     def __init__(self, name: str, title: str, work: Callable[[], Any]) -> None:
@@ -36,39 +37,39 @@ class Job:
         self.state: State = "waiting"
         self.result: Any = None
         self.error = ""
-        self.asked = 0
+        self.last_request = 0
 
     @property
     def is_done(self) -> bool:
         """Whether it is ready, or has failed."""
-        return self.state in _DONE
+        return self.state in _DONE_STATES
 
     def run(self) -> None:
-        """Do the work; nothing is raised, so that the work after it is done too."""
+        """Do the work; nothing is raised, so that the next job is done too."""
         self.state = "running"
         try:
             self.result = self._work()
         except Exception as error:
             logger.debug("%s failed", self.name, exc_info=True)
-            known = isinstance(error, DeepAccidentError | OSError)
-            self.error = str(error) if known else f"{type(error).__name__}: {error}"
+            is_expected = isinstance(error, DeepAccidentError | OSError)
+            self.error = str(error) if is_expected else f"{type(error).__name__}: {error}"
             self.state = "failed"
         else:
             self.state = "ready"
 
 
 class Jobs:
-    """All work that was asked for, each piece once, as long as its result is kept."""
+    """All requested work, each piece once, as long as its result is kept."""
 
     def __init__(self) -> None:
         self._jobs: dict[str, Job] = {}
         self._queue: SimpleQueue[Job | None] = SimpleQueue()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
-        self._asked = itertools.count()
+        self._requests = itertools.count()
 
     def ask(self, name: str, title: str, work: Callable[[], Any]) -> Job:
-        """The job of a name; if there is none yet, it is begun after those that were asked for before."""
+        """Return the job of a name; a new one begins after all jobs that were requested before."""
         with self._changed:
             if name not in self._jobs:
                 self._make_room()
@@ -79,29 +80,30 @@ class Jobs:
                         target=self._run, name="explore-background", daemon=True
                     )
                     self._thread.start()
-            self._jobs[name].asked = next(self._asked)
+            self._jobs[name].last_request = next(self._requests)
             return self._jobs[name]
 
     def all(self) -> list[Job]:
-        """All jobs, in the order in which they were asked for."""
+        """Return all jobs, in the order in which they were requested."""
         with self._changed:
             return list(self._jobs.values())
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until all that was asked for is done; whether it is."""
+        """Wait until all requested jobs are done; return whether they are."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: all(job.is_done for job in self._jobs.values()), timeout
             )
 
     def end(self) -> None:
-        """Begin no more. What runs is not waited for: its thread ends with the process."""
+        """Begin no more jobs. A running job is not waited for: its thread ends with the process."""
         self._queue.put(None)
 
     def _make_room(self) -> None:
-        done = [job for job in self._jobs.values() if job.is_done]
-        if done and len(self._jobs) >= MOST_JOBS:
-            del self._jobs[min(done, key=lambda job: job.asked).name]
+        finished = [job for job in self._jobs.values() if job.is_done]
+        if finished and len(self._jobs) >= MAX_JOBS:
+            oldest = min(finished, key=lambda job: job.last_request)
+            del self._jobs[oldest.name]
 
     def _run(self) -> None:
         for job in iter(self._queue.get, None):

@@ -1,4 +1,7 @@
-"""What a reader chose of the scenarios: in an address, as filters, as code; and the scenarios that it comes to."""
+"""What a reader chose of the scenarios, and the scenarios that match.
+
+Choices are read from an address, and written as filters and as code.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
 
 _ListView = Literal["grid", "table"]
 _SortDirection = Literal["up", "down"]
-# Column → its name for readers; `score:MODEL` is another.
+# Column → its name for readers; `score:MODEL` is another column.
 SORTS: Final[Mapping[str, str]] = {
     "name": "name",
     "num_frames": "length",
@@ -35,10 +38,13 @@ SORTS: Final[Mapping[str, str]] = {
 }
 SCORE_PREFIX: Final = "score:"
 SCENARIOS_PER_PAGE: Final = 48
-# Characters.
-_MOST_QUERY: Final = 2000
-_MOST_FREE: Final = 100  # filters of a query; values, in sum, that no facet has
-MOST_WORD: Final = 100  # characters of a value, or of another word of an address: it stands in many links of a page
+# Largest number of characters of a query.
+_MAX_QUERY_LENGTH: Final = 2000
+# Largest number of filters of a query, and of values in total that no facet has.
+_MAX_FREE_VALUES: Final = 100
+# Largest number of characters of a value, or of another word of an address, since it stands in many
+# links of a page.
+MAX_WORD_LENGTH: Final = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,12 +52,12 @@ class Choices:
     """What a reader chose.
 
     Attributes:
-        facets: field → the values, one of which must match, as texts.
-        query: more filters, one a line or between semicolons.
-        sort: of `SORTS`, or `score:MODEL`.
-        order: of the sorting: `up` is from low to high.
+        facets: Field → texts of its values; a scenario must match one of them.
+        query: More filters, one for each line or separated by semicolons.
+        sort: One of `SORTS`, or `score:MODEL`.
+        order: Order of the sorting: `up` is from low to high.
         view: `grid` of pictures, or `table`.
-        page: from 1.
+        page: Page number, from 1.
     """
 
     facets: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -62,98 +68,97 @@ class Choices:
     page: int = 1
 
     @classmethod
-    def of(cls, given: Sequence[tuple[str, str]], scenarios: Scenarios | None = None) -> Choices:
-        """Those of the parameters of an address; what makes no sense is left out, so that no address fails.
+    def of(
+        cls, parameters: Sequence[tuple[str, str]], scenarios: Scenarios | None = None
+    ) -> Choices:
+        """Return the choices of the parameters of an address.
 
-        An address may come from anyone, so it cannot ask for more than a page has. Values that the scenarios have all
+        Parameters that make no sense are left out, so that no address fails. An address may come
+        from anyone, so it cannot ask for more than a page has. All values that the scenarios have
         count, others only if they are few.
         """
-        known = (
-            {}
-            if scenarios is None
-            else {each.name: frozenset(each.values) for each in scenarios.facets()}
-        )
-        others = {name: value for name, value in given if name not in FIELDS}
+        known_values: dict[str, frozenset[str]] = {}
+        if scenarios is not None:
+            known_values = {facet.name: frozenset(facet.values) for facet in scenarios.facets()}
+        settings = {name: value for name, value in parameters if name not in FIELDS}
         facets: dict[str, tuple[str, ...]] = {}
-        unknown = 0
-        for name, value in dict.fromkeys(
-            pair for pair in given if pair[0] in FIELDS and len(pair[1]) <= MOST_WORD
-        ):
-            unknown += value not in known.get(name, ())
-            if unknown <= _MOST_FREE or value in known.get(name, ()):
+        num_unknown = 0
+        for name, value in dict.fromkeys(parameters):
+            if name not in FIELDS or len(value) > MAX_WORD_LENGTH:
+                continue
+            is_known = value in known_values.get(name, ())
+            num_unknown += not is_known
+            if is_known or num_unknown <= _MAX_FREE_VALUES:
                 facets[name] = (*facets.get(name, ()), value)
-        page = others.get("page", "")
+        page = settings.get("page", "")
         return cls(
             facets=facets,
-            query=others.get("q", "").strip()[:_MOST_QUERY],
-            sort=others.get("sort", "name")[:MOST_WORD],
-            order="down" if others.get("order") == "down" else "up",
-            view="table" if others.get("view") == "table" else "grid",
+            query=settings.get("q", "").strip()[:_MAX_QUERY_LENGTH],
+            sort=settings.get("sort", "name")[:MAX_WORD_LENGTH],
+            order="down" if settings.get("order") == "down" else "up",
+            view="table" if settings.get("view") == "table" else "grid",
             page=int(page) if re.fullmatch(r"[1-9]\d{0,5}", page) else 1,
         )
 
-    def address(self, **changed: Any) -> str:
-        """The parameters of the address that has these choices, with some changed: `?town=Town03&sort=lead`."""
-        chosen = replace(self, **changed)
-        pairs = [(name, value) for name, values in chosen.facets.items() for value in values]
-        plain = {"q": chosen.query, "sort": chosen.sort, "order": chosen.order, "view": chosen.view}
-        usual = {"q": "", "sort": "name", "order": "up", "view": get_args(_ListView)[0]}
-        pairs += [(name, value) for name, value in plain.items() if value != usual[name]]
-        pairs += [("page", str(chosen.page))] * (chosen.page > 1)
+    def address(self, **changes: Any) -> str:
+        """Return the parameters of the address with these choices: `?town=Town03&sort=lead`.
+
+        Keyword arguments change some of the choices.
+        """
+        choices = replace(self, **changes)
+        pairs = [(name, value) for name, values in choices.facets.items() for value in values]
+        fields = ("q", "sort", "order", "view")
+        values = (choices.query, choices.sort, choices.order, choices.view)
+        defaults = ("", "name", "up", get_args(_ListView)[0])
+        for name, value, default in zip(fields, values, defaults, strict=True):
+            if value != default:
+                pairs.append((name, value))
+        if choices.page > 1:
+            pairs.append(("page", str(choices.page)))
         return f"?{urlencode(pairs)}"
 
     @property
     def filters(self) -> list[str]:
-        """The texts of `da.find` and `--where`."""
-        return [
-            *(f"{name}={','.join(values)}" for name, values in self.facets.items()),
-            *self.lines,
-        ]
+        """Filters of all choices, as texts for `da.find` and `--where`."""
+        facets = (f"{name}={','.join(values)}" for name, values in self.facets.items())
+        return [*facets, *self.lines]
 
     @property
     def lines(self) -> list[str]:
-        """The filters of the query."""
+        """Filters of the query."""
         lines = (line.strip() for line in re.split(r"[;\n]", self.query))
-        return [line for line in dict.fromkeys(lines) if line][:_MOST_FREE]
+        return [line for line in dict.fromkeys(lines) if line][:_MAX_FREE_VALUES]
 
     def python(self) -> str:
-        """The call that finds the same scenarios."""
+        """Return the call that finds the same scenarios."""
         return find_call(self.filters)
 
     def command(self, dataroot: str) -> str:
-        """The command that writes the same scenarios into a split file."""
-        return shlex.join(
-            [
-                "deepaccident",
-                "split",
-                dataroot,
-                *where_words(self.filters),
-                "--out",
-                "selection.txt",
-            ]
-        )
+        """Return the command that writes the same scenarios into a split file."""
+        options = [*where_words(self.filters), "--out", "selection.txt"]
+        return shlex.join(["deepaccident", "split", dataroot, *options])
 
 
 def find_call(filters: Iterable[str]) -> str:
-    """Filters as the Python call that finds the same scenarios."""
+    """Return filters as the Python call that finds the same scenarios."""
     return f"da.find({', '.join(map(repr, filters))})"
 
 
 def where_words(filters: Iterable[str]) -> list[str]:
-    """Filters as words of a command line."""
-    return [word for each in filters for word in ("--where", each)]
+    """Return filters as words of a command line."""
+    return [word for condition in filters for word in ("--where", condition)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
-    """The scenarios that choices come to.
+class Matches:
+    """The scenarios that match some choices.
 
     Attributes:
-        rows: their rows, sorted.
-        counts: field → its values: each `value`, the `count` of scenarios that match all but the other values of this
-            field, and whether it is `chosen`.
-        faults: sentences on what is wrong in the query.
-        waiting: sentences on what is not computed yet.
+        rows: Rows of the scenarios, sorted.
+        counts: Field → its values, each with its `value`, the `count` of scenarios that match all
+            but the other values of this field, and whether it is `chosen`.
+        faults: Sentences on errors in the query.
+        waiting: Sentences on columns that are not computed yet.
     """
 
     rows: IntArray
@@ -162,89 +167,114 @@ class Found:
     waiting: tuple[str, ...]
 
 
-def found_by(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]) -> Found:
-    """The scenarios that match all that was chosen; models' scores (`score:MODEL`) may still be computed."""
+def match_scenarios(scenarios: Scenarios, choices: Choices, scores: Mapping[str, Model]) -> Matches:
+    """Return the scenarios that match all choices; models' scores may still be computed.
+
+    Args:
+        scenarios: Columns of the scenarios.
+        choices: What the reader chose.
+        scores: Column `score:MODEL` → model.
+    """
     facets = scenarios.facets()
-    chosen = {
-        each.name: choices.facets[each.name] for each in facets if each.name in choices.facets
+    selected = {
+        facet.name: choices.facets[facet.name] for facet in facets if facet.name in choices.facets
     }
     masks = {
-        each.name: _matching(each, chosen[each.name]) for each in facets if each.name in chosen
+        facet.name: _mask(facet, selected[facet.name]) for facet in facets if facet.name in selected
     }
-    rest, faults, waiting = _by_query(
-        scenarios, choices, [name for name in choices.facets if name not in chosen]
+    other_fields = [name for name in choices.facets if name not in selected]
+    mask, faults, waiting = _match_query(scenarios, choices, other_fields)
+    misses = np.zeros(len(scenarios), dtype=np.int64)
+    for facet_mask in masks.values():
+        misses = misses + ~facet_mask
+    counts = {}
+    for facet in facets:
+        # Count the rows that no other facet excludes.
+        own_misses = ~masks.get(facet.name, np.True_)
+        rows = mask & (misses == own_misses)
+        counts[facet.name] = _counts(facet, rows, selected.get(facet.name, ()))
+    matches = np.flatnonzero(mask & (misses == 0))
+    sorted_rows, sorts_waiting = _sorted_rows(scenarios, choices, matches, scores)
+    return Matches(
+        rows=sorted_rows,
+        counts=counts,
+        faults=tuple(faults),
+        waiting=(*waiting, *sorts_waiting),
     )
-    missed = sum((~mask for mask in masks.values()), np.zeros(len(scenarios), dtype=np.int64))
-    counts = {  # of the rows that no other facet misses
-        each.name: _counts(
-            each, rest & (missed == ~masks.get(each.name, np.True_)), chosen.get(each.name, ())
-        )
-        for each in facets
-    }
-    ranked, not_ready = _sorted(scenarios, choices, np.flatnonzero(rest & (missed == 0)), scores)
-    return Found(rows=ranked, counts=counts, faults=tuple(faults), waiting=(*waiting, *not_ready))
 
 
-def _matching(facet: Facet, values: Sequence[str]) -> BoolArray:
-    return np.isin(
-        facet.codes, [place for place, value in enumerate(facet.values) if value in values]
-    )
+def _mask(facet: Facet, values: Sequence[str]) -> BoolArray:
+    codes = [code for code, value in enumerate(facet.values) if value in values]
+    return np.isin(facet.codes, codes)
 
 
-def _counts(facet: Facet, rows: BoolArray, chosen: Sequence[str]) -> tuple[dict[str, Any], ...]:
-    counted = np.bincount(facet.codes[rows], minlength=len(facet.values)).tolist()
+def _counts(facet: Facet, rows: BoolArray, selected: Sequence[str]) -> tuple[dict[str, Any], ...]:
+    counts = np.bincount(facet.codes[rows], minlength=len(facet.values)).tolist()
     return tuple(
-        {"value": value, "count": count, "chosen": value in chosen}
-        for value, count in zip(facet.values, counted, strict=True)
+        {"value": value, "count": count, "chosen": value in selected}
+        for value, count in zip(facet.values, counts, strict=True)
     )
 
 
-def _by_query(
-    scenarios: Scenarios, choices: Choices, plain: Sequence[str]
+def _match_query(
+    scenarios: Scenarios, choices: Choices, fields: Sequence[str]
 ) -> tuple[BoolArray, list[str], list[str]]:
-    """Which scenarios match the query, chosen values of fields that are no facets (yet), faults, what is awaited."""
-    matching = np.ones(len(scenarios), dtype=bool)
+    """Match the query, and the choices of fields that are no facets (yet).
+
+    Returns:
+        Whether each scenario matches, shape (N,); faults; and conditions that wait for a column.
+    """
+    mask = np.ones(len(scenarios), dtype=bool)
     faults, waiting = [], []
-    for line in [*(f"{name}={','.join(choices.facets[name])}" for name in plain), *choices.lines]:
+    field_filters = [f"{name}={','.join(choices.facets[name])}" for name in fields]
+    for line in [*field_filters, *choices.lines]:
         try:
-            wanted = parse_where(line)
-            looked = field_of(wanted.name)
-            late = scenarios.late(looked.name)
-            if late is not None:
-                waiting.append(_waiting_text(line, late))
+            clause = parse_where(line)
+            column = field_of(clause.name)
+            job = scenarios.late(column.name)
+            if job is not None:
+                waiting.append(_waiting_text(line, job))
                 continue
-            values = scenarios.values(looked.name) or []
-            words = {
-                word
-                for value in values
-                for word in (value if isinstance(value, tuple) else (value,))
-            }
-            condition = condition_of(wanted, looked, words if looked.kind == "word" else ())
-            matching &= np.array([condition.holds(value) for value in values], dtype=bool)
+            values = scenarios.values(column.name) or []
+            words = _words(values) if column.kind == "word" else ()
+            condition = condition_of(clause, column, words)
+            mask &= np.array([condition.holds(value) for value in values], dtype=bool)
         except DeepAccidentError as error:
             faults.append(str(error))
-    return matching, faults, waiting
+    return mask, faults, waiting
 
 
-def _waiting_text(what: str, job: Job) -> str:
+def _words(values: Sequence[Any]) -> set[Any]:
+    """Return the different values; a tuple counts as several."""
+    words: set[Any] = set()
+    for value in values:
+        words.update(value if isinstance(value, tuple) else (value,))
+    return words
+
+
+def _waiting_text(subject: str, job: Job) -> str:
     if job.state == "failed":
-        return f"{what}: cannot be computed ({job.error})"
-    return f"{what}: is being computed ({job.title}); it counts as soon as it is there"
+        return f"{subject}: cannot be computed ({job.error})"
+    return f"{subject}: is being computed ({job.title}); it counts as soon as it is there"
 
 
-def _sorted(
+def _sorted_rows(
     scenarios: Scenarios, choices: Choices, rows: IntArray, scores: Mapping[str, Model]
 ) -> tuple[IntArray, list[str]]:
-    """Rows by the column of choice, unknown values last, and what is waited for."""
-    if choices.sort == "name" or (choices.sort not in SORTS and choices.sort not in scores):
+    """Return rows by the chosen column, unknown values last, and what they wait for."""
+    column = choices.sort
+    if column == "name" or (column not in SORTS and column not in scores):
         return rows if choices.order == "up" else rows[::-1], []
-    model = scores.get(choices.sort)
+    model = scores.get(column)
     if model is None:
-        late, numbers = scenarios.late(choices.sort), scenarios.numbers(choices.sort)
+        job, numbers = scenarios.late(column), scenarios.numbers(column)
     else:
-        late, numbers = model.job if model.scores is None else None, model.numbers(scenarios)
-    if late is not None or numbers is None:
-        return rows, [] if late is None else [_waiting_text(f"sorted by {choices.sort}", late)]
+        job, numbers = model.job if model.scores is None else None, model.numbers(scenarios)
+    if job is not None:
+        return rows, [_waiting_text(f"sorted by {column}", job)]
+    if numbers is None:
+        return rows, []
     keys = numbers[rows]
-    keys = keys if choices.order == "up" else -keys
+    if choices.order == "down":
+        keys = -keys
     return rows[np.argsort(keys, kind="stable")], []  # NaN is last in both orders

@@ -19,12 +19,12 @@ def _address(
         return {}
     from deepaccident_devkit.plugins.explore.access import HostPort
 
-    place = HostPort.parse(f"127.0.0.1:{value}" if value.isdecimal() else value)
-    if place is None or place.port == 0:
+    location = HostPort.parse(f"127.0.0.1:{value}" if value.isdecimal() else value)
+    if location is None or location.port == 0:
         raise click.BadParameter(
             f"expected HOST:PORT, HOST or PORT, found {value!r}", context, parameter
         )
-    return {"host": place.name, "port": place.port}
+    return {"host": location.name, "port": location.port}
 
 
 @verb()
@@ -35,14 +35,15 @@ def _address(
     multiple=True,
     type=PATH,
     metavar="PATH",
-    help="Results file or bundle of an evaluation, shown with the scenarios; you can repeat this option.",
+    help="Results file or bundle of an evaluation, shown with the scenarios; you can repeat this "
+    "option.",
 )
 @click.option(
     "--address",
     callback=_address,
     metavar="HOST:PORT",
-    help="Address to listen on, or the port alone. With another host than 127.0.0.1, the pages can be reached from "
-    "other machines.  [default: 127.0.0.1, and the first free port from 8765 on]",
+    help="Address to listen on, or the port alone. With another host than 127.0.0.1, the pages can "
+    "be reached from other machines.  [default: 127.0.0.1, and the first free port from 8765 on]",
 )
 @click.option("--no-open", is_flag=True, help="Do not open a browser.")
 @advanced(
@@ -60,10 +61,11 @@ def _address(
 )
 @where_parameter
 def explore(target: Path | None, predictions: tuple[Path, ...], **options: Any) -> None:
-    """Show the release in DATAROOT in the browser: find a scenario, watch it, see what a model says of it.
+    """Show the release in DATAROOT in the browser: find a scenario, watch it, see a model's output.
 
-    The command prints the address of the pages and runs until Ctrl-C. The pages change no file. They can be read
-    only with the token in that address. On another machine, use the SSH tunnel that the command prints.
+    The command prints the address of the pages and runs until Ctrl-C. The pages change no file.
+    They can be read only with the token in that address. On another machine, use the SSH tunnel
+    that the command prints.
 
     With --out, the command writes the pages of the scenarios that match --where, and ends.
     """
@@ -77,20 +79,19 @@ def explore(target: Path | None, predictions: tuple[Path, ...], **options: Any) 
     from deepaccident_devkit.plugins.explore import Explorer, export_pages
     from deepaccident_devkit.plugins.explore import explore as show
 
-    shown: dict[str, Any] = {"bundles": [], "results": []}
+    models: dict[str, Any] = {"bundles": [], "results": []}
     for path in predictions:
-        shown["bundles" if (path / SUMMARY_FILE).is_file() else "results"].append(path)
+        kind = "results"
+        if (path / SUMMARY_FILE).is_file():
+            kind = "bundles"
+        models[kind].append(path)
     where, no_open = options.pop("where"), options.pop("no_open")
     server = {**options.pop("address"), "root_path": options.pop("root_path")}
     dataset = DeepAccident(**options)
     if target is not None:
-        how: dict[str, Any] = {"workers": options["workers"], "progress": True}
-        path = export_pages(dataset, target, where=where, **shown, **how)
+        engine: dict[str, Any] = {"workers": options["workers"], "progress": True}
+        path = export_pages(dataset, target, where=where, **models, **engine)
         click.echo(f"written: {path}; open it in a browser")
         return
-    show(
-        Explorer(dataset, **shown, workers=options["workers"]),
-        open_browser=not no_open,
-        say=click.echo,
-        **server,
-    )
+    explorer = Explorer(dataset, **models, workers=options["workers"])
+    show(explorer, open_browser=not no_open, say=click.echo, **server)

@@ -1,4 +1,4 @@
-"""What the plug-in `explore` offers."""
+"""The offers of the plug-in `explore`."""
 
 from __future__ import annotations
 

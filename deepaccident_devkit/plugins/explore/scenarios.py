@@ -1,4 +1,4 @@
-"""What is known of each scenario, a column at a time: at once what stands in tables, later what is computed."""
+"""Columns of the scenarios: from tables at once, and computed ones as soon as they are ready."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 UNKNOWN_VALUE: Final = "unknown"
 INTERACTIONS: Final = "interactions"
 ACCIDENTS: Final = "accidents"
-# Slow column → the work that gives it.
-_JOB_OF: Final = {
+# Slow column → the job that computes it.
+_JOB_BY_COLUMN: Final = {
     **dict.fromkeys(("min_ttc", "min_pet", "min_gap", "max_drac"), INTERACTIONS),
     **dict.fromkeys(("closing_speed", "accident_visibility", "lead", "lead_all"), ACCIDENTS),
 }
@@ -36,10 +36,10 @@ _TITLES: Final = {
     INTERACTIONS: "how near pairs come",
     ACCIDENTS: "lead times, visibility and closing speeds",
 }
-# How an accident is seen to come → its place in an order.
+# Visibility of an approaching accident → its rank.
 VISIBILITY_RANKS: Final[Mapping[str, float]] = {"visible": 0.0, "partial": 1.0, "invisible": 2.0}
 # Facets that stand above the others.
-_FIRST: Final = (
+_TOP_FACETS: Final = (
     "collision",
     "accident_visibility",
     "split",
@@ -53,12 +53,12 @@ _FIRST: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facet:
-    """A field with few values, each of which a reader can choose.
+    """A field with few values, for readers to choose from.
 
     Attributes:
-        name: of the field, as filters name it.
-        values: as texts, `unknown` last.
-        codes: (N,) position of each scenario's value.
+        name: Name of the field, as filters name it.
+        values: Texts of the values, `unknown` last.
+        codes: Index of each scenario's value, shape (N,).
     """
 
     name: str
@@ -67,10 +67,13 @@ class Facet:
 
 
 class Scenarios:
-    """The scenarios of a release, in the order of its table, and their columns; safe to read from several threads."""
+    """The scenarios of a release, in the order of its table, and their columns.
+
+    Safe to read from several threads.
+    """
 
     def __init__(self, dataset: Dataset, jobs: Jobs, *, workers: int | None = None) -> None:
-        """Take a release; `begin` begins what is slow."""
+        """Read the fast columns of a release; `begin` begins the slow ones."""
         self.dataset = dataset
         self.records: Sequence[ScenarioRecord] = dataset.scenario[:]
         self.tokens = [record["token"] for record in self.records]
@@ -79,12 +82,13 @@ class Scenarios:
         self._values: dict[str, list[Any]] = {}
         self._facets: dict[str, Facet] = {}
         texts = [group_texts(dataset, record) for record in self.records]
-        for name in [*_FIRST, *(name for name, field in FIELDS.items() if field.groups)]:
+        grouping_fields = [name for name, field in FIELDS.items() if field.groups]
+        for name in [*_TOP_FACETS, *grouping_fields]:
             if name not in self._facets and not FIELDS[name].costly:
-                self._facets[name] = _facet(name, [each[name] for each in texts])
+                self._facets[name] = _facet(name, [row[name] for row in texts])
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of scenarios."""
         return len(self.records)
 
     def begin(self) -> None:
@@ -93,21 +97,28 @@ class Scenarios:
             self.job(name)
 
     def job(self, name: str) -> Job:
-        """The work that gives one or several slow columns, begun if it is not."""
+        """Return the job that computes one or several slow columns, begun if necessary."""
         work = {INTERACTIONS: self._interactions, ACCIDENTS: self._accidents}[name]
         return self._jobs.ask(name, _TITLES[name], work)
 
     def job_of(self, column: str) -> Job | None:
-        """The work that gives a column; None for one that is there at once."""
-        return self.job(_JOB_OF[column]) if column in _JOB_OF else None
+        """Return the job that computes a column; None for a column that is ready at once."""
+        if column in _JOB_BY_COLUMN:
+            return self.job(_JOB_BY_COLUMN[column])
+        return None
 
     def late(self, column: str) -> Job | None:
-        """The work that a column waits for; None for one that is there."""
+        """Return the job that a column waits for; None for a column that is ready."""
         job = self.job_of(column)
-        return job if job is not None and job.result is None else None
+        if job is not None and job.result is None:
+            return job
+        return None
 
     def values(self, column: str) -> Sequence[Any] | None:
-        """A column's values, None where unknown, or several in a tuple; None in its place until it is ready."""
+        """Return a column's values, None for unknown ones, or several in a tuple.
+
+        Return None until the column is ready.
+        """
         job = self.job_of(column)
         if job is not None:
             return None if job.result is None else job.result[column]
@@ -116,67 +127,70 @@ class Scenarios:
         return self._values[column]
 
     def numbers(self, column: str) -> FloatArray | None:
-        """(N,) a column's values as numbers by which to sort, NaN where unknown; None until it is ready."""
+        """Return a column's values as numbers to sort by, shape (N,), NaN for unknown ones.
+
+        Return None until the column is ready.
+        """
         values = self.values(column)
         if values is None:
             return None
         ranks = VISIBILITY_RANKS if column == "accident_visibility" else {}
-        return np.array(
-            [math.nan if each is None else ranks.get(each, each) for each in values],
-            dtype=np.float64,
-        )
+        numbers = [math.nan if value is None else ranks.get(value, value) for value in values]
+        return np.array(numbers, dtype=np.float64)
 
     def facets(self) -> list[Facet]:
-        """The facets, the most asked for first; without those of one value, and of those that are not ready."""
-        found = dict(self._facets)
+        """Return the facets that are ready and have several values, the most important first."""
+        facets = dict(self._facets)
         if self.values("accident_visibility") is not None:
-            found["accident_visibility"] = self._visibility
-        order = [*_FIRST, *(name for name in found if name not in _FIRST)]
-        return [found[name] for name in order if name in found and len(found[name].values) > 1]
+            facets["accident_visibility"] = self._visibility
+        order = [*_TOP_FACETS, *(name for name in facets if name not in _TOP_FACETS)]
+        return [facets[name] for name in order if name in facets and len(facets[name].values) > 1]
 
     @cached_property
     def _visibility(self) -> Facet:
         return _facet("accident_visibility", self.values("accident_visibility") or [])
 
     def _interactions(self) -> dict[str, list[Any]]:
-        found = interactions_of(self.dataset, workers=self._workers)
-        return _columns(INTERACTIONS, [measures_of_moving_pairs(each) for each in found])
+        results = interactions_of(self.dataset, workers=self._workers)
+        return _columns(INTERACTIONS, [measures_of_moving_pairs(pairs) for pairs in results])
 
     def _accidents(self) -> dict[str, list[Any]]:
-        found = each_scenario(
+        results = each_scenario(
             accident_fields, self.dataset, label="accidents", workers=self._workers
         )
-        return _columns(ACCIDENTS, those_of(dict, found))
+        return _columns(ACCIDENTS, those_of(dict, results))
 
 
-def _columns(job: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """The columns that a work gives, from what it found of each scenario."""
-    return {name: [row[name] for row in rows] for name, work in _JOB_OF.items() if work == job}
+def _columns(job_name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return the columns that a job computes, from its results for each scenario."""
+    names = [column for column, job in _JOB_BY_COLUMN.items() if job == job_name]
+    return {name: [row[name] for row in rows] for name in names}
 
 
 def accident_fields(dataset: Dataset, record: ScenarioRecord) -> dict[str, Any]:
-    """The columns of `_JOB_OF` that tell of an accident; None where unknown, and where nobody collides."""
+    """Return the slow columns about an accident; None where unknown, and without a collision."""
     try:
         leads = lead_times(dataset, record)
     except NotAvailableError:
         leads = None
-    told = {
-        name: FIELDS[name].read(dataset, record)
-        for name in ("closing_speed", "accident_visibility")
-    }
-    known = {"lead": leads.alone, "lead_all": leads.together} if leads is not None else {}
-    return {**told, **{name: _known(known.get(name)) for name in ("lead", "lead_all")}}
+    fields: dict[str, Any] = {}
+    for name in ("closing_speed", "accident_visibility"):
+        fields[name] = FIELDS[name].read(dataset, record)
+    fields["lead"] = None if leads is None else _finite_or_none(leads.alone)
+    fields["lead_all"] = None if leads is None else _finite_or_none(leads.together)
+    return fields
 
 
-def _known(value: float | None) -> float | None:
-    return None if value is None or math.isnan(value) else float(value)
+def _finite_or_none(value: float) -> float | None:
+    if math.isnan(value):
+        return None
+    return float(value)
 
 
 def _facet(name: str, texts: Sequence[str | None]) -> Facet:
     values = sorted({text for text in texts if text is not None}, key=natural_order)
-    values += [UNKNOWN_VALUE] * (None in texts)
-    place = {value: number for number, value in enumerate(values)}
-    codes = np.array(
-        [place[UNKNOWN_VALUE if text is None else text] for text in texts], dtype=np.int64
-    )
-    return Facet(name=name, values=tuple(values), codes=codes)
+    if None in texts:
+        values.append(UNKNOWN_VALUE)
+    code_by_value = {value: code for code, value in enumerate(values)}
+    codes = [code_by_value[UNKNOWN_VALUE if text is None else text] for text in texts]
+    return Facet(name=name, values=tuple(values), codes=np.array(codes, dtype=np.int64))

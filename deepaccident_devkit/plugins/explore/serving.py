@@ -1,4 +1,4 @@
-"""Run the pages: a server on a port of this machine, in a thread of its own, behind a `Gate`."""
+"""Run the pages: a server on a port of this machine, in its own thread, behind a `Gate`."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.plugins.explore.access import Access, App, Gate, HostPort, RootPath
 
 LOOPBACK: Final = "127.0.0.1"
-_NEEDED: Final = ("starlette", "uvicorn")
-# Tried first; then the machine chooses one.
+_EXTRA_PACKAGES: Final = ("starlette", "uvicorn")
+# Ports that are tried before the machine chooses one.
 PORTS: Final = range(8765, 8785)
-_LAST_PORT: Final = 0xFFFF
-# Time in which a connection must bring a whole request.
+_MAX_PORT: Final = 0xFFFF
+# Time in which a connection must send a complete request.
 _REQUEST_SECONDS: Final = 10.0
-# With more of them, those that have brought no whole request by the next look are closed.
-_MOST_CONNECTIONS: Final = 200
-# Between two looks at all connections.
+# Number of connections above which all that have sent no complete request by the next sweep are
+# closed.
+_MAX_CONNECTIONS: Final = 200
+# Time between two sweeps over all connections.
 _SWEEP_SECONDS: Final = 0.1
-# Time for answers that are being made when the server stops; then they are left to their threads.
+# Time for unfinished answers when the server stops; after it they are left to their threads.
 _STOP_SECONDS: Final = 0.7
-_EXPOSED: Final = (
-    "warning: anyone who can reach this machine can try to open the pages, and anyone who has the address with the "
-    "token sees the release. Nothing is encrypted: prefer an SSH tunnel, which needs no --address."
+_EXPOSURE_WARNING: Final = (
+    "warning: anyone who can reach this machine can try to open the pages, and anyone who has the "
+    "address with the token sees the release. Nothing is encrypted: prefer an SSH tunnel, which "
+    "needs no --address."
 )
 
 
 def need_extra() -> None:
     """Raise MissingExtraError unless the extra `explore` is installed."""
-    missing = [name for name in _NEEDED if find_spec(name) is None]
+    missing = [name for name in _EXTRA_PACKAGES if find_spec(name) is None]
     if missing:
         raise MissingExtraError(
             f"the explorer needs {', '.join(missing)}; in a checkout: pip install '.[explore]'"
@@ -57,12 +59,22 @@ def serve(
     open_browser: bool = True,
     say: Callable[[str], object],
 ) -> None:
-    """Show the pages on a host and port of this machine until an exception, such as that of Ctrl-C, ends it.
+    """Show the pages on a host and port of this machine until an exception, such as of Ctrl-C.
 
-    The port is by default the first free one from 8765 on; the root path is the path or URL at which a proxy shows the
-    pages; the addresses lead to a `page`, by default the first. A browser is opened if there is a display and no proxy;
-    `say` gets the addresses, line by line. Raises MissingExtraError, and ConfigError if the server cannot listen there
-    or the root path is neither.
+    A browser is opened if there is a display and no proxy.
+
+    Args:
+        app: Application that answers requests.
+        host: Host to listen on.
+        port: Port to listen on; by default the first free one from 8765 on.
+        root_path: Path or URL at which a proxy shows the pages.
+        page: Page that the addresses lead to; by default the first.
+        open_browser: Whether to open a browser.
+        say: Function that gets the addresses, line by line.
+
+    Raises:
+        MissingExtraError: The extra `explore` is not installed.
+        ConfigError: The server cannot listen there, or the root path is neither a path nor a URL.
     """
     with serving(app, host=host, port=port, root_path=root_path, page=page) as served:
         for line in served.lines():
@@ -76,18 +88,18 @@ def serve(
 def serving(
     app: App, *, host: str = LOOPBACK, port: int | None = None, root_path: str = "", page: str = ""
 ) -> Iterator[Served]:
-    """As `serve`, but the pages are shown while the block runs; port 0 is any free one."""
+    """Show the pages as `serve` does, but only while the block runs; port 0 is any free one."""
     need_extra()
     host = host.removeprefix("[").removesuffix("]")
     root = RootPath.parse(root_path)
-    listening = _listen(host, port)
-    address, number = listening.getsockname()[:2]
+    listener = _listen(host, port)
+    address, port_number = listener.getsockname()[:2]
     bound = ip_address(address)
     access = Access(
-        port=number, root=root, names=_names(host, bound), any_address=bound.is_unspecified
+        port=port_number, root=root, names=_names(host, bound), any_address=bound.is_unspecified
     )
     gate = Gate(app, access)
-    running = _Running(gate, listening)
+    running = _Running(gate, listener)
     try:
         running.start()
         yield Served(host, bound, access, gate, running, page)
@@ -97,13 +109,13 @@ def serving(
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """Where the pages are shown.
+    """A running server of the pages.
 
     Attributes:
-        host: name or address that was asked for.
-        bound: address on which the server listens.
-        access: what is let in.
-        page: to which the addresses lead.
+        host: Name or address that was requested.
+        bound: Address on which the server listens.
+        access: What is let in.
+        page: Page that the addresses lead to.
     """
 
     host: str
@@ -115,53 +127,48 @@ class Served:
 
     @property
     def port(self) -> int:
-        """Where the server listens."""
+        """Port on which the server listens."""
         return self.access.port
 
     @property
     def token(self) -> str:
-        """The secret that opens the pages."""
+        """Secret that opens the pages."""
         return self.access.token
 
     @property
     def origin(self) -> str:
-        """The address of the server, as this machine sees it, without a path."""
+        """Address of the server, as this machine sees it, without a path."""
         if self.bound.is_unspecified:
             return _origin(LOOPBACK if self.bound.version == 4 else "::1", self.port)
         return _origin(str(self.bound) if self.bound.is_loopback else self.host, self.port)
 
     @property
     def url(self) -> str:
-        """The address that opens the pages."""
+        """Address that opens the pages."""
         return f"{self.origin}/{self.page}?token={self.token}"
 
     def lines(self) -> list[str]:
-        """All addresses for the reader, and what to know about them."""
-        here, query = socket.gethostname(), f"/{self.page}?token={self.token}"
-        lines = [] if self.bound.is_loopback else [_EXPOSED]
+        """Return all addresses for the reader, and notes about them."""
+        machine, query = socket.gethostname(), f"/{self.page}?token={self.token}"
+        lines = [] if self.bound.is_loopback else [_EXPOSURE_WARNING]
         lines.append(f"the explorer runs until Ctrl-C; open {self.url}")
         if self.bound.is_unspecified:
-            lines.append(f"on other machines: {_origin(here, self.port)}{query}")
+            lines.append(f"on other machines: {_origin(machine, self.port)}{query}")
         root = self.access.root
-        if root.place is not None:
+        if root.location is not None:
             lines.append(f"behind the proxy: {root}{query}")
         elif root.path:
             lines.append(f"on your notebook server or portal: {root}{query}")
         inner = "localhost" if self.bound.is_loopback or self.bound.is_unspecified else self.host
-        tunnel = f"ssh -L {self.port}:{HostPort(inner, None)}:{self.port} {here}"
-        lines.append(
-            f"from another machine: {tunnel}, and there {_origin('localhost', self.port)}{query}"
-        )
+        tunnel = f"ssh -L {self.port}:{HostPort(inner, None)}:{self.port} {machine}"
+        local_address = f"{_origin('localhost', self.port)}{query}"
+        lines.append(f"from another machine: {tunnel}, and there {local_address}")
         return lines
 
     def open_browser(self) -> None:
-        """Open the pages in a browser, as far as there is one; the token is not in its command line."""
-        threading.Thread(
-            target=_open,
-            args=(f"{self.origin}/{self.page}?token={self._gate.ticket()}",),
-            name="browser",
-            daemon=True,
-        ).start()
+        """Open the pages in a browser, if there is one; its command line lacks the token."""
+        url = f"{self.origin}/{self.page}?token={self._gate.ticket()}"
+        threading.Thread(target=_open, args=(url,), name="browser", daemon=True).start()
 
     def wait(self) -> None:
         """Wait until the server ends, which it does not do by itself."""
@@ -169,15 +176,18 @@ class Served:
 
 
 class _Running:
-    """A server in a thread. Whatever it does, neither it nor the threads that it starts keep the process."""
+    """A server in a thread.
 
-    def __init__(self, app: App, listening: socket.socket) -> None:
+    Neither it nor the threads that it starts keep the process alive.
+    """
+
+    def __init__(self, app: App, listener: socket.socket) -> None:
         import uvicorn
 
-        self._listening = listening
+        self._listener = listener
         self._ended = threading.Event()
         self._failure: BaseException | None = None
-        # all by name: by default it takes what else is installed
+        # Everything is named explicitly: by default uvicorn uses whatever is installed.
         self._server = uvicorn.Server(
             uvicorn.Config(
                 app,
@@ -186,7 +196,8 @@ class _Running:
                 ws="none",
                 lifespan="on",
                 log_config=None,
-                log_level="critical",  # what anyone may send is no news, and the gate logs what fails
+                # The gate logs failures; bad requests, which anyone may send, are no news.
+                log_level="critical",
                 access_log=False,
                 proxy_headers=False,
                 server_header=False,
@@ -195,23 +206,23 @@ class _Running:
         )
 
     def start(self) -> None:
-        """Return when it answers."""
+        """Start the server, and return when it answers."""
         threading.Thread(target=self._run, name="explorer", daemon=True).start()
         while not self._server.started:
             if self._ended.wait(0.005):
                 raise RuntimeError("the explorer's server did not start") from self._failure
 
     def wait(self) -> None:
-        """Until it ends; unlike a thread's `join`, an event's `wait` can be interrupted."""
+        """Wait until the server ends; unlike a thread's `join`, this can be interrupted."""
         self._ended.wait()
         if self._failure is not None:
             raise RuntimeError("the explorer's server failed") from self._failure
 
     def stop(self) -> None:
-        """End it, and free its port, within a second."""
+        """End the server, and free its port, within a second."""
         self._server.should_exit = True
         self._ended.wait(_STOP_SECONDS)
-        self._listening.close()
+        self._listener.close()
 
     def _run(self) -> None:
         try:
@@ -222,70 +233,75 @@ class _Running:
             self._ended.set()
 
     async def _serve(self) -> None:
-        closing = asyncio.create_task(self._close_unasking())
-        await self._server.serve(sockets=[self._listening])
+        closing = asyncio.create_task(self._close_idle_connections())
+        await self._server.serve(sockets=[self._listener])
         closing.cancel()
-        for connection in [*self._server.server_state.connections]:  # to readers who take nothing
+        for connection in [*self._server.server_state.connections]:  # readers that read nothing
             connection.transport.abort()
 
-    async def _close_unasking(self) -> None:
-        """Close each connection that brings no whole request in time, and of too many all that wait for one."""
+    async def _close_idle_connections(self) -> None:
+        """Close each connection that sends no complete request in time.
+
+        Of too many connections, close all that wait for a request.
+        """
         from h11 import IDLE, SEND_BODY
 
         connections: Any = self._server.server_state.connections
-        looks: dict[Any, int] = {}
+        sweeps: dict[Any, int] = {}
         while True:
             await asyncio.sleep(_SWEEP_SECONDS)
             waiting = [
-                (each, each.cycle)
-                for each in connections
-                if each.conn.their_state in (IDLE, SEND_BODY)
+                (connection, connection.cycle)
+                for connection in connections
+                if connection.conn.their_state in (IDLE, SEND_BODY)
             ]
-            looks = {key: looks.get(key, 0) + 1 for key in waiting}
-            most = 1 if len(connections) > _MOST_CONNECTIONS else _REQUEST_SECONDS / _SWEEP_SECONDS
-            for (connection, _), count in looks.items():
-                if count > most:
+            sweeps = {key: sweeps.get(key, 0) + 1 for key in waiting}
+            max_sweeps = _REQUEST_SECONDS / _SWEEP_SECONDS
+            if len(connections) > _MAX_CONNECTIONS:
+                max_sweeps = 1
+            for (connection, _), count in sweeps.items():
+                if count > max_sweeps:
                     connection.transport.abort()
 
 
-class _TakenError(ConfigError):
-    """Another program listens there."""
+class _PortInUseError(ConfigError):
+    """Another program listens on the port."""
 
 
 def _listen(host: str, port: int | None) -> socket.socket:
-    """A socket that listens. Raises ConfigError."""
+    """Return a socket that listens; raise ConfigError."""
     if not host:
         raise ConfigError("host: expected a name or an address of this machine, found nothing")
-    if port is not None and not 0 <= port <= _LAST_PORT:
-        raise ConfigError(f"port: expected a number up to {_LAST_PORT}, found {port}")
+    if port is not None and not 0 <= port <= _MAX_PORT:
+        raise ConfigError(f"port: expected a number up to {_MAX_PORT}, found {port}")
     for candidate in PORTS if port is None else ():
-        with suppress(_TakenError):
+        with suppress(_PortInUseError):
             return _listener(host, candidate)
     return _listener(host, port or 0)
 
 
 def _listener(host: str, port: int) -> socket.socket:
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        family, _, _, _, address = min(found, key=lambda each: each[0] != socket.AF_INET)
-        return socket.create_server(
-            address, family=family, dualstack_ipv6=family == socket.AF_INET6
-        )
+        candidates = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        family, _, _, _, address = min(candidates, key=lambda info: info[0] != socket.AF_INET)
+        is_ipv6 = family == socket.AF_INET6
+        return socket.create_server(address, family=family, dualstack_ipv6=is_ipv6)
     except PermissionError as error:
         raise ConfigError(f"port {port}: not allowed here; choose a port from 1024 on") from error
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
-            raise _TakenError(
-                f"port {port}: another program listens there; choose another port (--address), or leave it out"
+            raise _PortInUseError(
+                f"port {port}: another program listens there; choose another port (--address), or "
+                "leave it out"
             ) from error
         raise ConfigError(
-            f"host {host}: cannot listen there ({error}); give a name or an address of this machine (--address), or "
-            "leave it out"
+            f"host {host}: cannot listen there ({error}); give a name or an address of this "
+            "machine (--address), or leave it out"
         ) from error
 
 
 def _names(host: str, bound: IPv4Address | IPv6Address) -> frozenset[str]:
-    """The hosts that a request may name: if other machines reach it, all names of this one."""
+    """Return the hosts that a request may name: all of this machine if others can reach it."""
     names = {host, str(bound)}
     if not bound.is_loopback:
         name = socket.gethostname()
@@ -298,7 +314,10 @@ def _origin(host: str, port: int) -> str:
 
 
 def _is_display_likely(environment: Mapping[str, str]) -> bool:
-    """Whether a browser would open where the reader sits: not at the far end of SSH, unless one is named."""
+    """Return whether a browser would open where the reader sits.
+
+    It would not at the far end of SSH, unless a browser is named.
+    """
     if "BROWSER" in environment:
         return True
     if "SSH_CONNECTION" in environment:

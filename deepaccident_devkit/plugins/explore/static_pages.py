@@ -1,4 +1,7 @@
-"""`export_pages`: some scenarios as pages that are files, for a talk or a supplement: no server, no network."""
+"""`export_pages`: pages of some scenarios as files, for a talk or a supplement.
+
+They need no server and no network.
+"""
 
 from __future__ import annotations
 
@@ -48,68 +51,73 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-# The file by which an export knows the folder of an earlier one: it names all files that were written.
+# Name of the file that marks the folder of an export; it lists all files that were written.
 MARK: Final = ".deepaccident_pages"
 _HEAD: Final = "DeepAccident pages"
 _REPLAY_FILE: Final = "replay.html"
 THUMBNAIL: Final = "thumbnail.jpg"
-# Scenarios of an export: a replay takes some seconds and up to 15 MB.
-MOST_SCENARIOS: Final = 50
+# Largest number of scenarios of an export: a replay takes some seconds and up to 15 MB.
+MAX_SCENARIOS: Final = 50
 INDEX: Final = "index.html"
 _STATIC: Final = "static"
 _ASSETS: Final = ("pages.css", "explore.css", "keys.js", "sorting.js")
-# Nothing is loaded but the files of the export, from a disk or from a server.
-_POLICY: Final = (
-    "default-src 'none'; script-src 'self' file:; style-src 'self' file:; img-src 'self' file: data:; "
-    "frame-src 'self' file:; base-uri 'none'; form-action 'none'"
+# Only the files of the export are loaded, from a disk or from a server.
+_CONTENT_POLICY: Final = (
+    "default-src 'none'; script-src 'self' file:; style-src 'self' file:; img-src 'self' file: "
+    "data:; frame-src 'self' file:; base-uri 'none'; form-action 'none'"
 )
 
 
 def target_folder(folder: str | os.PathLike[str]) -> Path:
-    """The real path of a folder for an export; raises ConfigError if it cannot be written to, or holds other files."""
+    """Return the real path of a folder for an export.
+
+    Raises ConfigError if it cannot be written to, or holds other files.
+    """
     target = path_of(folder, "expected a folder to write to").resolve()
     writable_folder(target.parent)
     if target.exists() and not target.is_dir():
         raise ConfigError(f"{target}: is a file; name a folder that does not exist yet")
-    others = sorted(set(_files(target)) - set(_earlier(target)))
-    if others:
+    foreign_files = sorted(set(_files(target)) - set(_exported_files(target)))
+    if foreign_files:
         raise ConfigError(
-            f"{target}: holds {others[0]}, which no export wrote; name a folder that is empty, or does not exist yet"
+            f"{target}: holds {foreign_files[0]}, which no export wrote; name a folder that is "
+            "empty, or does not exist yet"
         )
     return target
 
 
 @contextmanager
 def exported(target: Path) -> Iterator[Path]:
-    """Yield a new folder; if the block succeeds it takes the place of the target, and of an earlier export there."""
-    aside = temporary_path(target)
+    """Yield a new folder; if the block succeeds, it replaces the target and an earlier export."""
+    backup = temporary_path(target)
     try:
-        with replacing_folder(target) as made:
-            yield made
-            write_bytes(
-                made / MARK,
-                "".join(f"{line}\n" for line in (_HEAD, *sorted(_files(made)))).encode(),
-            )
+        with replacing_folder(target) as folder:
+            yield folder
+            lines = [_HEAD, *sorted(_files(folder))]
+            write_bytes(folder / MARK, "".join(f"{line}\n" for line in lines).encode())
             if target.is_dir() and any(target.iterdir()):
-                target.rename(aside)
+                target.rename(backup)
     finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(backup, ignore_errors=True)
 
 
 def _files(folder: Path) -> Iterator[str]:
-    """All files and links below a folder, relative to it."""
+    """Yield all files and links below a folder, relative to it."""
     for path, folders, files in os.walk(folder):
         links = [name for name in folders if Path(path, name).is_symlink()]
-        yield from (Path(path, name).relative_to(folder).as_posix() for name in (*links, *files))
+        for name in (*links, *files):
+            yield Path(path, name).relative_to(folder).as_posix()
 
 
-def _earlier(folder: Path) -> list[str]:
-    """The files that an earlier export wrote into a folder; none if there was none."""
+def _exported_files(folder: Path) -> list[str]:
+    """Return the files that an earlier export wrote into a folder; none without an export."""
     mark = folder / MARK
     if not mark.is_file() or mark.is_symlink():
         return []
     head, *names = read_bytes(mark, "index").decode(errors="replace").splitlines()
-    return [*names, MARK] if head == _HEAD else []
+    if head == _HEAD:
+        return [*names, MARK]
+    return []
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,9 +125,9 @@ class _ExportedScenario:
     """A scenario of an export.
 
     Attributes:
-        token: of the scenario.
-        folder: its own, relative to that of the export.
-        predictions: names and results of the models that tell of it.
+        token: Token of the scenario.
+        folder: Folder of the scenario, relative to the folder of the export.
+        predictions: Names and results of the models with predictions for it.
     """
 
     token: str
@@ -128,15 +136,15 @@ class _ExportedScenario:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
-    """What a scenario's page says; its thumbnail and replay are files.
+class ScenarioContent:
+    """The content of a scenario's page; its thumbnail and replay are files.
 
     Attributes:
-        facts: names and values.
-        parts: of `PARTS`, as HTML.
-        measures: of `SLOW`.
-        model: whose predictions the replay shows; empty for none.
-        reason: why there is no replay; empty if there is one.
+        facts: Names and values.
+        parts: The `PARTS` as HTML.
+        measures: Values of the columns `SLOW`.
+        model: Name of the model with the predictions of the replay; empty for none.
+        reason: Reason why there is no replay; empty if there is one.
     """
 
     facts: Sequence[Sequence[str]]
@@ -146,48 +154,52 @@ class Told:
     reason: str
 
 
-def tell(dataset: Dataset, folder: Path, work: _ExportedScenario) -> Told:
-    """Write a scenario's files below the folder of the export, and find what its page says."""
-    record = dataset.scenario.get(work.token)
-    own = folder / work.folder
-    write_bytes(own / THUMBNAIL, thumbnail(dataset, record))
-    measures = accident_fields(dataset, record) | measures_of_moving_pairs(
-        interactions(dataset, record)
-    )
-    model, reason = _make_replay(dataset, work, own / _REPLAY_FILE)
-    return Told(
-        facts=facts(recording_of(dataset, work.token, None)),
-        parts={name: _part(dataset, work.token, name) for name in PARTS},
+def write_scenario(dataset: Dataset, folder: Path, scenario: _ExportedScenario) -> ScenarioContent:
+    """Write a scenario's files below the folder of the export; return the content of its page."""
+    token = scenario.token
+    record = dataset.scenario.get(token)
+    own_folder = folder / scenario.folder
+    write_bytes(own_folder / THUMBNAIL, thumbnail(dataset, record))
+    measures = accident_fields(dataset, record)
+    measures |= measures_of_moving_pairs(interactions(dataset, record))
+    model, reason = _make_replay(dataset, scenario, own_folder / _REPLAY_FILE)
+    return ScenarioContent(
+        facts=facts(recording_of(dataset, token, None)),
+        parts={name: _part(dataset, token, name) for name in PARTS},
         measures={name: measures[name] for name in SLOW},
         model=model,
-        reason=_without_place(dataset, reason),
+        reason=_without_dataroot(dataset, reason),
     )
 
 
-def _make_replay(dataset: Dataset, work: _ExportedScenario, path: Path) -> tuple[str, str]:
-    """Write a replay with the first predictions that can be shown; whose they are, and why there is no replay."""
-    for name, prediction in work.predictions:
-        if tried_replay(dataset, work.token, path, prediction=prediction) is None:
+def _make_replay(dataset: Dataset, scenario: _ExportedScenario, path: Path) -> tuple[str, str]:
+    """Write a replay with the first predictions that can be shown.
+
+    Return the name of their model, and the reason if there is no replay.
+    """
+    for name, prediction in scenario.predictions:
+        if tried_replay(dataset, scenario.token, path, prediction=prediction) is None:
             return name, ""
-    return "", tried_replay(dataset, work.token, path) or ""
+    return "", tried_replay(dataset, scenario.token, path) or ""
 
 
 def _part(dataset: Dataset, token: str, name: str) -> str:
     context = part_context(dataset, token, name)
     if "findings" in context:
-        context["findings"] = [
-            replace(
-                each,
-                where=_without_place(dataset, each.where),
-                what=_without_place(dataset, each.what),
-            )
-            for each in context["findings"]
-        ]
+        findings = []
+        for finding in context["findings"]:
+            where = _without_dataroot(dataset, finding.where)
+            text = _without_dataroot(dataset, finding.what)
+            findings.append(replace(finding, where=where, what=text))
+        context["findings"] = findings
     return rendered(f"parts/{name}.html", root="", static=True, frame_number=str, **context)
 
 
-def _without_place(dataset: Dataset, text: str) -> str:
-    """A text in which paths of the release's files begin in its folder: pages for others do not tell where it lies."""
+def _without_dataroot(dataset: Dataset, text: str) -> str:
+    """Return a text with paths relative to the release's folder.
+
+    Pages for others should not reveal where the release lies.
+    """
     return text.replace(f"{dataset.dataroot}/", "")
 
 
@@ -199,90 +211,90 @@ def export_pages(
     bundles: Iterable[Path] = (),
     results: Iterable[Path] = (),
     scenarios: Iterable[RowArgument] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> Path:
-    """Write pages of some scenarios as files: a list, and for each a replay, its story, pairs, lead times and findings.
+    """Write pages of some scenarios as files.
 
-    They work from a disk, without a server and a network, and from any web server. Nothing in them tells where the
-    release lies. The same call gives the same bytes.
+    There is a list, and for each scenario a replay, its story, pairs, lead times and findings. They
+    work from a disk, without a server and a network, and from any web server. Nothing in them
+    reveals where the release lies. The same call gives the same bytes.
 
     Args:
-        dataset: the release.
-        folder: where; new, empty, or an earlier export, which is replaced.
-        where: filters as of `find`, all of which hold.
-        bundles: folders that `save_run` wrote with their results.
-        results: files or folders of results. A replay shows the predictions of the first ones that tell of the
-            scenario, those of bundles before others.
-        scenarios: tokens or records, of which those that match are written, in this order; None for all.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        folder: Output folder; new, empty, or an earlier export, which is replaced.
+        where: Filters as for `find`; a scenario must match all.
+        bundles: Folders that `save_run` wrote with their results.
+        results: Files or folders of results. A replay shows the first predictions for its scenario,
+            from bundles before others.
+        scenarios: Tokens or records; the ones that match are written, in this order. None for all.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Returns:
         The first page, `index.html`.
 
     Raises:
-        ConfigError: more than 50 scenarios match; or the folder cannot be written to, or holds other files.
-        NotAvailableError: no scenario matches.
-        FieldError, ChoiceError, TokenError: there is no such filter or scenario.
-        ResultsError: bundles or results cannot be read.
-        WorkerError: as `parallel.Engine` says.
+        ConfigError: More than 50 scenarios match; or the folder cannot be written to, or holds
+            other files.
+        NotAvailableError: No scenario matches.
+        FieldError, ChoiceError, TokenError: There is no such filter or scenario.
+        ResultsError: Bundles or results cannot be read.
+        WorkerError: See `parallel.Engine`.
 
     Examples:
         >>> export_pages(
         ...     da, "night", where=["time_of_day=Night", "collision=true"]
         ... )  # doctest: +SKIP
     """
-    given = (
-        None
-        if scenarios is None
-        else [dataset.get("scenario", each)["token"] for each in scenarios]
-    )
-    records = _chosen(dataset, where, given)
+    tokens: list[str] | None = None
+    if scenarios is not None:
+        tokens = [dataset.get("scenario", scenario)["token"] for scenario in scenarios]
+    records = _matching_records(dataset, where, tokens)
     target = target_folder(folder)
     models = open_models(bundles, results, Jobs())
-    filters = [*where, *([] if given is None else [f"token={','.join(given)}"])]
-    with exported(target) as made:
-        _Pages(dataset, made, records, models).write(filters, **how)
+    filters = [*where]
+    if tokens is not None:
+        filters.append(f"token={','.join(tokens)}")
+    with exported(target) as new_folder:
+        _Pages(dataset, new_folder, records, models).write(filters, **engine)
     return target / INDEX
 
 
-def _chosen(
-    dataset: Dataset, where: Sequence[str], given: Sequence[str] | None
+def _matching_records(
+    dataset: Dataset, where: Sequence[str], tokens: Sequence[str] | None
 ) -> list[ScenarioRecord]:
-    """The scenarios to write; raises ConfigError if they are too many."""
+    """Return the scenarios to write; raise ConfigError if they are too many."""
     records = find(dataset, *where)
-    if given is not None:
+    if tokens is not None:
         by_token = {record["token"]: record for record in records}
-        records = [by_token[token] for token in dict.fromkeys(given) if token in by_token]
+        records = [by_token[token] for token in dict.fromkeys(tokens) if token in by_token]
     if not records:
         raise NotAvailableError(
             "no scenario matches, so there is nothing to export; change --where"
         )
-    if len(records) > MOST_SCENARIOS:
+    if len(records) > MAX_SCENARIOS:
         raise ConfigError(
-            f"{len(records)} scenarios match, and at most {MOST_SCENARIOS} are exported; narrow --where"
+            f"{len(records)} scenarios match, and at most {MAX_SCENARIOS} are exported; narrow "
+            "--where"
         )
     return records
 
 
 def _folders(records: Sequence[ScenarioRecord]) -> dict[str, str]:
-    """Scenario → its folder, `TYPE/NAME` in letters that all file systems and addresses know."""
-    types = plain_names(
-        dict.fromkeys(record["scenario_type"] for record in records), taken=(_STATIC, INDEX, MARK)
-    )
-    names = {
-        kind: plain_names(record["name"] for record in records if record["scenario_type"] == kind)
-        for kind in types
-    }
-    return {
-        record[
-            "token"
-        ]: f"{types[record['scenario_type']]}/{names[record['scenario_type']][record['name']]}"
-        for record in records
-    }
+    """Return scenario → its folder, `TYPE/NAME` in letters that all file systems support."""
+    names_by_type: dict[str, list[str]] = {}
+    for record in records:
+        names_by_type.setdefault(record["scenario_type"], []).append(record["name"])
+    types = plain_names(names_by_type, reserved=(_STATIC, INDEX, MARK))
+    plain_by_type = {kind: plain_names(names) for kind, names in names_by_type.items()}
+    folders = {}
+    for record in records:
+        kind = record["scenario_type"]
+        folders[record["token"]] = f"{types[kind]}/{plain_by_type[kind][record['name']]}"
+    return folders
 
 
 class _Pages:
-    """The pages of an export that is being written into a folder."""
+    """The pages of an export, written into a folder."""
 
     def __init__(
         self,
@@ -294,23 +306,23 @@ class _Pages:
         self._dataset, self._folder, self._records, self._models = dataset, folder, records, models
         self._names = _folders(records)
 
-    def write(self, filters: Sequence[str], **how: Unpack[Engine]) -> None:
-        """Write all pages of scenarios that were found by filters, and what they show; `how` as of `export_pages`."""
+    def write(self, filters: Sequence[str], **engine: Unpack[Engine]) -> None:
+        """Write all pages of the scenarios that match filters; see `export_pages` for `engine`."""
         items = [
             _ExportedScenario(token=token, folder=name, predictions=self._predictions(token))
             for token, name in self._names.items()
         ]
         places = Places(reads=self._dataset.places, writes=(self._folder,))
-        work = partial(tell, self._dataset, self._folder)
-        told = run_batch(work, items, label="pages of scenarios", places=places, **how)
+        work = partial(write_scenario, self._dataset, self._folder)
+        contents = run_batch(work, items, label="pages of scenarios", places=places, **engine)
         for name in _ASSETS:
             write_bytes(self._folder / _STATIC / name, assets()[name].encode())
-        for place, each in enumerate(told):
-            self._write_scenario(place, each)
-        self._write_index(filters, told)
+        for index, content in enumerate(contents):
+            self._write_scenario(index, content)
+        self._write_index(filters, contents)
 
     def _predictions(self, token: str) -> tuple[tuple[str, Results], ...]:
-        """Those that a replay of the scenario can show."""
+        """Return the predictions that a replay of the scenario can show."""
         return tuple(
             (name, model.results)
             for name, model in self._models.items()
@@ -319,47 +331,47 @@ class _Pages:
             and token in model.scenarios
         )
 
-    def _write_index(self, filters: Sequence[str], told: Sequence[Told]) -> None:
+    def _write_index(self, filters: Sequence[str], contents: Sequence[ScenarioContent]) -> None:
+        entries = []
+        for record, content in zip(self._records, contents, strict=True):
+            cells = {name: cell(value) for name, value in content.measures.items()}
+            entries.append(entry(record, cells, {}))
+        options = [*where_words(filters), "--out", "DIR"]
         self._write_page(
             INDEX,
             "written_list.html",
             "./",
-            entries=[
-                entry(record, {name: cell(value) for name, value in each.measures.items()}, {})
-                for record, each in zip(self._records, told, strict=True)
-            ],
+            entries=entries,
             slow=SLOW,
             release=self._dataset.version,
             python=find_call(filters),
-            command=shlex.join(
-                ["deepaccident", "explore", "DATAROOT", *where_words(filters), "--out", "DIR"]
-            ),
+            command=shlex.join(["deepaccident", "explore", "DATAROOT", *options]),
         )
 
-    def _write_scenario(self, place: int, told: Told) -> None:
+    def _write_scenario(self, index: int, content: ScenarioContent) -> None:
         tokens = list(self._names)
-        token = tokens[place]
+        token = tokens[index]
         twin = twin_of(self._dataset, token)
         self._write_page(
             f"{self._names[token]}/{INDEX}",
             "written_scenario.html",
             "../../",
             token=token,
-            before=tokens[place - 1] if place else None,
-            after=tokens[place + 1] if place + 1 < len(tokens) else None,
+            before=tokens[index - 1] if index else None,
+            after=tokens[index + 1] if index + 1 < len(tokens) else None,
             twin=twin["token"] if twin is not None and twin["token"] in self._names else None,
-            facts=told.facts,
+            facts=content.facts,
             parts=PARTS,
-            told=told.parts,
-            model=told.model,
-            reason=told.reason,
+            told=content.parts,
+            model=content.model,
+            reason=content.reason,
             replay=_REPLAY_FILE,
         )
 
     def _write_page(self, name: str, template: str, root: str, **context: Any) -> None:
-        """Write a page from a template; `root` is its way to the first one."""
+        """Write a page from a template; `root` is its relative address of the first page."""
 
-        def own(token: str) -> str:
+        def scenario_path(token: str) -> str:
             return f"{root}{quote(self._names[token])}"
 
         text = rendered(
@@ -367,11 +379,11 @@ class _Pages:
             root=root,
             models=(),
             static=True,
-            policy=_POLICY,
+            policy=_CONTENT_POLICY,
             asset=lambda _, name: f"{root}{_STATIC}/{name}",
-            scenario_at=lambda _, token: f"{own(token)}/{INDEX}",
+            scenario_at=lambda _, token: f"{scenario_path(token)}/{INDEX}",
             named=lambda token: scenario_words(self._dataset.scenario.get(token)),
-            thumbnail_at=lambda _, token: f"{own(token)}/{THUMBNAIL}",
+            thumbnail_at=lambda _, token: f"{scenario_path(token)}/{THUMBNAIL}",
             **context,
         )
         write_bytes(self._folder / name, text.encode())

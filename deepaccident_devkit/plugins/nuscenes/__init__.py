@@ -1,9 +1,11 @@
-"""nuScenes beside DeepAccident: its scenes as a release, for all that takes one (the extra `nuscenes`).
+"""nuScenes beside DeepAccident: its scenes as a release, usable as any other.
 
-from deepaccident_devkit.plugins.nuscenes import open_nuscenes
+It needs the extra `nuscenes`:
 
-road = open_nuscenes("data/nuscenes/v1.0-mini")
-road.render_sample(road.samples("train", "all")[0])
+    from deepaccident_devkit.plugins.nuscenes import open_nuscenes
+
+    road = open_nuscenes("data/nuscenes/v1.0-mini")
+    road.render_sample(road.samples("train", "all")[0])
 """
 
 from deepaccident_devkit.plugins.nuscenes.classes import CLASSES, DETECTION_NAMES

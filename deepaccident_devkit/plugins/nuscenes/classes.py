@@ -1,7 +1,8 @@
-"""nuScenes' categories and ours: six of ours stand for five of its ten detection classes; all others are ignored.
+"""nuScenes' categories and ours.
 
-An ignored actor is there, and no background: it is neither learned nor counted, and in motion labels a vehicle is a
-vehicle, as by FIERY's rules.
+Six of ours stand for five of its ten detection classes; all others are ignored. An ignored actor is
+no background: it is neither learned nor counted, and in motion labels a vehicle is a vehicle, as in
+FIERY's rules.
 """
 
 from __future__ import annotations
@@ -31,7 +32,6 @@ DETECTION_NAMES: Final = MappingProxyType(
 
 
 def category_of(category: str) -> int:
-    """The index of our category for one of nuScenes'; of an ignored one, what it is most like."""
-    return CATEGORIES.index(
-        CLASSES.get(category, "truck" if category.startswith("vehicle.") else "pedestrian")
-    )
+    """Return the index of our category for one of nuScenes'; the most similar if ignored."""
+    similar = "truck" if category.startswith("vehicle.") else "pedestrian"
+    return CATEGORIES.index(CLASSES.get(category, similar))

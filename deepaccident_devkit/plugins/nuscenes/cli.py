@@ -22,20 +22,18 @@ from deepaccident_devkit.plugins.nuscenes.sensor_setups import sensor_setup_repo
 @figure_style_parameter
 @json_parameter
 def sensor_setups(first: Path, second: Path | None, out: Path | None, as_json: bool) -> None:
-    """Print what cameras and LiDAR of a source see, and how its boxes are spread; beside those of OTHER.
+    """Print what cameras and LiDAR of a source see, and how its boxes are spread; compare OTHER.
 
-    Each is a release or a dataroot of nuScenes. With OTHER, the last lines say what a model that learned on DATAROOT
-    will find odd in OTHER.
+    Each is a release or a dataroot of nuScenes. With OTHER, the last lines say what a model that
+    learned on DATAROOT will find odd in OTHER.
     """
-    report = sensor_setup_report(
-        *(open_release(each) for each in (first, second) if each is not None)
-    )
+    paths = [path for path in (first, second) if path is not None]
+    report = sensor_setup_report(*map(open_release, paths))
     click.echo(report.to_json() if as_json else report.to_text())
     if out is not None:
         from deepaccident_devkit.plugins.nuscenes.sensor_setup_figures import sensor_setups_figure
         from deepaccident_devkit.render.figures import write_report_figure
 
-        click.echo(
-            f"written: {write_report_figure(sensor_setups_figure(report), out)}", err=as_json
-        )
+        path = write_report_figure(sensor_setups_figure(report), out)
+        click.echo(f"written: {path}", err=as_json)
     sys.exit(report.exit_status)

@@ -1,4 +1,4 @@
-"""`NuScenesDataset`: the keyframes of a nuScenes split as items of a `V2XDataset` (the extra `torch` too)."""
+"""`NuScenesDataset`: keyframes of a nuScenes split as items of a `V2XDataset` (extra `torch`)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from deepaccident_devkit.training.torch import V2XConfig, V2XDataset
 
 
 class NuScenesDataset(V2XDataset):
-    """The keyframes of a split, each of one vehicle without partners; items are those of `V2XDataset`.
+    """The keyframes of a split, each of one vehicle without partners.
 
-    Categories are ours (`nuscenes.CLASSES`), −1 for boxes that are to be ignored.
+    Items are the same as in `V2XDataset`. Categories are ours (`nuscenes.CLASSES`), −1 for ignored
+    boxes.
     """
 
     def __init__(
@@ -26,13 +27,14 @@ class NuScenesDataset(V2XDataset):
         """Choose a split.
 
         Args:
-            nusc: what the nuScenes devkit has opened, a `nuscenes.NuScenes`; or a `NuScenesRelease`.
-            split: `train`, `val` or `test`; of the small version and of our export its own of that name.
-            config: the contents; None for those of `V2XConfig()`.
-            index_dir: of `open_nuscenes`.
+            nusc: A `nuscenes.NuScenes` that the nuScenes devkit has opened, or a `NuScenesRelease`.
+            split: `train`, `val` or `test`; the small version and our export have their own splits
+                of these names.
+            config: Contents of items; None for `V2XConfig()`.
+            index_dir: See `open_nuscenes`.
 
         Raises:
-            DeepAccidentError: as of `open_nuscenes`, `motion.samples` and `V2XDataset`.
+            DeepAccidentError: `open_nuscenes`, `motion.samples` or `V2XDataset` raises it.
         """
         release = nusc if isinstance(nusc, NuScenesRelease) else release_of(nusc, index_dir)
         super().__init__(release, release.samples(split, "all"), config)

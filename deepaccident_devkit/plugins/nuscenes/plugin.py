@@ -1,4 +1,4 @@
-"""What the plug-in `nuscenes` offers."""
+"""The offers of the plug-in `nuscenes`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detections as nuScenes' own evaluation reads them: one JSON file, boxes in the world."""
+"""Detections in the format of nuScenes' own evaluation: one JSON file, boxes in the world frame."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from deepaccident_devkit.plugins.nuscenes.source import NuScenesRelease
 from deepaccident_devkit.support.files import write_bytes
 
 NUSCENES_RESULTS_FILE: Final = "nuscenes_detections.json"
-# Boxes of a sample; nuScenes refuses more.
-_MOST: Final = 500
-# m/s, from which on an attribute says so.
-_MOVING: Final = 0.2
+# Largest number of boxes of a sample that nuScenes accepts.
+_MAX_BOXES: Final = 500
+# Speed in m/s above which an attribute calls an actor moving.
+_MIN_MOVING_SPEED: Final = 0.2
 _ATTRIBUTES: Final = {
     "pedestrian": ("pedestrian.standing", "pedestrian.moving"),
     **dict.fromkeys(("bicycle", "motorcycle"), ("cycle.without_rider", "cycle.with_rider")),
@@ -28,54 +28,51 @@ _ATTRIBUTES: Final = {
 
 
 def write_detections(release: DeepAccident, results: Path) -> Path:
-    """Write our detection results of keyframes beside them, as `nuscenes_detections.json`; the path.
+    """Write our detection results of keyframes to `nuscenes_detections.json` beside them.
 
-    nuScenes' evaluation wants all samples of its split: predict all of them.
+    Returns the path. nuScenes' evaluation requires all samples of its split: predict all of them.
 
     Raises:
-        ResultsError: they are of another task.
-        ConfigError: the release is not of nuScenes, or a sample is no keyframe.
-        DeepAccidentError: as of `read_results`.
+        ResultsError: The results are of another task.
+        ConfigError: The release is not of nuScenes, or a sample is no keyframe.
+        DeepAccidentError: `read_results` raises it.
     """
     if not isinstance(release, NuScenesRelease):
         raise ConfigError(
             f"{release.dataroot}: is no dataroot of nuScenes; open one with open_nuscenes"
         )
-    read = read_results(results)
-    if read.task != "detection":
-        raise ResultsError(f"{results}: has results of {read.task}; nuScenes evaluates detections")
-    found: dict[str, Any] = {
-        release.nuscenes_token(token): read.prediction(token) for token in read.tokens
+    content = read_results(results)
+    if content.task != "detection":
+        raise ResultsError(
+            f"{results}: has results of {content.task}; nuScenes evaluates detections"
+        )
+    detections: dict[str, Any] = {
+        release.nuscenes_token(token): content.prediction(token) for token in content.tokens
     }
-    preset = read.meta.get("model", {}).get("preset", "tiny")
+    preset = content.meta.get("model", {}).get("preset", "tiny")
     document = {
         "meta": {
             "use_camera": preset != "tiny_lidar",
             "use_lidar": preset in ("tiny_lidar", "tiny_both"),
             **dict.fromkeys(("use_radar", "use_map", "use_external"), False),
         },
-        "results": {token: _entries(token, boxes) for token, boxes in found.items()},
+        "results": {token: _entries(token, boxes) for token, boxes in detections.items()},
     }
     path = results.parent / NUSCENES_RESULTS_FILE
     write_bytes(path, json.dumps(document).encode())
     return path
 
 
-def _entries(token: str, found: DetectedBoxes) -> list[dict[str, Any]]:
+def _entries(token: str, detections: DetectedBoxes) -> list[dict[str, Any]]:
     """Return the best boxes of a sample, with nuScenes' classes and attributes."""
-    best = (-found.scores).argsort(kind="stable")[:_MOST]
-    entries = detection_entries(
-        token, DetectedBoxes(boxes=found.boxes.select(best), scores=found.scores[best])
-    )
+    best = (-detections.scores).argsort(kind="stable")[:_MAX_BOXES]
+    best_boxes = DetectedBoxes(boxes=detections.boxes.select(best), scores=detections.scores[best])
+    entries = detection_entries(token, best_boxes)
     for entry in entries:
-        name, velocity = (
-            DETECTION_NAMES[entry["detection_name"]],
-            entry["velocity"] or [math.nan, math.nan],
-        )
-        moving = math.hypot(*velocity) > _MOVING
-        entry |= {
-            "detection_name": name,
-            "velocity": velocity,
-            "attribute_name": _ATTRIBUTES[name][moving],
-        }
+        name = DETECTION_NAMES[entry["detection_name"]]
+        velocity = entry["velocity"] or [math.nan, math.nan]
+        is_moving = math.hypot(*velocity) > _MIN_MOVING_SPEED
+        entry["detection_name"] = name
+        entry["velocity"] = velocity
+        entry["attribute_name"] = _ATTRIBUTES[name][is_moving]
     return entries

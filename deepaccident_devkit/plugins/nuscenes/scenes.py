@@ -1,4 +1,4 @@
-"""One scene of nuScenes as the rows of our tables: frames at 10 Hz, of which its keyframes are every fifth one."""
+"""One scene of nuScenes as the rows of our tables: frames at 10 Hz, every fifth a keyframe."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from deepaccident_devkit.tables.build import scenario_rows
 from deepaccident_devkit.tables.scan import ScenarioFiles, ScenarioScan
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, IGNORED_ID
 
-# Whose recording a scene is.
+# The agent that records a scene.
 AGENT: Final = AGENTS[0]
-# Of the x and y of a quaternion: below, it is a turn about z alone.
-_LEAN: Final = 1e-6
-# nuScenes' visibility of a box of which the cameras see less than 40 %; FIERY takes it for unseen.
-_UNSEEN: Final = "1"
-# Seconds from a keyframe to the next one.
+# Largest x and y of a quaternion that only turns about z.
+_TILT_TOLERANCE: Final = 1e-6
+# nuScenes' visibility of a box that the cameras see to less than 40 %; FIERY takes it for unseen.
+_UNSEEN_VISIBILITY: Final = "1"
+# Smallest time from a keyframe to the next one.
 _MIN_GAP_S: Final = 1e-3
-# Seconds from a box to the next one of its object, beyond which nuScenes knows no velocity.
+# Largest time from a box to the next one of its object for which nuScenes has a velocity.
 _MAX_GAP_S: Final = 1.5
 _MIN_FOCAL_PX: Final = 0.5
-# How far from 1 the length of a quaternion may be.
+# Largest deviation of the length of a quaternion from 1.
 _UNIT_TOLERANCE: Final = 0.01
 
 
@@ -44,28 +44,28 @@ class NuScenesScene:
     """A scene, read and checked.
 
     Attributes:
-        frames: number of frames.
+        frames: Number of frames.
     """
 
     def __init__(self, source: NuScenesTables, row: Any) -> None:
-        """Read the scene of a row; raises DatarootError for a damaged row that it leads to."""
+        """Read the scene of a row; raise DatarootError for a damaged row that it refers to."""
         self._source, self._row = source, row
         self._samples = self._chain()
         self.frames = KEY_STEP * (len(self._samples) - 1) + 1
         boxes = [source.rows_of("sample_annotation", sample) for sample in self._samples]
         self._boxes = list(chain(*boxes))
-        self._keyframes = np.repeat(np.arange(len(boxes)), [len(of_sample) for of_sample in boxes])
+        num_boxes = [len(sample_boxes) for sample_boxes in boxes]
+        self._keyframes = np.repeat(np.arange(len(boxes)), num_boxes)
         self._rotations = self._quaternions(self._boxes)
         self._files = [self._channels(sample) for sample in self._samples]
         self._world_from_ego, self._ego_from_sensor = self._poses(LIDAR_CHANNEL)
-        self._ego_from_lidar = self._turned(
-            upright=bool((np.abs(self._rotations[:, 1:3]) < _LEAN).all())
-        )
-        self._calibs = self._all_calibs()
+        is_upright = bool((np.abs(self._rotations[:, 1:3]) < _TILT_TOLERANCE).all())
+        self._ego_from_lidar = self._turned_lidar(upright=is_upright)
+        self._calibs = self._interpolated_calibs()
         self._columns = self._box_columns()
 
     def _chain(self) -> list[Any]:
-        """Return the samples in the order of their times, in which each must lead to the next one."""
+        """Return the samples in order of time; each must lead to the next one."""
         source, scene = self._source, self._row
         samples = sorted(source.rows_of("sample", scene), key=lambda sample: sample.timestamp)
         tokens = [*(sample.token for sample in samples), ""]
@@ -99,11 +99,11 @@ class NuScenesScene:
 
     def _poses(self, channel: str) -> list[FloatArray]:
         """Return `world_from_ego` and `ego_from_sensor` (K, 4, 4) of a sensor at its keyframes."""
-        files = [of_sample[channel] for of_sample in self._files]
-        return [
-            self._matrices([self._source.follow(file, field) for file in files])
-            for field in ("ego_pose_token", "calibrated_sensor_token")
-        ]
+        files = [sample_files[channel] for sample_files in self._files]
+        poses = []
+        for field in ("ego_pose_token", "calibrated_sensor_token"):
+            poses.append(self._matrices([self._source.follow(file, field) for file in files]))
+        return poses
 
     def _matrices(self, rows: Sequence[Any]) -> FloatArray:
         """Return the transforms (N, 4, 4) of rows with translation and rotation."""
@@ -113,7 +113,7 @@ class NuScenesScene:
         return result
 
     def _quaternions(self, rows: Sequence[Any]) -> FloatArray:
-        """Return the rotations (N, 4) of rows; raises DatarootError for one that is none."""
+        """Return the rotations (N, 4) of rows; raise DatarootError for an invalid one."""
         rotations = np.reshape([row.rotation for row in rows], (-1, 4))
         errors = np.abs(np.linalg.norm(rotations, axis=1) - 1)
         if errors.max(initial=0) > _UNIT_TOLERANCE:
@@ -123,33 +123,36 @@ class NuScenesScene:
             )
         return rotations
 
-    def _turned(self, *, upright: bool) -> FloatArray:
-        """Return `ego_from_lidar` (K, 4, 4): x forward, and upright in the world if all boxes are."""
+    def _turned_lidar(self, *, upright: bool) -> FloatArray:
+        """Return `ego_from_lidar` (K, 4, 4) with x forward; if `upright`, upright in the world."""
         result = self._ego_from_sensor.copy()
-        turn = result[:, :3, :3]
+        rotation = result[:, :3, :3]
         if upright:
             world = self._world_from_ego[:, :3, :3]
-            turn[:] = np.swapaxes(world, 1, 2) @ _about_z(_heading(world))
+            rotation[:] = np.swapaxes(world, 1, 2) @ _about_z(_heading(world))
         else:
-            turn[:] = turn @ _about_z(-_heading(turn))
+            rotation[:] = rotation @ _about_z(-_heading(rotation))
         return result
 
-    def files(self, first: int) -> Iterator[tuple[int, str, str, list[float]]]:
-        """Yield row of `sample_data`, file, nuScenes' token of the sample, and its `lidar_from_sensor`.
+    def files(self, first_row: int) -> Iterator[tuple[int, str, str, list[float]]]:
+        """Yield the files of keyframes as rows of `_FILES`.
 
-        `first` is the row of the scene's first sample.
+        These are row of `sample_data`, file, nuScenes' token of the sample, and its
+        `lidar_from_sensor`. `first_row` is the row of the scene's first sample.
         """
-        matrices = (inverses(self._ego_from_lidar) @ self._ego_from_sensor).reshape(-1, 16).tolist()
-        for number, (sample, files, matrix) in enumerate(
-            zip(self._samples, self._files, matrices, strict=True)
-        ):
+        lidar_from_sensor = inverses(self._ego_from_lidar) @ self._ego_from_sensor
+        matrices = lidar_from_sensor.reshape(-1, 16).tolist()
+        keyframes = zip(self._samples, self._files, matrices, strict=True)
+        for number, (sample, files, matrix) in enumerate(keyframes):
             for channel, name in CHANNEL_NAMES.items():
-                row = (first + KEY_STEP * number) * len(CHANNELS) + CHANNELS.index(channel)
+                sample_row = first_row + KEY_STEP * number
+                row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
                 yield row, files[name].filename, sample.token, matrix
 
     def rows(self, *, every_class: bool) -> dict[str, ColumnArrays]:
-        """Return the rows of all tables, with boxes of all classes or of ours only."""
-        place = ScenarioFolder(self._source.folder.parent, "", "nuscenes", self._row.name, (AGENT,))
+        """Return the rows of all tables, with boxes of all classes or only of ours."""
+        folder = self._source.folder.parent
+        scenario = ScenarioFolder(folder, "", "nuscenes", self._row.name, (AGENT,))
         scan = ScenarioScan(
             agents=(AGENT,),
             has_meta=False,
@@ -158,28 +161,24 @@ class NuScenesScene:
             problems=(),
             notices=(),
         )
-        is_key = np.arange(self.frames) % KEY_STEP == 0
-        times = np.interp(
-            np.arange(self.frames), np.flatnonzero(is_key), self._stamps - self._stamps[0]
-        ).round(6)
-        chosen = (self._columns["actor_id"] < IGNORED_ID) | every_class
-        moved = np.diff(self._calibs.world_from_ego[:, :2, 3], axis=0, append=np.nan)
+        frames = np.arange(self.frames)
+        is_key = frames % KEY_STEP == 0
+        key_times = self._stamps - self._stamps[0]
+        times = np.interp(frames, np.flatnonzero(is_key), key_times).round(6)
+        is_included = (self._columns["actor_id"] < IGNORED_ID) | every_class
+        steps = np.diff(self._calibs.world_from_ego[:, :2, 3], axis=0, append=np.nan)
+        box_frames = KEY_STEP * self._keyframes[is_included]
         labels = Labels(
             raw=False,
-            num_boxes=np.bincount(KEY_STEP * self._keyframes[chosen], minlength=self.frames),
-            agent_velocity=moved / np.diff(times, append=np.nan)[:, None],
-            **{name: column[chosen] for name, column in self._columns.items()},
+            num_boxes=np.bincount(box_frames, minlength=self.frames),
+            agent_velocity=steps / np.diff(times, append=np.nan)[:, None],
+            **{name: column[is_included] for name, column in self._columns.items()},
         )
         rows = scenario_rows(
-            ScenarioFiles(scenario=place, scan=scan, meta=None, calibs=self._calibs, labels=labels)
-        )
-        images = [self._files[0][channel] for channel in CAMERA_CHANNELS.values()]
-        sizes = {}
-        for side in ("width", "height"):  # K says only where their middle may be
-            others = rows["sample_data"][side][len(images) : len(CHANNELS)]
-            sizes[side] = np.tile(
-                [*(getattr(image, side) for image in images), *others], self.frames
+            ScenarioFiles(
+                scenario=scenario, scan=scan, meta=None, calibs=self._calibs, labels=labels
             )
+        )
         own_columns: dict[str, ColumnArrays] = {
             "scenario": {"town": [self._source.follow(self._row, "log_token").location]},
             "frame": {"timestamp": times},
@@ -188,41 +187,59 @@ class NuScenesScene:
                 "time_to_end": times[-1] - times,
                 "labelled": is_key & bool(self._boxes),
             },
-            "sample_data": sizes,
+            "sample_data": self._image_sizes(rows["sample_data"]),
             "ego_pose": {"timestamp": times},
         }
         return {table: {**columns, **own_columns.get(table, {})} for table, columns in rows.items()}
 
-    def _all_calibs(self) -> Calibs:
-        """Return those of all frames: poses between keyframes are interpolated, sensors stay as at the one before."""
+    def _image_sizes(self, sample_data: ColumnArrays) -> dict[str, Any]:
+        """Return the width and height of `sample_data`, with the true sizes of images.
+
+        The intrinsic matrix only shows where their centre may be.
+        """
+        images = [self._files[0][channel] for channel in CAMERA_CHANNELS.values()]
+        sizes = {}
+        for side in ("width", "height"):
+            other_sizes = sample_data[side][len(images) : len(CHANNELS)]
+            values = [*(getattr(image, side) for image in images), *other_sizes]
+            sizes[side] = np.tile(values, self.frames)
+        return sizes
+
+    def _interpolated_calibs(self) -> Calibs:
+        """Return the calibrations of all frames.
+
+        Poses between keyframes are interpolated, sensors stay as at the keyframe before.
+        """
         from scipy.spatial.transform import Rotation
 
-        world = self._world_from_ego
+        key_poses = self._world_from_ego
         before, step = np.divmod(np.arange(self.frames), KEY_STEP)
         after, share = before + (step > 0), step[:, None] / KEY_STEP
-        turns = Rotation.from_matrix(world[:, :3, :3])
-        turn = (turns[before].inv() * turns[after]).as_rotvec()
-        moved = world[before]
-        moved[:, :3, 3] += share * (world[after] - moved)[:, :3, 3]
-        moved[:, :3, :3] = (turns[before] * Rotation.from_rotvec(share * turn)).as_matrix()
-        moved[step == 0] = world
+        rotations = Rotation.from_matrix(key_poses[:, :3, :3])
+        turn = (rotations[before].inv() * rotations[after]).as_rotvec()
+        poses = key_poses[before]
+        poses[:, :3, 3] += share * (key_poses[after] - poses)[:, :3, 3]
+        poses[:, :3, :3] = (rotations[before] * Rotation.from_rotvec(share * turn)).as_matrix()
+        poses[step == 0] = key_poses
         cameras, intrinsics = [], []
         for channel in CAMERA_CHANNELS.values():
-            then, ego_from_camera = self._poses(channel)
-            ego_then = (
-                inverses(then @ ego_from_camera) @ world
-            )  # the camera's ego is where it was at its own time
-            cameras.append(ego_then @ self._ego_from_lidar)
+            # A camera's ego is where it was at the camera's own time.
+            world_from_camera_ego, ego_from_camera = self._poses(channel)
+            camera_from_ego = inverses(world_from_camera_ego @ ego_from_camera) @ key_poses
+            cameras.append(camera_from_ego @ self._ego_from_lidar)
             intrinsics.append(np.stack([self._intrinsic(files[channel]) for files in self._files]))
         return Calibs(
             ego_from_lidar=self._ego_from_lidar[before],
-            world_from_ego=moved,
+            world_from_ego=poses,
             camera_from_lidar=np.stack(cameras, axis=1)[before],
             intrinsic=np.stack(intrinsics, axis=1)[before],
         )
 
     def _intrinsic(self, image: Any) -> FloatArray:
-        """Return the intrinsic matrix (3, 3) of an image; raises DatarootError if it or its size is none."""
+        """Return the intrinsic matrix (3, 3) of an image.
+
+        Raises DatarootError if it or the image's size is invalid.
+        """
         mount = self._source.follow(image, "calibrated_sensor_token")
         matrix = np.array(mount.camera_intrinsic)
         if matrix.shape != (3, 3) or matrix.diagonal().min() < _MIN_FOCAL_PX:
@@ -241,29 +258,30 @@ class NuScenesScene:
         names = [follow(follow(box, "instance_token"), "category_token").name for box in boxes]
         world_from_lidar = calibs.world_from_ego @ calibs.ego_from_lidar
         lidar_from_world = inverses(world_from_lidar)[KEY_STEP * self._keyframes]
-        turn = lidar_from_world[:, :3, :3]
-        yaw = _heading(turn @ quaternions.to_matrix(self._rotations))
+        rotation = lidar_from_world[:, :3, :3]
+        yaw = _heading(rotation @ quaternions.to_matrix(self._rotations))
         center = np.reshape([box.translation for box in boxes], (-1, 3))
         ids, velocity = self._tracks(center[:, :2])
         ids += np.array([name not in CLASSES for name in names], dtype=bool) * IGNORED_ID
         return {
             "category": np.array([category_of(name) for name in names], dtype=np.int8),
-            "center": (turn @ center[:, :, None])[..., 0] + lidar_from_world[:, :3, 3],
+            "center": (rotation @ center[:, :, None])[..., 0] + lidar_from_world[:, :3, 3],
             "size": np.reshape([box.size for box in boxes], (-1, 3))[:, [1, 0, 2]],
             "yaw": yaw,
             "velocity": label_from_world_velocity(velocity, yaw),
             "actor_id": ids,
             "num_lidar_pts": np.array([box.num_lidar_pts for box in boxes], dtype=np.int64),
             "camera_visible": np.array(
-                [box.visibility_token != _UNSEEN for box in boxes], dtype=bool
+                [box.visibility_token != _UNSEEN_VISIBILITY for box in boxes], dtype=bool
             ),
         }
 
-    def _tracks(self, places: FloatArray) -> tuple[IntArray, FloatArray]:
+    def _tracks(self, positions: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return numbers (N,) of actors as they appear, and velocities (N, 2) in the world, m/s.
 
-        As in nuScenes, a velocity is that from the actor's box before to its box after, NaN where these are too far
-        apart in time. Raises DatarootError if an actor has two boxes at a keyframe.
+        As in nuScenes, a velocity is taken from the actor's previous box to its next box, NaN where
+        these are too far apart in time. Raises DatarootError if an actor has two boxes at a
+        keyframe.
         """
         times, tracks = self._stamps[self._keyframes], defaultdict(list)
         ids, velocity = np.zeros(len(times), dtype=np.int64), np.full((len(times), 2), np.nan)
@@ -280,15 +298,15 @@ class NuScenesScene:
                     )
                 seconds = times[after] - times[before]
                 if 0 < seconds <= _MAX_GAP_S * ((before < row) + (row < after)):
-                    velocity[row] = (places[after] - places[before]) / seconds
+                    velocity[row] = (positions[after] - positions[before]) / seconds
         return ids, velocity
 
 
-def _heading(turn: FloatArray) -> FloatArray:
-    """Where x points, about z (N,), of rotations (N, 3, 3)."""
-    return np.asarray(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
+def _heading(rotation: FloatArray) -> FloatArray:
+    """Return the angle of x about z (N,) of rotations (N, 3, 3)."""
+    return np.asarray(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
 
 
 def _about_z(angle: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) about z."""
+    """Return the rotations (N, 3, 3) about z."""
     return quaternions.to_matrix(quaternions.from_yaw(angle))

@@ -1,4 +1,4 @@
-"""nuScenes' tables as records: read once, and checked while they are read; an error names the table and the row.
+"""nuScenes' tables as records, read and checked at once; an error names the table and the row.
 
 Only the fields that keyframes use are read, and other tables are not.
 """
@@ -20,7 +20,7 @@ from deepaccident_devkit.support.reading import fault_text, read_bytes
 NUSCENES_REMEDY: Final = "unpack the tables again, or correct what wrote them"
 _COORDINATE = Annotated[float, Meta(ge=-1e8, le=1e8)]
 _LENGTH = Annotated[float, Meta(gt=0, le=1e3)]
-_TURN = Annotated[float, Meta(ge=-1.1, le=1.1)]
+_QUATERNION_PART = Annotated[float, Meta(ge=-1.1, le=1.1)]
 _PIXELS = Annotated[int, Meta(ge=0, le=65535)]
 _NAME = Annotated[str, Meta(pattern=r"\A[^/\x00-\x1f\x7f]+\Z", max_length=200)]
 _VECTOR = tuple[_COORDINATE, _COORDINATE, _COORDINATE]
@@ -29,7 +29,7 @@ _FIELD_TYPES: Final[Mapping[str, Any]] = {
     "location": _NAME,
     "timestamp": Annotated[float, Meta(ge=0, le=1 << 53)],
     "translation": _VECTOR,
-    "rotation": tuple[_TURN, _TURN, _TURN, _TURN],
+    "rotation": tuple[_QUATERNION_PART, _QUATERNION_PART, _QUATERNION_PART, _QUATERNION_PART],
     "size": tuple[_LENGTH, _LENGTH, _LENGTH],
     "camera_intrinsic": Annotated[list[_VECTOR], Meta(max_length=3)],
     "is_key_frame": bool,
@@ -40,9 +40,10 @@ _FIELD_TYPES: Final[Mapping[str, Any]] = {
     "height": _PIXELS,
     "num_lidar_pts": Annotated[int, Meta(ge=0, le=1 << 31)],
 }
-"""Field → its values; all others are texts. Metres, microseconds, quaternions w, x, y, z, sizes width, length, height.
+"""Field → type of its values; all other fields are texts.
 
-A file name leads to nothing above the dataroot.
+Metres, microseconds, quaternions w, x, y, z, sizes width, length, height. A file name leads to
+nothing above the dataroot.
 """
 # Table → the fields that are read, besides the token.
 _FIELDS: Final = {
@@ -54,10 +55,12 @@ _FIELDS: Final = {
     "ego_pose": "translation rotation",
     "category": "name",
     "instance": "category_token",
-    "sample_data": "sample_token ego_pose_token calibrated_sensor_token filename is_key_frame width height",
-    "sample_annotation": "sample_token instance_token visibility_token translation rotation size num_lidar_pts",
+    "sample_data": "sample_token ego_pose_token calibrated_sensor_token filename is_key_frame "
+    "width height",
+    "sample_annotation": "sample_token instance_token visibility_token translation rotation size "
+    "num_lidar_pts",
 }
-# Table → the field that says to what its rows belong.
+# Table → the field with the owner of its rows.
 _OWNERS: Final = {
     "sample": "scene_token",
     "sample_data": "sample_token",
@@ -69,35 +72,36 @@ class NuScenesTables:
     """The tables of a version of nuScenes.
 
     Attributes:
-        folder: of the tables.
-        rows: table → token → row, in the order of the table.
+        folder: Folder of the tables.
+        rows: Table → token → row, in the order of the table.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Read the tables; raises DatarootError for a damaged row, and for one that belongs to no other."""
+        """Read the tables; raise DatarootError for a damaged row, and for one without an owner."""
         self.folder = folder
         self.rows = {table: self._read(table, fields.split()) for table, fields in _FIELDS.items()}
-        self._belonging: dict[tuple[str, str], list[Any]] = defaultdict(list)
+        self._rows_by_owner: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for table, field in _OWNERS.items():
             for row in self.rows[table].values():
                 owner = self.follow(row, field)
-                self._belonging[table, owner.token].append(row)
+                self._rows_by_owner[table, owner.token].append(row)
 
     def follow(self, row: Any, field: str) -> Any:
-        """Return the row that a field such as `scene_token` leads to; raises DatarootError if there is none."""
+        """Return the row that a field such as `scene_token` leads to; raise DatarootError."""
         token, table = getattr(row, field), field.removesuffix("_token")
         if token not in self.rows[table]:
             raise self.error(row, f"{field}: {table}.json has no {shortened(token)!r}")
         return self.rows[table][token]
 
     def rows_of(self, table: str, owner: Any) -> list[Any]:
-        """Return the rows of a table that belong to a scene or sample, in the order of the table."""
-        return self._belonging[table, owner.token]
+        """Return the rows of a table that belong to a scene or sample, in the table's order."""
+        return self._rows_by_owner[table, owner.token]
 
     def error(self, row: Any, fault: str) -> DatarootError:
         """Return the error of a row; the fault begins with a field."""
         return DatarootError(
-            f"{self.folder / type(row).__name__}.json: {shortened(row.token)}: {fault}; {NUSCENES_REMEDY}"
+            f"{self.folder / type(row).__name__}.json: {shortened(row.token)}: {fault}; "
+            f"{NUSCENES_REMEDY}"
         )
 
     def _read(self, table: str, fields: list[str]) -> dict[str, Any]:
@@ -114,16 +118,16 @@ class NuScenesTables:
 
 
 def read_table(path: Path, kind: Any) -> Any:
-    """Return what the JSON of a table says; raises DatarootError if it cannot be read, or is of another kind."""
+    """Return the content of a table's JSON.
+
+    Raises DatarootError if it cannot be read, or is of another kind.
+    """
     try:
         content = read_bytes(path, "tables")
         try:
             return msgspec.json.decode(content, type=kind)
-        except (
-            msgspec.DecodeError,
-            RecursionError,
-            UnicodeDecodeError,
-        ):  # NaN, too, which Python writes
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            # The slow parser also accepts NaN, which Python writes.
             return as_record(parsed_json(content, constants=True), kind)
     except (OSError, ValueError) as error:
         raise DatarootError(f"{path}: {fault_text(error)}; {NUSCENES_REMEDY}") from error

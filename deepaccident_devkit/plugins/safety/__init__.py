@@ -1,4 +1,4 @@
-"""Accidents looked into: who saw the danger first, when it was too late, what a warning would have prevented."""
+"""Analyses of accidents: who saw the danger first, and what warnings would have prevented."""
 
 from deepaccident_devkit.plugins.safety.avoidability_report import (
     AvoidabilityReport,

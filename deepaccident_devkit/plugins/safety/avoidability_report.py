@@ -1,4 +1,7 @@
-"""What braking would have changed in the accidents of a release: shares of outcomes, and `avoidability_report`."""
+"""What braking would have changed in the accidents of a release.
+
+Has the shares of outcomes (`outcome_shares`), and `avoidability_report`.
+"""
 
 from __future__ import annotations
 
@@ -45,32 +48,48 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 
-# Kinds of accidents that are counted apart: with a pedestrian, who does not brake as a vehicle does; of vehicles that
-# meet head-on, where it matters most how the other goes on if one of them brakes; and all others.
+# Kinds of accidents that are counted separately: with a pedestrian, which does not brake as a
+# vehicle does; of vehicles that meet head-on, where it matters most how the other goes on if one of
+# them brakes; and all others.
 ACCIDENT_GROUPS: Final = ("vehicles", "head-on", "pedestrians")
-# Who is warned and brakes; `ego` alone counts only the accidents of the ego.
+# The drivers that are warned and brake; `ego` counts only the accidents of the ego.
 WARNED: Final = (*BRAKERS, "ego")
-# Shares of accidents for which the text gives the seconds of warning that they need.
-_SHARES: Final = (0.5, 0.9)
+# Shares of accidents for which the text states the seconds of warning that they need.
+_TEXT_SHARES: Final = (0.5, 0.9)
+# Columns of the table of last moments.
+_LAST_MOMENT_COLUMNS: Final = (
+    "brakers",
+    "deceleration",
+    "avoidable",
+    "last_moment",
+    "slack",
+    "switches",
+    "extrapolated",
+)
+# Columns of the table of contacts with other actors.
+_SECONDARY_COLUMNS: Final = ("actor_id", "other_id", "category", "time", "extrapolated")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OutcomeShares(FrozenArrays):
     """Shares of outcomes over a group of accidents, for L leads of the warning and K ways to brake.
 
-    Accidents whose recording is shorter than a lead do not count at it. Arrays are read-only; NaN where none counts.
+    Accidents with a recording shorter than a lead do not count at it. Arrays are read-only; NaN
+    where no accident counts.
 
     Attributes:
-        group: one of `ACCIDENT_GROUPS`.
-        warned: one of `WARNED`.
-        brakings: the K ways to brake.
-        leads: (L,) seconds from the warning to the end of the recording: 0, 0.1, …
-        accidents: (L,) how many count.
-        shares: (L, K, 5) of `OUTCOMES`.
-        extrapolated: (L, K) share in which they touch only after the end of the recording.
-        relative_speed: (L, K) mean over all of these of the speed between the two at the contact, m/s; 0 if avoided.
-        delta_v: (L, K, 3) the same of the larger delta-v of the two: with the assumed masses; the least and the most
-            with masses that are wrong by up to `MASS_UNCERTAINTY`.
+        group: One of `ACCIDENT_GROUPS`.
+        warned: One of `WARNED`.
+        brakings: The K ways to brake.
+        leads: Seconds from the warning to the end of the recording, shape (L,): 0, 0.1, …
+        accidents: Number of accidents that count, shape (L,).
+        shares: Share of each of `OUTCOMES`, shape (L, K, 5).
+        extrapolated: Share in which they touch only after the end of the recording, shape (L, K).
+        relative_speed: Mean speed in m/s between the two at the contact over all of these
+            accidents, shape (L, K); 0 if avoided.
+        delta_v: Mean of the larger delta-v of the two in m/s, shape (L, K, 3): with the assumed
+            masses, and the smallest and the largest with masses that are wrong by up to
+            `MASS_UNCERTAINTY`.
     """
 
     group: str
@@ -85,73 +104,85 @@ class OutcomeShares(FrozenArrays):
 
 
 def group_of(accident: Avoidability) -> str:
-    """The one of `ACCIDENT_GROUPS` that an accident is counted in."""
+    """Return the one of `ACCIDENT_GROUPS` that an accident is counted in."""
     if accident.pedestrian:
         return "pedestrians"
-    return "head-on" if accident.head_on else "vehicles"
+    if accident.head_on:
+        return "head-on"
+    return "vehicles"
 
 
 def outcomes_if_warned(accident: Avoidability, warned: str) -> Outcomes | None:
-    """What warnings of the one of `WARNED` change; None if the ego is to be warned and is not of the pair."""
+    """Return what warnings change, for one of `WARNED`; None for an ego that is not of the pair."""
     if warned != "ego":
         return accident.outcomes[BRAKERS.index(warned)]
     agents = accident.accident.agents
-    return accident.outcomes[agents.index("ego_vehicle")] if "ego_vehicle" in agents else None
+    if "ego_vehicle" in agents:
+        return accident.outcomes[agents.index("ego_vehicle")]
+    return None
 
 
 def outcome_shares(accidents: Sequence[Avoidability]) -> list[OutcomeShares]:
-    """The shares of outcomes of each group of accidents and for each who is warned; groups without any are left out.
+    """Return the shares of outcomes by group of accidents and by warned drivers.
+
+    Groups without any accident are left out.
 
     Args:
-        accidents: computed for the same ways to brake.
+        accidents: Accidents computed for the same ways to brake.
     """
-    told = {
-        (group, warned): [
-            (each, found)
-            for each in accidents
-            if group_of(each) == group and (found := outcomes_if_warned(each, warned)) is not None
-        ]
-        for group, warned in product(ACCIDENT_GROUPS, WARNED)
-    }
-    return [_shares(group, warned, those) for (group, warned), those in told.items() if those]
+    shares = []
+    for group, warned in product(ACCIDENT_GROUPS, WARNED):
+        members = []
+        for accident in accidents:
+            if group_of(accident) == group:
+                outcomes = outcomes_if_warned(accident, warned)
+                if outcomes is not None:
+                    members.append((accident, outcomes))
+        if members:
+            shares.append(_group_shares(group, warned, members))
+    return shares
 
 
-def _shares(
-    group: str, warned: str, told: Sequence[tuple[Avoidability, Outcomes]]
+def _group_shares(
+    group: str, warned: str, members: Sequence[tuple[Avoidability, Outcomes]]
 ) -> OutcomeShares:
-    brakings = told[0][0].brakings
-    longest = max(len(outcomes.outcome) for _, outcomes in told)
-    sums = np.zeros((longest, len(brakings), len(OUTCOMES) + 5))
-    accidents = np.zeros(longest, dtype=np.int64)
-    for accident, outcomes in told:
+    brakings = members[0][0].brakings
+    num_leads = max(len(outcomes.outcome) for _, outcomes in members)
+    sums = np.zeros((num_leads, len(brakings), len(OUTCOMES) + 5))
+    accidents = np.zeros(num_leads, dtype=np.int64)
+    for accident, outcomes in members:
         rows = slice(0, len(outcomes.outcome))
         accidents[rows] += 1
-        sums[rows] += _figures(accident, outcomes)
+        sums[rows] += _accident_figures(accident, outcomes)
     means = sums / accidents[:, None, None]
-    shares, extrapolated, relative, delta_v = np.split(
+    shares, extrapolated, relative_speed, delta_v = np.split(
         means, np.cumsum([len(OUTCOMES), 1, 1]), axis=2
     )
     return OutcomeShares(
         group=group,
         warned=warned,
         brakings=brakings,
-        leads=as_floats(np.arange(longest) * FRAME_PERIOD),
+        leads=as_floats(np.arange(num_leads) * FRAME_PERIOD),
         accidents=accidents,
         shares=shares,
         extrapolated=extrapolated[..., 0],
-        relative_speed=relative[..., 0],
+        relative_speed=relative_speed[..., 0],
         delta_v=delta_v,
     )
 
 
-def _figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
-    """(L, K, 10) of one accident: each outcome 0 or 1, extrapolated 0 or 1, relative speed, delta-v, least, most."""
-    relative = outcomes.delta_v.sum(axis=-1)  # the shares of the two add up to 1
-    ranges = delta_v_ranges(accident.accident.masses, relative).max(axis=-2)
-    classes = outcomes.outcome[..., None] == np.arange(len(OUTCOMES))
-    return np.dstack(
-        [classes, outcomes.extrapolated, relative, outcomes.delta_v.max(axis=-1), ranges]
-    )
+def _accident_figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
+    """Return the figures of one accident, shape (L, K, 10).
+
+    They are 0 or 1 for each outcome, 0 or 1 for extrapolated, the relative speed, and the delta-v
+    with its smallest and its largest value.
+    """
+    # The shares of the two add up to 1, so their sum is the relative speed.
+    relative_speed = outcomes.delta_v.sum(axis=-1)
+    ranges = delta_v_ranges(accident.accident.masses, relative_speed).max(axis=-2)
+    is_outcome = outcomes.outcome[..., None] == np.arange(len(OUTCOMES))
+    delta_v = outcomes.delta_v.max(axis=-1)
+    return np.dstack([is_outcome, outcomes.extrapolated, relative_speed, delta_v, ranges])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,12 +190,13 @@ class AvoidabilityReport(Report):
     """When accidents could have been avoided by braking.
 
     Attributes:
-        dataroot: the release's folder.
+        dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        accidents: those whose recording shows them, in the release's order.
-        dropped: those whose recording does not: the two are too far apart at the end.
-        skipped: scenarios of which meta or labels are missing.
-        margins: scenario → metres between the two at the last frame, for all accidents, dropped ones too.
+        accidents: Accidents that their recordings show, in the release's order.
+        dropped: Accidents that their recordings do not show: the two are too far apart at the end.
+        skipped: Scenarios without meta or labels.
+        margins: Scenario → metres between the two at the last frame, for all accidents, dropped
+            ones too.
     """
 
     dataroot: str
@@ -176,24 +208,26 @@ class AvoidabilityReport(Report):
 
     @property
     def shares(self) -> list[OutcomeShares]:
-        """Shares of outcomes by the seconds of warning, for each group of accidents and for each who is warned."""
+        """Shares of outcomes by the seconds of warning, for each group and all warned drivers."""
         return outcome_shares(self.accidents)
 
     def to_dict(self) -> dict[str, Any]:
-        """Values for JSON: counts, what is left out and why, and the last moments of each accident."""
+        """Return the values for JSON: counts, omissions with reasons, and the last moments."""
+        accidents = [
+            {"group": group_of(accident), **accident.to_dict(warnings=False)}
+            for accident in self.accidents
+        ]
         return {
             "dataroot": self.dataroot,
             "version": self.version,
-            "dropped": {each.scenario: each.reason for each in self.dropped},
-            "skipped": {each.scenario: each.reason for each in self.skipped},
+            "dropped": {dropped.scenario: dropped.reason for dropped in self.dropped},
+            "skipped": {skipped.scenario: skipped.reason for skipped in self.skipped},
             "margins": dict(self.margins),
-            "accidents": [
-                {"group": group_of(each), **each.to_dict(warnings=False)} for each in self.accidents
-            ],
+            "accidents": accidents,
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
-        """Last moments, contacts with others, shares of outcomes, the self-check, and what is left out."""
+        """Return last moments, other contacts, outcome shares, the self-check, and omissions."""
         return {
             "avoidability_last_moments": self._last_moment_rows(),
             "avoidability_secondary_contacts": self._secondary_rows(),
@@ -203,66 +237,72 @@ class AvoidabilityReport(Report):
         }
 
     def to_text(self) -> str:
-        """Some aligned blocks for a terminal."""
+        """Return some aligned blocks for a terminal."""
         left_out = {
             "dropped, as the two are too far apart at the end": self.dropped,
             "skipped": self.skipped,
         }
-        counts = [
-            f"{len(self.accidents)} accidents",
-            *(f"{len(each)} {word}" for word, each in left_out.items() if each),
-        ]
-        blocks = [f"DeepAccident {self.version} at {self.dataroot}\n{'; '.join(counts)}"]
+        counts = [f"{len(self.accidents)} accidents"]
+        for title, omissions in left_out.items():
+            if omissions:
+                counts.append(f"{len(omissions)} {title}")
+        head = f"DeepAccident {self.version} at {self.dataroot}\n{'; '.join(counts)}"
         if self.accidents:
-            blocks[0] += f"\n{counted_text([each.accident.touching for each in self.accidents])}"
+            touching = [accident.accident.touching for accident in self.accidents]
+            head += f"\n{counted_text(touching)}"
+        blocks = [head]
         blocks += [self._group_text(group) for group in ACCIDENT_GROUPS if self.members(group)]
         if self.margins:
             blocks.append(self._margins_text())
-        blocks += [reasons_text(word, which) for word, which in left_out.items() if which]
+        for title, omissions in left_out.items():
+            if omissions:
+                blocks.append(reasons_text(title, omissions))
         return "\n\n".join(blocks)
 
     @property
     def margin_counts(self) -> dict[str, int]:
-        """Size in words → how many of the `margins` are of that size."""
+        """Size in words → number of `margins` of that size."""
         bounds = [0, 0.01, 0.1, 0.5, MOST_MARGIN]
         counts = np.histogram(list(self.margins.values()), bins=[*bounds, np.inf])[0].tolist()
         names = [f"below {bound:g} m" for bound in bounds[1:]] + [f"{MOST_MARGIN:g} m or more"]
         return dict(zip(names, counts, strict=True))
 
     def members(self, group: str) -> list[Avoidability]:
-        """The accidents of one of `ACCIDENT_GROUPS`."""
-        return [each for each in self.accidents if group_of(each) == group]
+        """Return the accidents of one of `ACCIDENT_GROUPS`."""
+        return [accident for accident in self.accidents if group_of(accident) == group]
 
     def _group_text(self, group: str) -> str:
-        """A line for each who brakes and how hard: how many are avoidable, and how much warning they need."""
+        """Return how many accidents braking avoids, and how much warning they need.
+
+        There is a line for each way to choose the braking drivers and the deceleration.
+        """
         members = self.members(group)
         reactions = sorted({braking.reaction for braking in members[0].brakings})
         heading = ["brakes", "m/s²", "avoidable", "hit only after the end"]
-        rows = [heading + [f"reaction {each:g} s" for each in reactions]]
-        slack = np.stack([each.slack for each in members])
-        extrapolated = np.stack([each.last_moments.extrapolated for each in members]).reshape(
-            slack.shape
-        )
+        rows = [heading + [f"reaction {reaction:g} s" for reaction in reactions]]
+        slack = np.stack([accident.slack for accident in members])
+        extrapolated = np.stack([accident.last_moments.extrapolated for accident in members])
+        extrapolated = extrapolated.reshape(slack.shape)
         for row, brakers in enumerate(BRAKERS):
             for column, deceleration in enumerate(members[0].decelerations.tolist()):
-                needed = np.sort(slack[:, row, column])  # those that nothing avoids are last
-                places = [int(np.ceil(share * len(needed))) - 1 for share in _SHARES]
-                counts = (np.isfinite(needed).sum(), extrapolated[:, row, column].sum())
-                cells = [
-                    " / ".join(_seconds_text(needed[place] + each) for place in places)
-                    for each in reactions
-                ]
-                rows.append(
-                    [brakers, f"{deceleration:g}", *(str(count) for count in counts), *cells]
-                )
-        meant = " and ".join(f"{share:.0%}" for share in _SHARES)
+                seconds = np.sort(slack[:, row, column])  # accidents that nothing avoids come last
+                ranks = [int(np.ceil(share * len(seconds))) - 1 for share in _TEXT_SHARES]
+                avoidable = np.isfinite(seconds).sum()
+                later = extrapolated[:, row, column].sum()
+                cells = [brakers, f"{deceleration:g}", str(avoidable), str(later)]
+                for reaction in reactions:
+                    texts = [_seconds_text(seconds[rank] + reaction) for rank in ranks]
+                    cells.append(" / ".join(texts))
+                rows.append(cells)
+        share_text = " and ".join(f"{share:.0%}" for share in _TEXT_SHARES)
         return (
-            f"{group}: {len(members)} accidents; seconds of warning that {meant} of them need\n{columns_text(rows)}\n"
+            f"{group}: {len(members)} accidents; seconds of warning that {share_text} of them "
+            f"need\n{columns_text(rows)}\n"
             f"{_secondary_text(members)}"
         )
 
     def _margins_text(self) -> str:
-        """How many margins of the self-check there are of each size; the largest by name."""
+        """Return the number of margins of the self-check by size, and the largest one by name."""
         lines = [f"  {name}: {count}" for name, count in self.margin_counts.items() if count]
         largest = max(self.margins, key=lambda name: self.margins[name])
         return "\n".join(
@@ -274,67 +314,51 @@ class AvoidabilityReport(Report):
         )
 
     def _last_moment_rows(self) -> Iterator[Row]:
-        names = (
-            "brakers",
-            "deceleration",
-            "avoidable",
-            "last_moment",
-            "slack",
-            "switches",
-            "extrapolated",
-        )
-        yield ("scenario", "group", "first_id", "first", "second_id", "second", *names, "secondary")
-        for each in self.accidents:
-            accident = each.accident
-            who = [
-                value
-                for pair in zip(accident.actor_ids, accident.categories, strict=True)
-                for value in pair
-            ]
-            for row in each.last_moment_rows():
+        pair_columns = ("first_id", "first", "second_id", "second")
+        yield ("scenario", "group", *pair_columns, *_LAST_MOMENT_COLUMNS, "secondary")
+        for avoidability in self.accidents:
+            accident = avoidability.accident
+            colliders: list[Any] = []
+            for actor_id, category in zip(accident.actor_ids, accident.categories, strict=True):
+                colliders += [actor_id, category]
+            for row in avoidability.last_moment_rows():
                 yield (
                     accident.scenario,
-                    group_of(each),
-                    *who,
-                    *map(row.get, names),
+                    group_of(avoidability),
+                    *colliders,
+                    *map(row.get, _LAST_MOMENT_COLUMNS),
                     len(row["secondary"]),
                 )
 
     def _secondary_rows(self) -> Iterator[Row]:
-        names = ("actor_id", "other_id", "category", "time", "extrapolated")
-        yield ("scenario", "brakers", "deceleration", *names)
-        for each in self.accidents:
-            for row in each.last_moment_rows():
+        yield ("scenario", "brakers", "deceleration", *_SECONDARY_COLUMNS)
+        for accident in self.accidents:
+            for row in accident.last_moment_rows():
+                key = (accident.accident.scenario, row["brakers"], row["deceleration"])
                 for contact in row["secondary"]:
-                    yield (
-                        each.accident.scenario,
-                        row["brakers"],
-                        row["deceleration"],
-                        *map(contact.get, names),
-                    )
+                    yield (*key, *map(contact.get, _SECONDARY_COLUMNS))
 
     def _share_rows(self) -> Iterator[Row]:
         yield (
             *("group", "warned", "reaction", "deceleration", "lead", "accidents", *OUTCOMES),
             *("extrapolated", "relative_speed", "delta_v", "delta_v_least", "delta_v_most"),
         )
-        for each in self.shares:
-            for column, braking in enumerate(each.brakings):
-                for row, lead in enumerate(each.leads.tolist()):
+        for shares in self.shares:
+            for column, braking in enumerate(shares.brakings):
+                for row, lead in enumerate(shares.leads.tolist()):
                     values = (
-                        *(*each.shares[row, column], each.extrapolated[row, column]),
-                        *(each.relative_speed[row, column], *each.delta_v[row, column]),
+                        *shares.shares[row, column],
+                        shares.extrapolated[row, column],
+                        shares.relative_speed[row, column],
+                        *shares.delta_v[row, column],
                     )
-                    key = (
-                        each.group,
-                        each.warned,
+                    yield (
+                        shares.group,
+                        shares.warned,
                         braking.reaction,
                         braking.deceleration,
                         round(lead, 1),
-                    )
-                    yield (
-                        *key,
-                        int(each.accidents[row]),
+                        int(shares.accidents[row]),
                         *(round(float(value), 6) for value in values),
                     )
 
@@ -344,23 +368,26 @@ class AvoidabilityReport(Report):
             *("scenario", "margin", "time", "end", *(f"speed_{side}" for side in sides)),
             *(f"delta_v_{side}{end}" for side in sides for end in ("", "_least", "_most")),
         )
-        for each in self.accidents:
-            told = each.to_dict(warnings=False)["recorded"]
-            changes = zip(told["delta_v"], told["delta_v_ranges"], strict=True)
-            delta_v = [value for change, both in changes for value in (change, *both)]
-            key = (
-                each.accident.scenario,
-                told["margin"],
-                told["time"],
-                round(each.accident.duration, 1),
+        for accident in self.accidents:
+            recorded = accident.to_dict(warnings=False)["recorded"]
+            delta_v: list[Any] = []
+            for change, bounds in zip(recorded["delta_v"], recorded["delta_v_ranges"], strict=True):
+                delta_v += [change, *bounds]
+            yield (
+                accident.accident.scenario,
+                recorded["margin"],
+                recorded["time"],
+                round(accident.accident.duration, 1),
+                *recorded["speeds"],
+                *delta_v,
             )
-            yield (*key, *told["speeds"], *delta_v)
 
     def _left_out_rows(self) -> Iterator[Row]:
         yield ("scenario", "why", "reason", "margin")
-        for word, which in (("dropped", self.dropped), ("skipped", self.skipped)):
-            for each in which:
-                yield (each.scenario, word, each.reason, self.margins.get(each.scenario))
+        for title, omissions in (("dropped", self.dropped), ("skipped", self.skipped)):
+            for skipped in omissions:
+                margin = self.margins.get(skipped.scenario)
+                yield (skipped.scenario, title, skipped.reason, margin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,79 +395,87 @@ class Dropped:
     """An accident that its recording does not show.
 
     Attributes:
-        why: in words.
-        margin: metres between the two at the last frame.
+        why: Reason in words.
+        margin: Metres between the two at the last frame.
     """
 
     why: Skipped
     margin: float
 
 
-def looked_into(dataset: Dataset, scenario: ScenarioRecord) -> Avoidability | Dropped | None:
-    """When a scenario's accident could have been avoided; None if it has no collision. Raises NotAvailableError."""
+def replay_accident(dataset: Dataset, scenario: ScenarioRecord) -> Avoidability | Dropped | None:
+    """Return when a scenario's accident could have been avoided; None if it has no collision.
+
+    Raises NotAvailableError.
+    """
     accident = accident_of(dataset, scenario)
     if accident is None:
         return None
     check = undisturbed(accident)
     if not check.usable:
-        return Dropped(
-            Skipped(scenario=accident.scenario, reason=unusable(accident, check)), check.margin
-        )
+        why = Skipped(scenario=accident.scenario, reason=unusable(accident, check))
+        return Dropped(why, check.margin)
     return avoidability_of(accident, scenario_tracks(dataset, scenario))
 
 
 def avoidability_report(
     dataset: Dataset,
     scenarios: Iterable[RowArgument] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> AvoidabilityReport:
-    """When the accidents of scenarios could have been avoided by braking, in the nine ways of `BRAKINGS`.
+    """Return when accidents could have been avoided by braking, in the nine ways of `BRAKINGS`.
 
     Args:
-        dataset: the release.
-        scenarios: tokens or records; None for all. Those whose meta file names no collision do not count.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        scenarios: Tokens or records of scenarios; None for all. Scenarios with a meta file that
+            names no collision do not count.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: There is no such scenario.
     """
-    work: Callable[[Dataset, Any], Avoidability | Dropped | None] = looked_into
+    work: Callable[[Dataset, Any], Avoidability | Dropped | None] = replay_accident
     return report_of(
-        dataset, each_scenario(work, dataset, scenarios, label="replaying", at_once=1, **how)
+        dataset, each_scenario(work, dataset, scenarios, label="replaying", at_once=1, **engine)
     )
 
 
 def report_of(
-    dataset: Dataset, found: Sequence[Avoidability | Dropped | Skipped | None]
+    dataset: Dataset, replays: Sequence[Avoidability | Dropped | Skipped | None]
 ) -> AvoidabilityReport:
-    """The report of what `looked_into` gave for scenarios, in their order."""
-    accidents, dropped = those_of(Avoidability, found), those_of(Dropped, found)
+    """Return the report of the results of `replay_accident` for scenarios, in their order."""
+    accidents, dropped = those_of(Avoidability, replays), those_of(Dropped, replays)
+    margins = {}
+    for accident in accidents:
+        margins[accident.accident.scenario] = accident.check.margin
+    for unusable_accident in dropped:
+        margins[unusable_accident.why.scenario] = unusable_accident.margin
     return AvoidabilityReport(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
         accidents=accidents,
-        dropped=tuple(each.why for each in dropped),
-        skipped=those_of(Skipped, found),
-        margins={
-            **{each.accident.scenario: each.check.margin for each in accidents},
-            **{each.why.scenario: each.margin for each in dropped},
-        },
+        dropped=tuple(unusable_accident.why for unusable_accident in dropped),
+        skipped=those_of(Skipped, replays),
+        margins=margins,
     )
 
 
 def _secondary_text(accidents: Sequence[Avoidability]) -> str:
-    """In how many replays of braking at the last moment another actor is touched."""
-    touched = [{each.replay for each in accident.secondary} for accident in accidents]
-    before = [
-        {each.replay for each in accident.secondary if not each.extrapolated}
-        for accident in accidents
-    ]
-    replays = sum(int(np.isfinite(accident.last_moments.time).sum()) for accident in accidents)
+    """Return in how many replays of braking at the last moment another actor is touched."""
+    num_touched = num_before_end = num_replays = 0
+    for accident in accidents:
+        contacts = accident.secondary
+        num_touched += len({contact.replay for contact in contacts})
+        num_before_end += len({contact.replay for contact in contacts if not contact.extrapolated})
+        num_replays += int(np.isfinite(accident.last_moments.time).sum())
     return (
-        f"other road users, who do not react, are touched in {sum(map(len, before))} of {replays} replays of the last "
-        f"moment before the recording ends, in {sum(map(len, touched))} if all go straight on for 3 s"
+        f"other road users, who do not react, are touched in {num_before_end} of {num_replays} "
+        f"replays of the last moment before the recording ends, in {num_touched} if all go "
+        "straight on for 3 s"
     )
 
 
 def _seconds_text(seconds: float) -> str:
-    return f"{seconds:.2f}" if np.isfinite(seconds) else "–"
+    if np.isfinite(seconds):
+        return f"{seconds:.2f}"
+    return "–"

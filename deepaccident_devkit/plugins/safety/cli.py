@@ -1,4 +1,4 @@
-"""`deepaccident safety`: what is to be learnt from the accidents of a release, from its labels alone."""
+"""`deepaccident safety`: what the labels of a release show about its accidents."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -39,9 +39,9 @@ from deepaccident_devkit.render.figures import report_figure, write_report_figur
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 from deepaccident_devkit.support.text import counted
 
-# Those that a verb is about; None for all.
+# Scenarios that a verb is about; None for all.
 _Scenarios = Sequence[Any] | None
-# Name of a file in a folder → what writes it at a path, and gives the path back.
+# Name of a file in a folder → function that writes it at a path, and returns the path.
 Files = dict[str, Callable[[Path], Path]]
 
 
@@ -54,50 +54,54 @@ def _replay_count(context: click.Context, parameter: click.Parameter, value: str
         raise click.BadParameter(
             f"expected a number, all or none, found {value!r}", context, parameter
         )
-    return 0 if word == "none" else int(word)
+    if word == "none":
+        return 0
+    return int(word)
 
 
-def _picture(
-    render: Callable[..., Any], size: tuple[float, float], *what: Any
+def _figure_writer(
+    render: Callable[..., Any], size: tuple[float, float], *arguments: Any
 ) -> Callable[[Path], Path]:
-    """What renders a figure of this size into a file."""
-    return lambda path: write_report_figure(
-        render(*what, fig=report_figure(size, column=COLUMN_HEIGHT)), path
-    )
+    """Return a function that renders a figure of this size into a file."""
+
+    def write(path: Path) -> Path:
+        fig = report_figure(size, column=COLUMN_HEIGHT)
+        return write_report_figure(render(*arguments, fig=fig), path)
+
+    return write
 
 
 def _lead_time(
-    dataset: DeepAccident, chosen: _Scenarios, *, kind: Any, **engine: Any
+    dataset: DeepAccident, scenarios: _Scenarios, *, kind: Any, **engine: Any
 ) -> tuple[Any, Files]:
-    ledger = lead_time_ledger(dataset, chosen, ObservationRule(kind=kind), **engine)
-    return ledger, {
-        "lead_times.png": _picture(render_lead_times, LEAD_TIME_SIZE, ledger)
-    } if ledger.accidents else {}
+    ledger = lead_time_ledger(dataset, scenarios, ObservationRule(kind=kind), **engine)
+    if not ledger.accidents:
+        return ledger, {}
+    return ledger, {"lead_times.png": _figure_writer(render_lead_times, LEAD_TIME_SIZE, ledger)}
 
 
-def _avoidability(dataset: DeepAccident, chosen: _Scenarios, **engine: Any) -> tuple[Any, Files]:
-    report = avoidability_report(dataset, chosen, **engine)
-    return report, {
-        f"avoidability_{group.replace('-', '_')}.png": _picture(
-            render_avoidability, AVOIDABILITY_SIZE, report, group
-        )
-        for group in ACCIDENT_GROUPS
-        if report.members(group)
-    }
+def _avoidability(dataset: DeepAccident, scenarios: _Scenarios, **engine: Any) -> tuple[Any, Files]:
+    report = avoidability_report(dataset, scenarios, **engine)
+    files: Files = {}
+    for group in ACCIDENT_GROUPS:
+        if report.members(group):
+            name = f"avoidability_{group.replace('-', '_')}.png"
+            files[name] = _figure_writer(render_avoidability, AVOIDABILITY_SIZE, report, group)
+    return report, files
 
 
-def _twins(dataset: DeepAccident, chosen: _Scenarios, **engine: Any) -> tuple[Any, Files]:
-    return twin_report(dataset, chosen, **engine), {}
+def _twins(dataset: DeepAccident, scenarios: _Scenarios, **engine: Any) -> tuple[Any, Files]:
+    return twin_report(dataset, scenarios, **engine), {}
 
 
-# Topic → what makes its report and further files, and the report's JSON file.
+# Topic → function that makes its report and further files, and the report's JSON file.
 _TABLES: Final[dict[str, tuple[Callable[..., tuple[Any, Files]], str]]] = {
     "lead-time": (_lead_time, "lead_times.json"),
     "avoidability": (_avoidability, "avoidability.json"),
     "twins": (_twins, "twins.json"),
 }
 # Parameter → the topics that take it.
-_OF_TOPIC: Final = {
+_TOPICS_BY_PARAMETER: Final = {
     "kind": ("lead-time",),
     "scenario": ("describe",),
     "replays": ("report",),
@@ -117,7 +121,8 @@ _OF_TOPIC: Final = {
     "kind",
     help="Of lead-time: what an observation is. points: the agent's label counts at least "
     f"{ObservationRule().least_points} LiDAR points in the actor's box. "
-    "released: the visibility rule of the released code. annotated: the label has the actor, hidden or not.",
+    "released: the visibility rule of the released code. annotated: the label has the actor, "
+    "hidden or not.",
 )
 @click.option(
     "--replays",
@@ -125,14 +130,15 @@ _OF_TOPIC: Final = {
     show_default=True,
     callback=_replay_count,
     metavar="N|all|none",
-    help="Of report: how many accidents have a replay page, the hardest first. With images, a page takes up to 15 MB.",
+    help="Of report: how many accidents have a replay page, the hardest first. With images, a page "
+    "takes up to 15 MB.",
 )
 @click.option(
     "--out",
     type=click.Path(),
     metavar="DIR",
-    help="Folder to write into: the page with its files, or tables (JSON, CSV) and figures. Of describe: a JSON Lines "
-    "file, with the facts and the text of each scenario.",
+    help="Folder to write into: the page with its files, or tables (JSON, CSV) and figures. Of "
+    "describe: a JSON Lines file, with the facts and the text of each scenario.",
 )
 @figure_style_parameter
 @json_parameter
@@ -148,10 +154,11 @@ def safety(
     avoidability  Until when braking of either collider, or of both, would have avoided the accident.
     twins         When accidents and their normal twins part, and who acts differently.
 
-    SCENARIO, a token of the form TYPE/NAME, makes `describe` tell of this one alone. All is computed from labels and
-    meta. What cannot be told is named with its reason, or left out. docs/safety.md says what numbers mean.
-    """  # noqa: D301, D415 - \b is click's mark of lines that are not wrapped
-    for name, topics in _OF_TOPIC.items():
+    SCENARIO, a token of the form TYPE/NAME, makes `describe` tell of this one alone. All is
+    computed from labels and meta. What cannot be told is named with its reason, or left out.
+    docs/safety.md says what numbers mean.
+    """  # noqa: D301, D415, E501 - \b is click's mark of lines that are not wrapped
+    for name, topics in _TOPICS_BY_PARAMETER.items():
         if topic not in topics:
             refuse_unused(f"with {topic}", name)
     scenario, kind, replays = (options.pop(name) for name in ("scenario", "kind", "replays"))
@@ -159,63 +166,85 @@ def safety(
         refuse_unused("with a scenario", "where")
     if topic == "report" and out is None:
         raise click.UsageError("Missing option '--out': the folder of the page.")
-    if topic == "describe" and out is not None and Path(out).is_dir():
+    target = _target_path(topic, out)
+    dataset, engine = DeepAccident(**options), engine_of(options)
+    scenarios: _Scenarios = dataset.find(*where) if where else None
+    if topic in _TABLES:
+        if topic in _TOPICS_BY_PARAMETER["kind"]:
+            engine["kind"] = kind
+        _write_tables(topic, dataset, scenarios, target, as_json=as_json, **engine)
+    elif topic == "describe":
+        described = scenarios if scenario is None else [scenario]
+        _describe(dataset, described, target, as_json=as_json, **engine)
+    elif target is not None:
+        _report(dataset, scenarios, target, replays, **engine)
+
+
+def _target_path(topic: str, out: str | None) -> Path | None:
+    """Return the path of `--out`: a file for `describe`, otherwise a folder; None without it."""
+    if out is None:
+        return None
+    if topic != "describe":
+        return writable_folder(out)
+    if Path(out).is_dir():
         raise click.BadParameter(
             f"--out: {out} is a folder; give a file, such as {out}/stories.jsonl"
         )
-    target = None if out is None else Path(out) if topic == "describe" else writable_folder(out)
-    dataset, engine = DeepAccident(**options), engine_of(options)
-    chosen = dataset.find(*where) if where else None
-    if topic in _TABLES:
-        make, name = _TABLES[topic]
-        own = {"kind": kind} if topic in _OF_TOPIC["kind"] else {}
-        report, files = make(dataset, chosen, **own, **engine)
-        written = write_report(report, target, name)
-        if target is not None:
-            written += [write(target / file) for file, write in files.items()]
-        say_report(report, written, target, as_json=as_json)
-    elif topic == "describe":
-        _describe(
-            dataset, chosen if scenario is None else [scenario], target, as_json=as_json, **engine
-        )
-    elif target is not None:
-        _report(dataset, chosen, target, replays, **engine)
+    return Path(out)
+
+
+def _write_tables(
+    topic: str,
+    dataset: DeepAccident,
+    scenarios: _Scenarios,
+    target: Path | None,
+    *,
+    as_json: bool,
+    **arguments: Any,
+) -> None:
+    make_report, name = _TABLES[topic]
+    report, files = make_report(dataset, scenarios, **arguments)
+    written = write_report(report, target, name)
+    if target is not None:
+        written += [write(target / file) for file, write in files.items()]
+    say_report(report, written, target, as_json=as_json)
 
 
 def _describe(
-    dataset: DeepAccident, chosen: _Scenarios, out: Path | None, *, as_json: bool, **engine: Any
+    dataset: DeepAccident, scenarios: _Scenarios, out: Path | None, *, as_json: bool, **engine: Any
 ) -> None:
-    told = stories(dataset, chosen, **engine)
-    lines = [json.dumps({**each.facts, "text": each.text}, allow_nan=False) for each in told]
+    described = stories(dataset, scenarios, **engine)
+    lines = [
+        json.dumps({**story.facts, "text": story.text}, allow_nan=False) for story in described
+    ]
     if out is not None:
         write_bytes(out, "".join(f"{line}\n" for line in lines).encode())
-    for line, each in zip(lines, told, strict=True):
-        click.echo(line if as_json else f"{each.facts['scenario']}\n  {each.text}")
-        for reason in () if as_json else each.facts["unknown"]:
+    for line, story in zip(lines, described, strict=True):
+        if as_json:
+            click.echo(line)
+            continue
+        click.echo(f"{story.facts['scenario']}\n  {story.text}")
+        for reason in story.facts["unknown"]:
             click.echo(f"  not known: {reason}")
     if out is not None:
         click.echo(f"written: {counted(len(lines), 'scenario')} in {out}", err=as_json)
 
 
 def _report(
-    dataset: DeepAccident, chosen: _Scenarios, folder: Path, replays: int | None, **engine: Any
+    dataset: DeepAccident, scenarios: _Scenarios, folder: Path, replays: int | None, **engine: Any
 ) -> None:
-    if chosen is not None and not chosen:
+    if scenarios is not None and not scenarios:
         raise click.UsageError(
             "no scenario matches --where, so there is nothing to write; change it"
         )
-    found = safety_report(dataset, chosen, progress=True, **engine)
+    report = safety_report(dataset, scenarios, progress=True, **engine)
     written = save_safety_report(
-        found, folder, dataset=dataset, replays=replays, progress=True, **engine
+        report, folder, dataset=dataset, replays=replays, progress=True, **engine
     )
-    left_out = (
-        f"; {len(found.left_out)} reasons for what is left out are in the page"
-        if found.left_out
-        else ""
-    )
-    click.echo(
-        f"{counted(len(found.rows), 'accident')} of {counted(found.scenarios, 'scenario')}{left_out}"
-    )
+    summary = f"{counted(len(report.rows), 'accident')} of {counted(report.scenarios, 'scenario')}"
+    if report.left_out:
+        summary += f"; {len(report.left_out)} reasons for what is left out are in the page"
+    click.echo(summary)
     click.echo(
         f"written: {counted(len(written), 'file')} in {folder}; open {written[-1]} in a browser"
     )

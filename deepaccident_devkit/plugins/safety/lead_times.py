@@ -1,6 +1,7 @@
-"""How long before an accident's impact sets of agents first observe both colliders, and what each partner adds.
+"""How long before an accident's impact sets of agents first observe both colliders.
 
-First of an accident, then of all accidents of a release.
+`lead_times` measures one accident, with what each partner adds; `lead_time_ledger` measures all
+accidents of a release.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ PARTNERS: Final = AGENTS[1:]
 CAVEAT: Final = "Observation bounds warning from above; it is no prediction."
 _RESAMPLES: Final = 2000
 _CONFIDENCE: Final = 0.95
-# Accidents of which a mean has an interval.
-_FEWEST: Final = 6
-_OF_ACCIDENT: Final = (
+# Smallest number of accidents for which a mean has an interval.
+_MIN_ACCIDENTS: Final = 6
+_ACCIDENT_COLUMNS: Final = (
     "scenario",
     "actor_ids",
     "categories",
@@ -67,31 +68,42 @@ COALITIONS: Final[tuple[tuple[AgentName, ...], ...]] = tuple(
     (_EGO, *(name for name, joins in zip(PARTNERS, row, strict=True) if joins))
     for row in _MEMBERS.tolist()
 )
-"""The sixteen sets of agents with the ego; partner i belongs to those whose number has bit i."""
-# Numbers of the sets of the ego and one partner.
-_ALONE: Final = [1 << partner for partner in range(len(PARTNERS))]
+"""The sixteen sets of agents with the ego; set number n has partner i if bit i of n is set."""
+# Bit of each partner, which is also the number of the set of the ego and this partner.
+_PARTNER_BITS: Final = [1 << partner for partner in range(len(PARTNERS))]
+# Columns of the CSV file.
+_CSV_HEADING: Final = (
+    *_ACCIDENT_COLUMNS,
+    *(f"lead_{'+'.join(members)}" for members in COALITIONS),
+    *(f"first_frame_{'+'.join(members)}" for members in COALITIONS),
+    *(f"shapley_{name}" for name in PARTNERS),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LeadTimes(FrozenArrays):
     """When sets of agents first observe both colliders of an accident; arrays are read-only.
 
-    What is seen bounds a warning from above. It is no prediction: who sees both need not see that they will collide.
+    Observation bounds a warning from above. It is no prediction: an agent that sees both actors
+    need not foresee that they will collide.
 
     Attributes:
-        scenario: token.
-        rule: when an actor counts as observed.
+        scenario: Token of the scenario.
+        rule: When an actor counts as observed.
         actor_ids: CARLA ids of the colliders, in the meta file's order.
-        categories: their classes.
-        colliding_agents: the agents that they are; None for one that records nothing.
-        missing: agents without labels in this release.
-        num_frames: of the recording; the last one counts as the impact.
-        touching: seconds from the frame at which the outlines begin to touch to the last one; None if they never do.
-        first_frames: (16,) int64 for each of `COALITIONS`, the number (from 1) of the first frame at which it observes
-            both; 0 for one that never does, and for one with a missing agent.
-        leads: (16,) seconds from that frame to the last one; 0 for one that never does, NaN with a missing agent.
-        shapley: (4,) seconds: of each of `PARTNERS` its Shapley value of the gain over the ego alone, among the
-            partners that are there; NaN for a missing one.
+        categories: Classes of the colliders.
+        colliding_agents: Agents that the colliders are; None for a collider that records nothing.
+        missing: Agents without labels in this release.
+        num_frames: Number of frames of the recording; the last one counts as the impact.
+        touching: Seconds from the frame at which the outlines begin to touch to the last one; None
+            if they never do.
+        first_frames: Number (from 1) of the first frame at which each of `COALITIONS` observes
+            both, shape (16,), int64; 0 for a set that never does, and for a set with a missing
+            agent.
+        leads: Seconds from that frame to the last one, shape (16,); 0 for a set that never observes
+            both, NaN with a missing agent.
+        shapley: Shapley value of each of `PARTNERS`, shape (4,): seconds of the gain over the ego
+            without partners, shared among the partners with labels; NaN for a missing one.
     """
 
     scenario: str
@@ -113,42 +125,48 @@ class LeadTimes(FrozenArrays):
 
     @property
     def alone(self) -> float:
-        """Seconds of the ego alone."""
+        """Seconds of the ego without partners."""
         return float(self.leads[0])
 
     @property
     def together(self) -> float:
-        """Seconds of all agents that are there."""
-        return float(self.leads[self._everyone])
+        """Seconds of all agents with labels."""
+        return float(self.leads[self._full_coalition])
 
     @property
     def never_alone(self) -> bool:
-        """Whether the ego alone never observes both at the same frame."""
+        """Whether the ego without partners never observes both at the same frame."""
         return not self.first_frames[0]
 
     @property
     def never_together(self) -> bool:
-        """Whether all agents that are there never observe both at the same frame."""
-        return not self.first_frames[self._everyone]
+        """Whether all agents with labels never observe both at the same frame."""
+        return not self.first_frames[self._full_coalition]
 
     @property
     def from_the_start(self) -> bool:
-        """Whether all agents that are there observe both from the first frame on: the recording may cut it."""
-        return int(self.first_frames[self._everyone]) == 1
+        """Whether all agents with labels observe both from the first frame on.
+
+        The recording may then cut the lead time.
+        """
+        return int(self.first_frames[self._full_coalition]) == 1
 
     @property
     def gains(self) -> FloatArray:
-        """(4,) seconds that each of `PARTNERS` adds to the ego alone; NaN for a missing one."""
-        return np.asarray(self.leads[_ALONE] - self.leads[0])
+        """Seconds that each of `PARTNERS` adds to the ego, shape (4,); NaN for a missing one."""
+        return np.asarray(self.leads[_PARTNER_BITS] - self.leads[0])
 
     @property
     def losses(self) -> FloatArray:
-        """(4,) seconds that all agents lose without each of `PARTNERS`; NaN for a missing one."""
-        without = [self._everyone & ~bit for bit in _ALONE]
-        return np.where(np.isnan(self.gains), np.nan, self.together - self.leads[without])
+        """Seconds that all agents lose without each of `PARTNERS`, shape (4,); NaN if missing."""
+        smaller_sets = [self._full_coalition & ~bit for bit in _PARTNER_BITS]
+        return np.where(np.isnan(self.gains), np.nan, self.together - self.leads[smaller_sets])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; None for what is not known, and for the first frame of a set that never observes both."""
+        """Return the values for JSON.
+
+        None for unknown values, and for the first frame of a set that never observes both.
+        """
         names = ["+".join(members) for members in COALITIONS]
         frames = [number or None for number in self.first_frames.tolist()]
         return {
@@ -168,70 +186,71 @@ class LeadTimes(FrozenArrays):
         }
 
     @property
-    def _everyone(self) -> int:
-        return sum(
-            bit for bit, name in zip(_ALONE, PARTNERS, strict=True) if name not in self.missing
-        )
+    def _full_coalition(self) -> int:
+        """Number of the set of all agents with labels."""
+        bits = zip(_PARTNER_BITS, PARTNERS, strict=True)
+        return sum(bit for bit, name in bits if name not in self.missing)
 
 
 def lead_times(
     dataset: Dataset, scenario: RowArgument, rule: ObservationRule | None = None
 ) -> LeadTimes | None:
-    """When each set of agents with `ego_vehicle` first observes both colliders of an accident.
+    """Return when each set of agents with `ego_vehicle` first observes both colliders.
 
     Args:
-        dataset: the release.
-        scenario: token or record.
-        rule: when an actor counts as observed; None for `ObservationRule()`.
+        dataset: The release.
+        scenario: Token or record of the scenario.
+        rule: When an actor counts as observed; None for `ObservationRule()`.
 
     Returns:
         None if the meta file names no collision.
 
     Raises:
-        TokenError: no such scenario.
-        NotAvailableError: as of `accident_of`, or `ego_vehicle` has no labels in this release.
+        TokenError: There is no such scenario.
+        NotAvailableError: `accident_of` raises it, or `ego_vehicle` has no labels in this release.
     """
     accident = accident_of(dataset, scenario)
     if accident is None:
         return None
     rule = rule or ObservationRule()
-    there, observed = observed_actors(dataset, accident.scenario, accident.actor_ids, rule)
-    if _EGO not in there:
+    present, observed = observed_actors(dataset, accident.scenario, accident.actor_ids, rule)
+    if _EGO not in present:
         raise NotAvailableError(
             f"{accident.scenario}: has no labels of {_EGO}, whose lead time is asked; unpack them"
         )
-    first, leads, shapley = _whole_ledger(observed, there[1:])
+    first_frames, leads, shapley = _coalition_values(observed, present[1:])
     return LeadTimes(
         scenario=accident.scenario,
         rule=rule,
         actor_ids=accident.actor_ids,
         categories=accident.categories,
         colliding_agents=accident.agents,
-        missing=tuple(name for name in AGENTS if name not in there),
+        missing=tuple(name for name in AGENTS if name not in present),
         num_frames=accident.num_frames,
         touching=accident.touching,
-        first_frames=first,
+        first_frames=first_frames,
         leads=leads,
         shapley=shapley,
     )
 
 
-def _whole_ledger(
+def _coalition_values(
     observed: BoolArray, partners: tuple[AgentName, ...]
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """First frames (16,), leads (16,) and Shapley values (4,), of which those of missing partners are not known."""
-    places = np.array([PARTNERS.index(name) for name in partners], dtype=np.int64)
-    numbers = coalition_members(len(partners)) @ (1 << places)
-    first = first_together(observed)
-    leads = leads_from(first, observed.shape[-1])
-    every_frame, every_lead = (
-        np.zeros(len(COALITIONS), dtype=np.int64),
-        np.full(len(COALITIONS), np.nan),
-    )
-    every_frame[numbers], every_lead[numbers] = first + 1, leads
+    """Return first frames (16,), leads (16,) and Shapley values (4,) of all sets and partners.
+
+    Values of sets with a missing partner are unknown, as are Shapley values of missing partners.
+    """
+    indices = np.array([PARTNERS.index(name) for name in partners], dtype=np.int64)
+    numbers = coalition_members(len(partners)) @ (1 << indices)
+    first_index = first_together(observed)
+    known_leads = leads_from(first_index, observed.shape[-1])
+    first_frames = np.zeros(len(COALITIONS), dtype=np.int64)
+    leads = np.full(len(COALITIONS), np.nan)
+    first_frames[numbers], leads[numbers] = first_index + 1, known_leads
     shapley = np.full(len(PARTNERS), np.nan)
-    shapley[places] = shapley_values(leads)
-    return every_frame, every_lead, shapley
+    shapley[indices] = shapley_values(known_leads)
+    return first_frames, leads, shapley
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,10 +258,11 @@ class MeanTime:
     """A mean over accidents.
 
     Attributes:
-        mean: seconds; None of no accident.
-        low: end of the interval of 95 % by the bootstrap over accidents; None of fewer than six.
-        high: its other end.
-        accidents: of how many.
+        mean: Mean in seconds; None without accidents.
+        low: Lower end of the interval of 95 % by the bootstrap over accidents; None for fewer than
+            six.
+        high: Upper end of the interval.
+        accidents: Number of accidents.
     """
 
     mean: float | None
@@ -252,12 +272,11 @@ class MeanTime:
 
     @property
     def text(self) -> str:
-        """Such as `1.52 [1.20, 1.86]`."""
+        """The mean and its interval, such as `1.52 [1.20, 1.86]`."""
         if self.mean is None:
             return "–"
-        return f"{self.mean:.2f}" + (
-            "" if self.low is None else f" [{self.low:.2f}, {self.high:.2f}]"
-        )
+        interval = "" if self.low is None else f" [{self.low:.2f}, {self.high:.2f}]"
+        return f"{self.mean:.2f}{interval}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,12 +284,12 @@ class LeadTimeLedger(Report):
     """The lead times of the accidents of a release, or of some of its scenarios.
 
     Attributes:
-        dataroot: the release's folder.
+        dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        rule: when an actor counts as observed.
-        accidents: in the order of the release.
-        skipped: scenarios of which the lead times cannot be told, and why.
-        without_accident: scenarios whose meta file names no collision.
+        rule: When an actor counts as observed.
+        accidents: Lead times, in the order of the release.
+        skipped: Scenarios with unknown lead times, and why.
+        without_accident: Number of scenarios with a meta file that names no collision.
     """
 
     dataroot: str
@@ -282,54 +301,55 @@ class LeadTimeLedger(Report):
 
     @cached_property
     def mean_leads(self) -> tuple[MeanTime, ...]:
-        """Of each of `COALITIONS`, the mean lead time; accidents without one of its agents do not count."""
-        return mean_times(
-            np.array([each.leads for each in self.accidents]).reshape(-1, len(COALITIONS))
-        )
+        """Mean lead time of each of `COALITIONS`.
+
+        Accidents without one of its agents do not count.
+        """
+        return _column_means([times.leads for times in self.accidents], len(COALITIONS))
 
     @cached_property
     def mean_gains(self) -> tuple[MeanTime, ...]:
-        """Of each of `PARTNERS`, the mean of what it adds to the ego alone."""
-        return mean_times(
-            np.array([each.gains for each in self.accidents]).reshape(-1, len(PARTNERS))
-        )
+        """Mean of what each of `PARTNERS` adds to the ego."""
+        return _column_means([times.gains for times in self.accidents], len(PARTNERS))
 
     @cached_property
     def mean_losses(self) -> tuple[MeanTime, ...]:
-        """Of each of `PARTNERS`, the mean of what all agents lose without it."""
-        return mean_times(
-            np.array([each.losses for each in self.accidents]).reshape(-1, len(PARTNERS))
-        )
+        """Mean of what all agents lose without each of `PARTNERS`."""
+        return _column_means([times.losses for times in self.accidents], len(PARTNERS))
 
     @cached_property
     def mean_shapley(self) -> tuple[MeanTime, ...]:
-        """Of each of `PARTNERS`, its mean Shapley value."""
-        return mean_times(
-            np.array([each.shapley for each in self.accidents]).reshape(-1, len(PARTNERS))
-        )
+        """Mean Shapley value of each of `PARTNERS`."""
+        return _column_means([times.shapley for times in self.accidents], len(PARTNERS))
 
     @property
     def mean_together(self) -> MeanTime:
-        """Of all agents that each accident has."""
-        return mean_times(np.array([each.together for each in self.accidents]).reshape(-1, 1))[0]
+        """Mean lead time of all agents that each accident has."""
+        return _column_means([times.together for times in self.accidents], 1)[0]
 
     @property
     def share_never_alone(self) -> float | None:
-        """Share of the accidents whose colliders the ego alone never observes at the same frame; None of none."""
-        return _share([each.never_alone for each in self.accidents])
+        """Share of the accidents that the ego without partners never observes; None for none.
+
+        To observe an accident is to observe both colliders at the same frame.
+        """
+        return _share([times.never_alone for times in self.accidents])
 
     @property
     def share_never_together(self) -> float | None:
-        """The same of all agents together."""
-        return _share([each.never_together for each in self.accidents])
+        """Share of the accidents that all agents together never observe; None for none."""
+        return _share([times.never_together for times in self.accidents])
 
     @property
     def share_from_the_start(self) -> float | None:
-        """Share of the accidents that all agents observe from the first frame on, so that more may have been cut."""
-        return _share([each.from_the_start for each in self.accidents])
+        """Share of the accidents that all agents observe from the first frame on; None for none.
+
+        In these accidents the beginning of the recording may have cut the lead time.
+        """
+        return _share([times.from_the_start for times in self.accidents])
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; None for what is not known."""
+        """Return the values for JSON; None for unknown values."""
         names = ["+".join(members) for members in COALITIONS]
         return {
             "dataroot": self.dataroot,
@@ -338,8 +358,8 @@ class LeadTimeLedger(Report):
             "caveat": CAVEAT,
             "summary": {
                 "accidents": len(self.accidents),
-                "ego_collides": sum(each.ego_collides for each in self.accidents),
-                "with_missing_agents": sum(bool(each.missing) for each in self.accidents),
+                "ego_collides": sum(times.ego_collides for times in self.accidents),
+                "with_missing_agents": sum(bool(times.missing) for times in self.accidents),
                 "skipped": len(self.skipped),
                 "without_accident": self.without_accident,
                 "share_never_alone": self.share_never_alone,
@@ -351,131 +371,128 @@ class LeadTimeLedger(Report):
                 "loss_seconds": _by_name(PARTNERS, self.mean_losses),
                 "shapley_seconds": _by_name(PARTNERS, self.mean_shapley),
             },
-            "accidents": [each.to_dict() for each in self.accidents],
-            "skipped": [asdict(each) for each in self.skipped],
+            "accidents": [times.to_dict() for times in self.accidents],
+            "skipped": [asdict(skipped) for skipped in self.skipped],
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
-        """`lead_times`, a row an accident, seconds with all their digits; and `skipped`."""
+        """Return `lead_times`, a row for each accident with unrounded seconds, and `skipped`."""
         return {
             "lead_times": [_CSV_HEADING, *map(_csv_row, self.accidents)],
             "skipped": skipped_rows(self.skipped),
         }
 
     def to_text(self) -> str:
-        """A table of the accidents and of their means, for a terminal."""
-        with_ego = sum(each.ego_collides for each in self.accidents)
+        """Return a table of the accidents and of their means, for a terminal."""
+        with_ego = sum(times.ego_collides for times in self.accidents)
         counts = (
-            f"{counted(len(self.accidents), 'accident')}, {with_ego} of them with {_EGO} among the colliders; "
-            f"{counted(self.without_accident, 'scenario')} without an accident; {len(self.skipped)} skipped"
+            f"{counted(len(self.accidents), 'accident')}, {with_ego} of them with {_EGO} among the "
+            f"colliders; {counted(self.without_accident, 'scenario')} without an accident; "
+            f"{len(self.skipped)} skipped"
         )
-        head = f"Lead times: DeepAccident {self.version} at {self.dataroot}\nobserved: {self.rule.text}\n{counts}"
-        blocks = [f"{head}\n{CAVEAT}"]
+        title = f"Lead times: DeepAccident {self.version} at {self.dataroot}"
+        blocks = [f"{title}\nobserved: {self.rule.text}\n{counts}\n{CAVEAT}"]
         if self.accidents:
-            blocks[0] += f"\n{counted_text([each.touching for each in self.accidents])}"
+            blocks[0] += f"\n{counted_text([times.touching for times in self.accidents])}"
             blocks += [self._accidents_text(), self._means_text()]
         if self.skipped:
             blocks.append(reasons_text("skipped", self.skipped))
         return "\n\n".join(blocks)
 
     def _accidents_text(self) -> str:
-        heading = (
-            "seconds before the impact",
-            "ego alone",
-            *(f"+ {short_name(name)}" for name in PARTNERS),
-            "all",
-        )
-        rows = [
-            (
-                each.scenario,
-                _lead_text(each.alone, never=each.never_alone),
-                *(
-                    _gain_text(*pair)
-                    for pair in zip(each.gains.tolist(), each.shapley.tolist(), strict=True)
-                ),
-                _lead_text(each.together, never=each.never_together) + "*" * bool(each.missing),
+        partner_heads = (f"+ {short_name(name)}" for name in PARTNERS)
+        rows = [("seconds before the impact", "ego alone", *partner_heads, "all")]
+        for times in self.accidents:
+            partners = zip(times.gains.tolist(), times.shapley.tolist(), strict=True)
+            together = _lead_text(times.together, never=times.never_together)
+            rows.append(
+                (
+                    times.scenario,
+                    _lead_text(times.alone, never=times.never_alone),
+                    *(_gain_text(gain, shapley) for gain, shapley in partners),
+                    together + "*" * bool(times.missing),
+                )
             )
-            for each in self.accidents
-        ]
         notes = [
             "+: what the partner alone adds to the ego, and in brackets its Shapley value",
             "never: the colliders are not observed at the same frame",
         ]
-        if any(each.missing for each in self.accidents):
+        if any(times.missing for times in self.accidents):
             notes.append("*: of the agents that are there; – for the missing ones")
-        return "\n".join([columns_text([heading, *rows]), *notes])
+        return "\n".join([columns_text(rows), *notes])
 
     def _means_text(self) -> str:
         means = zip(PARTNERS, self.mean_gains, self.mean_losses, self.mean_shapley, strict=True)
-        rows = [(short_name(name), *(mean.text for mean in each)) for name, *each in means]
+        heading = ("partner", "adds to the ego", "all lose without", "Shapley value")
+        rows = [
+            (short_name(name), gain.text, loss.text, shapley.text)
+            for name, gain, loss, shapley in means
+        ]
         alone, together = self.mean_leads[0].text, self.mean_together.text
-        start = "observed by all agents from the first frame on, so that the lead may be longer than the recording: "
-        never = f"never observed together: by the ego alone {_percent(self.share_never_alone)}, by all agents "
-        return "\n".join(
-            [
-                "means in seconds [interval of 95 %, bootstrap over accidents]",
-                columns_text(
-                    [("partner", "adds to the ego", "all lose without", "Shapley value"), *rows]
-                ),
-                f"lead time: the ego alone {alone}, all agents {together}",
-                f"{never}{_percent(self.share_never_together)} of the accidents",
-                f"{start}{_percent(self.share_from_the_start)}",
-            ]
+        start = (
+            "observed by all agents from the first frame on, so that the lead may be longer than "
+            "the recording: "
         )
+        never = (
+            f"never observed together: by the ego alone {_percent(self.share_never_alone)}, by all "
+            "agents "
+        )
+        lines = [
+            "means in seconds [interval of 95 %, bootstrap over accidents]",
+            columns_text([heading, *rows]),
+            f"lead time: the ego alone {alone}, all agents {together}",
+            f"{never}{_percent(self.share_never_together)} of the accidents",
+            f"{start}{_percent(self.share_from_the_start)}",
+        ]
+        return "\n".join(lines)
 
 
 def mean_times(values: FloatArray) -> tuple[MeanTime, ...]:
-    """The mean of each column of (N, K) seconds over accidents, NaN for unknown, with its bootstrap interval.
+    """Return the mean of each column of seconds over accidents, with its bootstrap interval.
 
-    The same accidents are taken for all columns, `_RESAMPLES` times, always by the same random numbers.
+    All columns use the same `_RESAMPLES` resamples of the accidents, always from the same random
+    numbers.
+
+    Args:
+        values: Seconds, shape (N, K); NaN for unknown ones.
     """
-    count = len(values)
+    count, columns = values.shape
     known = np.isfinite(values)
     if not count:
-        return tuple(
-            MeanTime(mean=None, low=None, high=None, accidents=0) for _ in range(values.shape[1])
-        )
-    times = (
-        np.random.default_rng(0)
-        .multinomial(count, np.full(count, 1 / count), size=_RESAMPLES)
-        .astype(np.float64)
-    )
+        return tuple(MeanTime(mean=None, low=None, high=None, accidents=0) for _ in range(columns))
+    generator = np.random.default_rng(0)
+    draws = generator.multinomial(count, np.full(count, 1 / count), size=_RESAMPLES)
+    times = draws.astype(np.float64)
     with np.errstate(invalid="ignore"):
-        drawn = times @ np.where(known, values, 0) / (times @ known)
+        means = times @ np.where(known, values, 0) / (times @ known)
     return tuple(
-        _mean_time(values[known[:, at], at], drawn[:, at]) for at in range(values.shape[1])
+        _mean_time(values[known[:, column], column], means[:, column]) for column in range(columns)
     )
 
 
-def _mean_time(values: FloatArray, drawn: FloatArray) -> MeanTime:
+def _column_means(rows: Sequence[FloatArray | float], columns: int) -> tuple[MeanTime, ...]:
+    return mean_times(np.array(rows).reshape(-1, columns))
+
+
+def _mean_time(values: FloatArray, resampled_means: FloatArray) -> MeanTime:
     ends: Sequence[float | None] = (None, None)
-    if len(values) >= _FEWEST:
+    if len(values) >= _MIN_ACCIDENTS:
         tail = (1 - _CONFIDENCE) / 2
-        ends = np.nanquantile(drawn, (tail, 1 - tail)).tolist()
+        ends = np.nanquantile(resampled_means, (tail, 1 - tail)).tolist()
     mean = math.fsum(values.tolist()) / len(values) if len(values) else None
     return MeanTime(mean=mean, low=ends[0], high=ends[1], accidents=len(values))
 
 
-_CSV_HEADING: Final = (
-    *_OF_ACCIDENT,
-    *(f"lead_{'+'.join(members)}" for members in COALITIONS),
-    *(f"first_frame_{'+'.join(members)}" for members in COALITIONS),
-    *(f"shapley_{name}" for name in PARTNERS),
-)
-
-
 def _csv_row(times: LeadTimes) -> list[Any]:
-    told = times.to_dict()
-    lists = ("actor_ids", "categories", "colliding_agents", "missing")
-    words = {
-        name: " ".join("none" if each is None else str(each) for each in told[name])
-        for name in lists
-    }
+    payload = times.to_dict()
+    cells = dict(payload)
+    for name in ("actor_ids", "categories", "colliding_agents", "missing"):
+        cells[name] = " ".join("none" if value is None else str(value) for value in payload[name])
     return [
-        *({**told, **words}[name] for name in _OF_ACCIDENT),
-        *told["lead_seconds"].values(),
-        *told["first_frames"].values(),
-        *told["shapley_seconds"].values(),
+        *(cells[name] for name in _ACCIDENT_COLUMNS),
+        *payload["lead_seconds"].values(),
+        *payload["first_frames"].values(),
+        *payload["shapley_seconds"].values(),
     ]
 
 
@@ -484,54 +501,61 @@ def _by_name(names: Sequence[str], means: Sequence[MeanTime]) -> dict[str, Any]:
 
 
 def _share(truths: Sequence[bool]) -> float | None:
-    return sum(truths) / len(truths) if truths else None
+    if truths:
+        return sum(truths) / len(truths)
+    return None
 
 
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{round(100 * share)} %"
+    if share is None:
+        return "–"
+    return f"{round(100 * share)} %"
 
 
 def _gain_text(gain: float, shapley: float) -> str:
-    return "–" if math.isnan(gain) else f"{gain:.1f} ({shapley:.2f})"
+    if math.isnan(gain):
+        return "–"
+    return f"{gain:.1f} ({shapley:.2f})"
 
 
 def _lead_text(lead: float, *, never: bool) -> str:
-    return "never" if never else f"{lead:.1f}"
+    if never:
+        return "never"
+    return f"{lead:.1f}"
 
 
 def lead_time_ledger(
     dataset: Dataset,
     scenarios: Iterable[RowArgument] | None = None,
     rule: ObservationRule | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> LeadTimeLedger:
-    """The lead times of every accident, and the scenarios of which they cannot be told.
+    """Return the lead times of every accident, and the scenarios with unknown lead times.
 
     Args:
-        dataset: the release.
-        scenarios: tokens or records of those to look at, such as `find` gives; None for all.
-        rule: when an actor counts as observed; None for `ObservationRule()`.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        scenarios: Tokens or records of scenarios, such as `find` returns; None for all.
+        rule: When an actor counts as observed; None for `ObservationRule()`.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: There is no such scenario.
     """
     rule = rule or ObservationRule()
-    found = each_scenario(
-        partial(lead_times, rule=rule), dataset, scenarios, label="lead times", **how
-    )
-    return ledger_of(dataset, found, rule)
+    work = partial(lead_times, rule=rule)
+    results = each_scenario(work, dataset, scenarios, label="lead times", **engine)
+    return ledger_of(dataset, results, rule)
 
 
 def ledger_of(
-    dataset: Dataset, found: Sequence[LeadTimes | Skipped | None], rule: ObservationRule
+    dataset: Dataset, results: Sequence[LeadTimes | Skipped | None], rule: ObservationRule
 ) -> LeadTimeLedger:
-    """The ledger of what `lead_times` found in scenarios."""
+    """Return the ledger of the results of `lead_times` for scenarios."""
     return LeadTimeLedger(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
         rule=rule,
-        accidents=those_of(LeadTimes, found),
-        skipped=those_of(Skipped, found),
-        without_accident=found.count(None),
+        accidents=those_of(LeadTimes, results),
+        skipped=those_of(Skipped, results),
+        without_accident=results.count(None),
     )

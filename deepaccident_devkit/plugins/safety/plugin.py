@@ -1,4 +1,4 @@
-"""What the plug-in `safety` offers."""
+"""The offers of the plug-in `safety`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""How accidents would have ended (`OutcomeTable`), and `PreventedResult`: those that braking after alarms prevents.
+"""How accidents would have ended (`OutcomeTable`), and which of them braking prevents.
 
-`AlarmOutcomes` asks one predictor's scores how accidents end as the threshold of an alarm moves.
+`AlarmOutcomes` returns how accidents end for one predictor's scores, as the threshold of an alarm
+moves; `PreventedResult` holds the figures.
 """
 
 from __future__ import annotations
@@ -34,11 +35,23 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-SETTINGS: Final = tuple(f"{each.reaction:g} s, {each.deceleration:g} m/s²" for each in BRAKINGS)
+SETTINGS: Final = tuple(
+    f"{braking.reaction:g} s, {braking.deceleration:g} m/s²" for braking in BRAKINGS
+)
 """Names of the ways of braking, in the order of `BRAKINGS`: reaction time and deceleration."""
 NOMINAL: Final = SETTINGS[BRAKINGS.index(Braking(reaction=1.0, deceleration=6.0))]
 """The setting of the headline, in the middle of the nine."""
+BUDGET: Final = 1.0
+"""Braking seconds a minute, on recordings without an accident, that the headline allows."""
+CURVE_ROWS: Final = 101
+"""Largest number of thresholds of a curve, besides the row without an alarm."""
 _NO_FRAME: Final = np.iinfo(np.int64).min
+_REACTIONS: Final = tuple(dict.fromkeys(braking.reaction for braking in BRAKINGS))
+# (K,) index in `_REACTIONS` of each way of braking.
+_REACTION_INDEX: Final = np.array([_REACTIONS.index(braking.reaction) for braking in BRAKINGS])
+_NOMINAL_REACTION: Final = int(_REACTION_INDEX[SETTINGS.index(NOMINAL)])
+# Braking seconds by which a sum of floats may exceed the budget.
+_BUDGET_TOLERANCE_S: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,13 +59,13 @@ class OutcomeTable(FrozenArrays):
     """How one accident ends for each moment of the first alarm; arrays are read-only.
 
     Attributes:
-        frame: (W,) int64 frame numbers of possible first alarms, ascending.
-        outcome: (L, W + 1, K) int8 positions in `safety.OUTCOMES` after each latency, for each first alarm and setting;
-            the last of the W + 1 is that without an alarm.
-        extrapolated: (L, W + 1, K) bool, whether the two touch only after the recording's end, where both go
-            straight on.
-        latencies: L seconds from the alarm to the warning of those who brake.
-        pedestrian: whether one of the two that collide is a pedestrian.
+        frame: Frame numbers of possible first alarms, shape (W,), int64, ascending.
+        outcome: Indices in `collisions.OUTCOMES`, shape (L, W + 1, K), int8, by latency, first
+            alarm and setting; the last of the W + 1 is the outcome without an alarm.
+        extrapolated: Whether the two touch only after the recording's end, where both go straight
+            on, shape (L, W + 1, K), bool.
+        latencies: L seconds from the alarm to the warning of the drivers that brake.
+        pedestrian: Whether one of the colliding pair is a pedestrian.
     """
 
     frame: IntArray
@@ -62,13 +75,15 @@ class OutcomeTable(FrozenArrays):
     pedestrian: bool = False
 
     def __post_init__(self) -> None:
-        """Check the arrays against each other; raises EvaluationError."""
+        """Check the arrays against each other; raise EvaluationError."""
         FrozenArrays.__post_init__(self)
         shape = (len(self.latencies), len(self.frame) + 1, len(BRAKINGS))
         for name in ("outcome", "extrapolated"):
-            found = np.shape(getattr(self, name))
-            if found != shape:
-                raise EvaluationError(f"OutcomeTable.{name}: expected shape {shape}, found {found}")
+            actual = np.shape(getattr(self, name))
+            if actual != shape:
+                raise EvaluationError(
+                    f"OutcomeTable.{name}: expected shape {shape}, found {actual}"
+                )
         if np.any(np.diff(self.frame) <= 0):
             raise EvaluationError("OutcomeTable.frame: expected ascending frame numbers; sort them")
         if not np.isin(self.outcome, range(len(OUTCOMES))).all():
@@ -77,10 +92,13 @@ class OutcomeTable(FrozenArrays):
             )
 
     def rows(self, frames: IntArray) -> IntArray:
-        """(C,) which of the W + 1 rows a first alarm at each frame has; the last one for frames of no sample."""
-        place = np.searchsorted(self.frame, frames)
-        there = np.append(self.frame, _NO_FRAME)[place] == frames
-        return np.where(there, place, len(self.frame))
+        """Return which of the W + 1 rows a first alarm at each frame has, shape (C,).
+
+        Frames without a sample have the last row.
+        """
+        position = np.searchsorted(self.frame, frames)
+        has_sample = np.append(self.frame, _NO_FRAME)[position] == frames
+        return np.where(has_sample, position, len(self.frame))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,10 +106,11 @@ class AccidentOutcomes(ShortRepr):
     """The tables of accidents, and the scenarios without one.
 
     Attributes:
-        tables: recording, such as `type1_subtype1_accident/Town03_…/ego_vehicle` → its accident's table, with those
-            braking whom this agent warns.
-        dropped: scenarios whose labels do not show the two near each other at the impact, so that no braking is judged.
-        skipped: scenarios of which the labels or the meta file do not say who moves how.
+        tables: Recording, such as `type1_subtype1_accident/Town03_…/ego_vehicle` → its accident's
+            table, for the drivers that this agent warns.
+        dropped: Scenarios that are not judged, as their labels do not show the two near each other
+            at the impact.
+        skipped: Scenarios with labels or a meta file that do not show how the two move.
     """
 
     tables: Mapping[str, OutcomeTable] = field(default_factory=dict)
@@ -99,22 +118,21 @@ class AccidentOutcomes(ShortRepr):
     skipped: tuple[Skipped, ...] = ()
 
 
-BUDGET: Final = 1.0
-"""Braking seconds a minute, on recordings without an accident, that the headline allows."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutcomeFigures(FrozenMappings):
-    """How the accidents of one group end, for one way of braking and one threshold. NaN: nothing to count.
+    """How the accidents of one group end, for one way of braking and one threshold.
+
+    NaN where there is nothing to count.
 
     Attributes:
-        warned: share of the accidents with an alarm that counts.
-        shares: class of `safety.OUTCOMES` → share of the accidents; missed ones end as they were recorded.
-        counts: class → accidents; empty where the shares are means over draws.
-        extrapolated: share that touches only after the recording's end, where both are taken to go straight on: if the
-            replay ended there, these would count as avoided.
-        braking_seconds_per_minute: the cost, on recordings without an accident: of each run of alarmed frames what is
-            left after the reaction time.
+        warned: Share of the accidents with an alarm that counts.
+        shares: Class of `collisions.OUTCOMES` → share of the accidents; missed ones end as they
+            were recorded.
+        counts: Class → accidents; empty where the shares are means over draws.
+        extrapolated: Share that touches only after the recording's end, where both are assumed to
+            go straight on; if the replay ended there, these would count as avoided.
+        braking_seconds_per_minute: Cost on recordings without an accident: the length of each run
+            of alarmed frames less the reaction time.
     """
 
     warned: float
@@ -133,16 +151,19 @@ class PreventionFigures(FrozenMappings):
     """What one predictor's alarms prevent in one group of recordings.
 
     Attributes:
-        threshold: the lowest score that is an alarm; NaN where none is known, infinite where any alarm costs too much.
-        quiet_braking: the lowest threshold with at most one braking second a minute at a reaction of 1 s; to be given
-            when another split is evaluated.
-        accidents: how many are judged.
-        recordings: those without an accident.
-        minutes: of these, up to where they count.
-        right: who brakes is warned by the first right alarm.
-        any_alarm: likewise by the first alarm of all, which may be of others or of another moment.
-        lasting: likewise by the first alarm that lasts longer than the reaction, as those do that cost anything. So
-            alarms that flicker, such as random ones, prevent nothing for free.
+        threshold: Lowest score that is an alarm; NaN if unknown, infinite if any alarm costs too
+            much.
+        quiet_braking: Lowest threshold with at most one braking second a minute at a reaction of 1
+            s; to be passed when another split is evaluated.
+        accidents: Number of judged accidents.
+        recordings: Number of recordings without an accident.
+        minutes: Their duration, up to where they count.
+        right: Figures if the first right alarm warns the drivers.
+        any_alarm: Figures if the very first alarm warns them, even if it names other actors or
+            another moment.
+        lasting: Figures if the first alarm that lasts longer than the reaction warns them. Only
+            such alarms cost anything, so alarms that flicker, such as random ones, prevent nothing
+            for free.
     """
 
     threshold: float
@@ -157,13 +178,17 @@ class PreventionFigures(FrozenMappings):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreventionCurve(FrozenArrays):
-    """Shares prevented against the cost as the threshold falls, without latency; arrays are read-only.
+    """Shares prevented against the cost as the threshold falls, without latency.
+
+    The arrays are read-only.
 
     Attributes:
-        threshold: (C,) descending; the first is infinite: no alarm.
-        braking_seconds_per_minute: (C, K) the cost in the order of `SETTINGS`; never falls along C.
-        avoided: (C, K) share of the accidents that do not happen.
-        mitigated: (C, K) share of those with a change of speed that is smaller by a tenth or more.
+        threshold: Thresholds, shape (C,), descending; the first is infinite: no alarm.
+        braking_seconds_per_minute: Cost in the order of `SETTINGS`, shape (C, K); never falls along
+            C.
+        avoided: Share of the accidents that do not happen, shape (C, K).
+        mitigated: Share of the accidents with a change of speed that is smaller by a tenth or more,
+            shape (C, K).
     """
 
     threshold: FloatArray
@@ -174,18 +199,22 @@ class PreventionCurve(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreventedResult(FrozenMappings):
-    """Prevented accidents, by group (`recordings.GROUPS`); accidents of pedestrians are groups of their own.
+    """Prevented accidents, by group (`recordings.GROUPS`).
+
+    Accidents of pedestrians are groups of their own.
 
     Attributes:
-        operating_by: `given` threshold, or `budget`: at most one braking second a minute on these very recordings.
-        alarms: `right` or `any_alarm`: which of these the headline and the curves are of.
-        groups: group → figures of the predictions.
-        references: predictor (of `recordings.PREDICTORS` but the given one; a random one also at its own
-            `quiet_braking`) → the same; empty for resamples.
-        curves: group → curve of the predictions; empty for resamples.
-        dropped: accidents that no braking is judged of, and why: their labels do not show the two near each other.
-        skipped: accidents whose motion is not known, and why.
-        notes: sentences that a reader of the numbers should know.
+        operating_by: `given` threshold, or `budget`: at most one braking second a minute on these
+            very recordings.
+        alarms: `right` or `any_alarm`: the kind of alarm of the headline and the curves.
+        groups: Group → figures of the predictions.
+        references: Reference predictor of `recordings.PREDICTORS` (a random one also at its own
+            `quiet_braking`) → group → figures; empty for resamples.
+        curves: Group → curve of the predictions; empty for resamples.
+        dropped: Accidents without a judgement of braking, and why: their labels do not show the two
+            near each other.
+        skipped: Accidents with unknown motion, and why.
+        notes: Sentences that a reader of the numbers should know.
     """
 
     rows: ClassVar[tuple[Row, ...]] = (
@@ -204,39 +233,38 @@ class PreventedResult(FrozenMappings):
     notes: tuple[str, ...] = ()
 
     def avoided(self, group: str) -> float:
-        """The headline: the share avoided in the setting `NOMINAL`, without latency; NaN for none."""
-        ends: FiguresByLatency = getattr(self.groups[group], self.alarms)
-        return next((each[NOMINAL].shares[OUTCOMES[0]] for each in ends.values()), math.nan)
-
-
-CURVE_ROWS: Final = 101
-"""Thresholds of a curve, at most, beside that without an alarm."""
-_REACTIONS: Final = tuple(dict.fromkeys(each.reaction for each in BRAKINGS))
-_REACTION_OF: Final = np.array([_REACTIONS.index(each.reaction) for each in BRAKINGS])
-_NOMINAL_REACTION: Final = int(_REACTION_OF[SETTINGS.index(NOMINAL)])
-_SLACK: Final = 1e-9
+        """Return the headline: the share avoided at `NOMINAL` without latency; NaN for none."""
+        by_latency: FiguresByLatency = getattr(self.groups[group], self.alarms)
+        for figures in by_latency.values():
+            return figures[NOMINAL].shares[OUTCOMES[0]]
+        return math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Alarms(FrozenArrays):
-    """At one threshold: (P, R) column of the first alarm in each accident by reaction, and of the first that lasts.
+    """The alarms at one threshold.
 
-    And (R, M) braking seconds in the recordings without an accident.
+    Attributes:
+        first_column: Column of the first alarm in each accident by reaction, shape (P, R).
+        lasting_column: Column of the first alarm that lasts longer than the reaction, shape (P, R).
+        seconds: Braking seconds in the recordings without an accident, shape (R, M).
     """
 
-    first: IntArray
-    first_lasting: IntArray
+    first_column: IntArray
+    lasting_column: IntArray
     seconds: FloatArray
 
 
 class AlarmOutcomes:
-    """One predictor's scores of one group of recordings with the ends of its accidents, to be asked with any weights.
+    """One predictor's scores of a group of recordings, with the outcomes of its accidents.
+
+    Every method takes weights of the recordings, so that resamples can be evaluated.
 
     Attributes:
-        part: (N,) which group of samples each recording is of.
-        accident: (P,) rows of the accidents that are judged.
-        normal: (M,) rows of the recordings without an accident.
-        levels: scores, ascending: all thresholds that differ.
+        part: Group of samples of each recording, shape (N,).
+        accident: Rows of the judged accidents, shape (P,).
+        normal: Rows of the recordings without an accident, shape (M,).
+        levels: All different scores, ascending: the possible thresholds.
     """
 
     def __init__(
@@ -247,104 +275,118 @@ class AlarmOutcomes:
         outcomes: Mapping[str, OutcomeTable],
         draw: int = 0,
     ) -> None:
-        """Count what figures at any threshold need; accidents without a table are not judged."""
+        """Prepare what figures at any threshold need; accidents without a table are not judged."""
         self._series = series_of(recordings, predictor, scores_of, draw)
-        self.part = np.array([each.part for each in recordings], dtype=np.int64)
-        judged = [each.kind == "accident" and each.name in outcomes for each in recordings]
-        self.accident, self.normal = np.flatnonzero(judged), np.flatnonzero(~self._series.positive)
+        self.part = np.array([recording.part for recording in recordings], dtype=np.int64)
+        is_judged = [
+            recording.kind == "accident" and recording.name in outcomes for recording in recordings
+        ]
+        self.accident = np.flatnonzero(is_judged)
+        self.normal = np.flatnonzero(~self._series.positive)
         valid = self._series.valid
         self._scores = np.where(valid, self._series.scores, -np.inf)
         self._seconds = valid[self.normal].sum(axis=1) / self._series.fps
-        counting = self._scores[np.concatenate([self.accident, self.normal])]
-        self.levels = np.unique(counting[np.isfinite(counting)])
-        own = [outcomes[recordings[row].name] for row in self.accident.tolist()]
-        self._latencies = own[0].latencies if own else (0.0,)
-        rows = [
-            table.rows(self._frames(recordings[row]))
-            for table, row in zip(own, self.accident.tolist(), strict=True)
-        ]
-        shape = (len(own), len(self._latencies), self._series.scores.shape[1] + 1, len(BRAKINGS))
-        self._outcome, self._extrapolated = (
-            np.array(
-                [getattr(table, name)[:, each] for table, each in zip(own, rows, strict=True)]
-            ).reshape(shape)
-            for name in ("outcome", "extrapolated")
-        )
-        self._found: dict[float, _Alarms] = {}
+        counted_scores = self._scores[np.concatenate([self.accident, self.normal])]
+        self.levels = np.unique(counted_scores[np.isfinite(counted_scores)])
+        accidents = [recordings[row] for row in self.accident.tolist()]
+        tables = [outcomes[recording.name] for recording in accidents]
+        self._latencies = tables[0].latencies if tables else (0.0,)
+        outcome, extrapolated = [], []
+        for table, recording in zip(tables, accidents, strict=True):
+            rows = table.rows(self._frames(recording))
+            outcome.append(table.outcome[:, rows])
+            extrapolated.append(table.extrapolated[:, rows])
+        columns = self._series.scores.shape[1] + 1
+        shape = (len(tables), len(self._latencies), columns, len(BRAKINGS))
+        self._outcome = np.array(outcome).reshape(shape)
+        self._extrapolated = np.array(extrapolated).reshape(shape)
+        self._alarms_by_threshold: dict[float, _Alarms] = {}
 
     def __repr__(self) -> str:
-        return f"AlarmOutcomes({len(self.accident):,} accidents, {len(self.normal):,} others, {self._series!r})"
+        accidents, normal = len(self.accident), len(self.normal)
+        return f"AlarmOutcomes({accidents:,} accidents, {normal:,} others, {self._series!r})"
 
     def minutes(self, weight: FloatArray) -> float:
-        """Of the recordings without an accident."""
+        """Return the weighted duration of the recordings without an accident."""
         return float((self._seconds * weight[self.normal]).sum()) / MINUTE
 
     def costs(self, threshold: float, weight: FloatArray) -> FloatArray:
-        """(K,) braking seconds a minute of each setting; NaN without a recording that has no accident."""
+        """Return the braking seconds a minute of each setting, shape (K,).
+
+        NaN if every recording has an accident.
+        """
         minutes = self.minutes(weight)
-        seconds = self._at(threshold).seconds @ weight[self.normal]
-        return np.asarray(
-            np.array([ratio(each, minutes) for each in seconds.tolist()])[_REACTION_OF]
-        )
+        seconds = self._alarms_at(threshold).seconds @ weight[self.normal]
+        by_reaction = np.array([ratio(value, minutes) for value in seconds.tolist()])
+        return np.asarray(by_reaction[_REACTION_INDEX])
 
     def quiet_braking(self, weight: FloatArray) -> float:
-        """The lowest threshold within the budget at the nominal reaction; infinite if there is none, NaN without cost.
+        """Return the lowest threshold within the budget at the nominal reaction.
 
-        A higher threshold splits and shortens runs of alarmed frames alone, so that the cost never rises with it.
+        Infinite if there is none, NaN without recordings to measure the cost. A higher threshold
+        only splits and shortens runs of alarmed frames, so the cost never rises with it.
         """
         minutes = self.minutes(weight)
         if not minutes:
             return math.nan
-        most = BUDGET * minutes + _SLACK
+        max_seconds = BUDGET * minutes + _BUDGET_TOLERANCE_S
 
         def is_quiet(threshold: float) -> int:
-            return int(
-                float(self._at(threshold).seconds[_NOMINAL_REACTION] @ weight[self.normal]) <= most
-            )
+            by_recording = self._alarms_at(threshold).seconds[_NOMINAL_REACTION]
+            return int(float(by_recording @ weight[self.normal]) <= max_seconds)
 
-        place = bisect_left(self.levels.tolist(), 1, key=is_quiet)
-        return float(self.levels[place]) if place < len(self.levels) else math.inf
+        position = bisect_left(self.levels.tolist(), 1, key=is_quiet)
+        if position < len(self.levels):
+            return float(self.levels[position])
+        return math.inf
 
     def ends(
         self, threshold: float, weight: FloatArray, *, lasting: bool = False
     ) -> FiguresByLatency:
-        """Latency → setting → figures at a threshold, with (N,) weights of the recordings; all NaN at NaN.
+        """Return the figures at a threshold, by latency and setting; all NaN at NaN.
 
-        If `lasting`, alarms warn only if they outlast the reaction time.
+        Args:
+            threshold: Lowest score that is an alarm.
+            weight: Weights of the recordings, shape (N,).
+            lasting: Whether only alarms that outlast the reaction time warn.
         """
-        unknown = math.isnan(threshold)
-        alarms = self._at(math.inf if unknown else threshold)
-        columns = alarms.first_lasting if lasting else alarms.first
-        costs = np.full(len(BRAKINGS), math.nan) if unknown else self.costs(threshold, weight)
-        counting = weight[self.accident] * (math.nan if unknown else 1.0)
-        warned = (
-            (counting[:, None] * (columns < self._series.scores.shape[1]))
-            .sum(axis=0)[_REACTION_OF]
-            .tolist()
-        )
-        found: dict[float, dict[str, OutcomeFigures]] = {}
-        for place, latency in enumerate(self._latencies):
-            sums, beyond = self._sums(place, columns, counting)
-            found[latency] = {
+        is_unknown = math.isnan(threshold)
+        alarms = self._alarms_at(math.inf if is_unknown else threshold)
+        columns = alarms.lasting_column if lasting else alarms.first_column
+        accident_weight = weight[self.accident] * (math.nan if is_unknown else 1.0)
+        if is_unknown:
+            costs = np.full(len(BRAKINGS), math.nan)
+        else:
+            costs = self.costs(threshold, weight)
+        has_alarm = columns < self._series.scores.shape[1]
+        warned_by_reaction = (accident_weight[:, None] * has_alarm).sum(axis=0)
+        warned = warned_by_reaction[_REACTION_INDEX].tolist()
+        total = float(accident_weight.sum())
+        by_latency: dict[float, dict[str, OutcomeFigures]] = {}
+        for index, latency in enumerate(self._latencies):
+            sums, extrapolated = self._sums(index, columns, accident_weight)
+            by_latency[latency] = {
                 setting: _figures(
-                    sums[row],
-                    float(beyond[row]),
-                    warned[row],
-                    float(counting.sum()),
-                    float(costs[row]),
+                    sums[row], float(extrapolated[row]), warned[row], total, float(costs[row])
                 )
                 for row, setting in enumerate(SETTINGS)
             }
-        return found
+        return by_latency
 
     def curve(self) -> PreventionCurve:
-        """The curve over the thresholds that differ, or over some of them spread evenly."""
+        """Return the curve over all different thresholds, or over some of them spread evenly."""
         weight = np.ones(len(self.part))
-        rows = np.unique(np.rint(np.linspace(0, len(self.levels) - 1, CURVE_ROWS)).astype(np.int64))
-        levels = [math.inf, *(self.levels[rows][::-1].tolist() if len(self.levels) else [])]
-        counting = weight[self.accident]
-        sums = np.array([self._sums(0, self._at(level).first, counting)[0] for level in levels])
-        shares = sums / (len(counting) or math.nan)
+        positions = np.linspace(0, len(self.levels) - 1, CURVE_ROWS)
+        rows = np.unique(np.rint(positions).astype(np.int64))
+        levels = [math.inf]
+        if len(self.levels):
+            levels += self.levels[rows][::-1].tolist()
+        accident_weight = weight[self.accident]
+        sums = []
+        for level in levels:
+            class_sums, _ = self._sums(0, self._alarms_at(level).first_column, accident_weight)
+            sums.append(class_sums)
+        shares = np.array(sums) / (len(accident_weight) or math.nan)
         return PreventionCurve(
             threshold=np.array(levels),
             braking_seconds_per_minute=np.array([self.costs(level, weight) for level in levels]),
@@ -353,50 +395,60 @@ class AlarmOutcomes:
         )
 
     def _frames(self, recording: Recording) -> IntArray:
-        """(T + 1,) frame number of each column of the scores; −1, no frame, of the one after the last."""
+        """Return the frame number of each column of the scores, shape (T + 1,).
+
+        The column after the last one has −1, which is no frame.
+        """
         step = round(1 / (self._series.fps * FRAME_PERIOD))
         return np.append(recording.frame[0] + step * np.arange(self._series.scores.shape[1]), -1)
 
-    def _at(self, threshold: float) -> _Alarms:
-        """The alarms at a threshold; kept."""
-        if threshold not in self._found:
+    def _alarms_at(self, threshold: float) -> _Alarms:
+        """Return the alarms at a threshold, which are cached."""
+        if threshold not in self._alarms_by_threshold:
             alarm, fps = self._scores >= threshold, self._series.fps
-            accidents, normal = (
-                AlarmRuns.of(alarm[rows], fps) for rows in (self.accident, self.normal)
+            accident_runs = AlarmRuns.of(alarm[self.accident], fps)
+            normal_runs = AlarmRuns.of(alarm[self.normal], fps)
+            first_column = self._series.first(np.array([threshold]))[self.accident]
+            lasting_columns = [accident_runs.first_lasting(reaction) for reaction in _REACTIONS]
+            seconds = [normal_runs.braking_seconds(reaction) for reaction in _REACTIONS]
+            self._alarms_by_threshold[threshold] = _Alarms(
+                first_column=np.repeat(first_column, len(_REACTIONS), axis=1),
+                lasting_column=np.stack(lasting_columns, axis=1),
+                seconds=np.stack(seconds),
             )
-            first = self._series.first(np.array([threshold]))[self.accident]
-            self._found[threshold] = _Alarms(
-                first=np.repeat(first, len(_REACTIONS), axis=1),
-                first_lasting=np.stack(
-                    [accidents.first_lasting(each) for each in _REACTIONS], axis=1
-                ),
-                seconds=np.stack([normal.braking_seconds(each) for each in _REACTIONS]),
-            )
-        return self._found[threshold]
+        return self._alarms_by_threshold[threshold]
 
     def _sums(
-        self, latency: int, columns: IntArray, weight: FloatArray
+        self, latency_index: int, columns: IntArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """(K, C) weights of the accidents of each class and setting, and (K,) of those that are extrapolated."""
-        at = (
+        """Return the weights of the accidents by setting and class, and of the extrapolated ones.
+
+        Shapes are (K, C) and (K,).
+        """
+        index = (
             np.arange(len(self.accident))[:, None],
-            latency,
-            columns[:, _REACTION_OF],
+            latency_index,
+            columns[:, _REACTION_INDEX],
             np.arange(len(BRAKINGS)),
         )
-        codes = self._outcome[at]
-        sums = [((codes == code) * weight[:, None]).sum(axis=0) for code in range(len(OUTCOMES))]
-        return np.stack(sums, axis=1), (self._extrapolated[at] * weight[:, None]).sum(axis=0)
+        codes = self._outcome[index]
+        column_weight = weight[:, None]
+        sums = [((codes == code) * column_weight).sum(axis=0) for code in range(len(OUTCOMES))]
+        extrapolated = (self._extrapolated[index] * column_weight).sum(axis=0)
+        return np.stack(sums, axis=1), extrapolated
 
 
 def _figures(
-    sums: FloatArray, beyond: float, warned: float, accidents: float, cost: float
+    sums: FloatArray, extrapolated: float, warned: float, accidents: float, cost: float
 ) -> OutcomeFigures:
-    known = {name: float(each) for name, each in zip(OUTCOMES, sums, strict=True)}
+    by_class = {name: float(value) for name, value in zip(OUTCOMES, sums, strict=True)}
+    counts: dict[str, int] = {}
+    if not math.isnan(accidents):
+        counts = {name: round(value) for name, value in by_class.items()}
     return OutcomeFigures(
         warned=ratio(warned, accidents),
-        shares={name: ratio(each, accidents) for name, each in known.items()},
-        counts={} if math.isnan(accidents) else {name: round(each) for name, each in known.items()},
-        extrapolated=ratio(beyond, accidents),
+        shares={name: ratio(value, accidents) for name, value in by_class.items()},
+        counts=counts,
+        extrapolated=ratio(extrapolated, accidents),
         braking_seconds_per_minute=cost,
     )

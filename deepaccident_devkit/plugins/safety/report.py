@@ -1,4 +1,4 @@
-"""`safety_report`: the accidents of a release from every side, a row an accident."""
+"""`safety_report`: all that is known of a release's accidents, with a row for each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deepaccident_devkit.interactions import InteractionConfig, InteractionPairs
 from deepaccident_devkit.plugins.safety.avoidability_report import (
     AvoidabilityReport,
     Dropped,
-    looked_into,
+    replay_accident,
     report_of,
 )
 from deepaccident_devkit.plugins.safety.lead_times import (
@@ -44,16 +44,16 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 
-# Seconds: the time to collision under which a pair counts as exposed.
+# Time to collision in seconds below which a pair counts as exposed.
 CRITICAL_TTC: Final = InteractionConfig().taus[0]
-# m/s² of the last moments to brake.
-DECELERATIONS: Final = tuple(sorted({each.deceleration for each in BRAKINGS}))
+# Decelerations in m/s² of the last moments to brake.
+DECELERATIONS: Final = tuple(sorted({braking.deceleration for braking in BRAKINGS}))
 _SIDES: Final = ("first", "second")
-_OF_COLLIDERS: Final = ("actor_id", "category", "agent", "turn", "speed", "side", "delta_v")
+_COLLIDER_COLUMNS: Final = ("actor_id", "category", "agent", "turn", "speed", "side", "delta_v")
 # Columns of the CSV file.
 ROW_HEADING: Final = (
     "scenario",
-    *(f"{side}_{name}" for side in _SIDES for name in _OF_COLLIDERS),
+    *(f"{side}_{name}" for side in _SIDES for name in _COLLIDER_COLUMNS),
     *("gap", "closing_speed", "impact_angle", "margin", "head_on", "time_exposed", "pet"),
     *(f"lead_{agent}" for agent in AGENTS),
     "lead_all",
@@ -66,13 +66,13 @@ ROW_HEADING: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairMeasures:
-    """Measures of the colliders over the recording; None for what is not known.
+    """Measures of the colliders over the recording; None for unknown values.
 
-    Their least time to collision is left out: it is 0 where they touch.
+    Their smallest time to collision is left out: it is 0 where they touch.
 
     Attributes:
-        time_exposed: seconds with a time to collision of at most `CRITICAL_TTC`.
-        pet: post-encroachment time, seconds; 0 if their boxes touch.
+        time_exposed: Seconds with a time to collision of at most `CRITICAL_TTC`.
+        pet: Post-encroachment time in seconds; 0 if their boxes touch.
     """
 
     time_exposed: float | None
@@ -80,13 +80,15 @@ class PairMeasures:
 
     @classmethod
     def of(cls, pairs: InteractionPairs, first: int, second: int) -> PairMeasures | None:
-        """Those of two actors in `interactions(…).pairs`; None if they never come under a threshold there."""
-        at = pairs.position(first, second)
-        return (
-            None
-            if at is None
-            else cls(time_exposed=known(pairs.tet[at, 0], 2), pet=known(abs(pairs.pet[at]), 2))
-        )
+        """Return the measures of two actors in `interactions(…).pairs`.
+
+        None if the two never come under a threshold there.
+        """
+        index = pairs.position(first, second)
+        if index is None:
+            return None
+        time_exposed, pet = known(pairs.tet[index, 0], 2), known(abs(pairs.pet[index]), 2)
+        return cls(time_exposed=time_exposed, pet=pet)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,11 +96,12 @@ class AccidentRow(ShortRepr):
     """An accident.
 
     Attributes:
-        story: its facts, and sentences of them.
-        replayed: until when braking would have avoided it; None if the recording does not show it.
-        times: how long before the impact sets of agents observed both; None if there are no labels of the ego.
-        twin: where it parts from its twin; None without one.
-        measures: of the colliders over the recording.
+        story: Its facts, and sentences about them.
+        replayed: Until when braking would have avoided it; None if the recording does not show it.
+        times: How long before the impact sets of agents observed both colliders; None if the ego
+            has no labels.
+        twin: Where it parts from its twin; None without a twin.
+        measures: Measures of the colliders over the recording.
     """
 
     story: Story
@@ -109,70 +112,80 @@ class AccidentRow(ShortRepr):
 
     @property
     def scenario(self) -> str:
-        """Token."""
+        """Token of the scenario."""
         return str(self.story.facts["scenario"])
 
     @property
     def colliders(self) -> list[dict[str, Any]]:
-        """The two as the story's facts tell them."""
+        """The two colliders, as facts of the story."""
         return list(self.story.facts["accident"]["pair"])
 
     @property
     def names(self) -> list[str]:
-        """What the two are called."""
-        return [actor_name(each) for each in self.colliders]
+        """Names of the two colliders."""
+        return [actor_name(collider) for collider in self.colliders]
 
     @property
     def severity(self) -> float:
-        """The larger delta-v of the two, m/s; −1 if none is known."""
-        return max(
-            (each["delta_v"] for each in self.colliders if each["delta_v"] is not None),
-            default=-1.0,
-        )
+        """The larger delta-v of the two, m/s; −1 if neither is known."""
+        values = [collider["delta_v"] for collider in self.colliders]
+        return max((value for value in values if value is not None), default=-1.0)
 
     @property
     def leads(self) -> dict[str, float | None]:
-        """Agent → seconds before the impact at which it alone first observes both; then `all`. None: not there."""
-        seen = self.story.facts["accident"]["seen"]
+        """Agent → seconds before the impact at which it first observes both; then `all`.
+
+        None for an agent without an observation.
+        """
+        lead_by_agent = self.story.facts["accident"]["seen"]
         together = None if self.times is None else round(self.times.together, 1)
-        return {**{agent: seen.get(agent) for agent in AGENTS}, "all": together}
+        return {**{agent: lead_by_agent.get(agent) for agent in AGENTS}, "all": together}
 
     @property
     def brakes(self) -> list[str | None]:
-        """Who brakes in `last_moments`: the ego alone if it collides, both else; None for one that is no agent."""
+        """The drivers that brake in `last_moments`: only the ego if it collides, otherwise both.
+
+        None for a driver that is no agent.
+        """
         braking = self.story.facts["accident"]["braking"]
-        return [] if braking is None else list(braking["by"])
+        if braking is None:
+            return []
+        return list(braking["by"])
 
     @property
     def last_moments(self) -> dict[float, float | None]:
-        """Deceleration → seconds before the impact at which braking still avoids it; None if it never does."""
+        """Deceleration → last seconds before the impact to brake and avoid it; None if too late."""
         if self.replayed is None:
             return {}
         row = BRAKERS.index("both")
         if len(self.brakes) == 1:
             row = self.replayed.accident.agents.index("ego_vehicle")
-        values = zip(
-            self.replayed.decelerations.tolist(), self.replayed.slack[row].tolist(), strict=True
-        )
-        return {deceleration: known(slack, 2) for deceleration, slack in values}
+        decelerations, slacks = self.replayed.decelerations, self.replayed.slack[row]
+        return {
+            deceleration: known(slack, 2)
+            for deceleration, slack in zip(decelerations.tolist(), slacks.tolist(), strict=True)
+        }
 
     @property
     def parts(self) -> float | None:
-        """Seconds before the impact at which the first actor acts otherwise in the twin; None if none does."""
+        """Seconds before the impact at which the first actor acts differently in the twin.
+
+        None if no actor does.
+        """
         return None if self.twin is None else known(self.twin.to_dict()["time_to_impact"], 1)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; None for what is not known."""
+        """Return the values for JSON; None for unknown values."""
         accident = self.story.facts["accident"]
-        replayed = self.replayed
+        replayed, measures = self.replayed, self.measures
         return {
             "scenario": self.scenario,
             "colliders": self.colliders,
             **{name: accident[name] for name in ("gap", "closing_speed", "impact_angle")},
             "margin": None if replayed is None else replayed.check.margin,
             "head_on": None if replayed is None else replayed.head_on,
-            "time_exposed": None if self.measures is None else self.measures.time_exposed,
-            "pet": None if self.measures is None else self.measures.pet,
+            "time_exposed": None if measures is None else measures.time_exposed,
+            "pet": None if measures is None else measures.pet,
             "leads": self.leads,
             "brakes": self.brakes,
             "last_moments": {f"{key:g}": value for key, value in self.last_moments.items()},
@@ -184,41 +197,41 @@ class AccidentRow(ShortRepr):
 
 
 def actor_name(actor: Mapping[str, Any]) -> str:
-    """An actor of a story's facts: `ego (car)`, or `cyclist 1234` for one that is no agent."""
+    """Return the name of an actor of a story: `ego (car)`, or `cyclist 1234` if it is no agent."""
     category = actor["category"] or "road user"
-    return (
-        f"{short_name(actor['agent'])} ({category})"
-        if actor["agent"]
-        else f"{category} {actor['actor_id']}"
-    )
+    if actor["agent"]:
+        return f"{short_name(actor['agent'])} ({category})"
+    return f"{category} {actor['actor_id']}"
 
 
 def csv_row(row: AccidentRow) -> list[Any]:
-    """The cells of `ROW_HEADING`."""
-    told = row.to_dict()
-    colliders = [each[name] for each in row.colliders for name in _OF_COLLIDERS]
+    """Return the cells of `ROW_HEADING`."""
+    payload = row.to_dict()
+    colliders = [collider[name] for collider in row.colliders for name in _COLLIDER_COLUMNS]
     measures = ("gap", "closing_speed", "impact_angle", "margin", "head_on", "time_exposed", "pet")
     moments = [row.last_moments.get(deceleration) for deceleration in DECELERATIONS]
-    brakes = " ".join(each or "none" for each in row.brakes)
+    brakes = " ".join(agent or "none" for agent in row.brakes)
     return [
-        *(row.scenario, *colliders, *map(told.get, measures)),
-        *(*row.leads.values(), brakes, *moments, *map(told.get, ("twin", "twin_parts", "story"))),
+        *(row.scenario, *colliders, *map(payload.get, measures)),
+        *(*row.leads.values(), brakes, *moments),
+        *map(payload.get, ("twin", "twin_parts", "story")),
     ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyReport(Report):
-    """The accidents of a release, or of some of its scenarios, from every side.
+    """The accidents of a release, or of some of its scenarios, in all respects.
 
     Attributes:
-        scenarios: how many were looked at.
-        rows: an accident each, in the order of the release; also of those that cannot be replayed.
-        avoidability: until when braking would have avoided them.
-        ledger: who observed the colliders first.
-        twins: where they part from their normal twins.
-        normal: the stories of the scenarios that end without a collision, the most critical first: by the least time to
-            collision of two that move; those without one last.
-        broken: scenarios that the index leaves out (`on_error='skip'`), of the whole release.
+        scenarios: Number of examined scenarios.
+        rows: One row for each accident, in the order of the release, also if it cannot be replayed.
+        avoidability: Until when braking would have avoided them.
+        ledger: Who observed the colliders first.
+        twins: Where they part from their normal twins.
+        normal: Stories of the scenarios that end without a collision, the most critical first, by
+            the smallest time to collision of two moving actors; stories without such a time come
+            last.
+        broken: Scenarios that the index leaves out (`on_error='skip'`), of the entire release.
     """
 
     scenarios: int
@@ -231,7 +244,7 @@ class SafetyReport(Report):
 
     @property
     def dataroot(self) -> str:
-        """The release's folder."""
+        """Folder of the release."""
         return self.avoidability.dataroot
 
     @property
@@ -241,47 +254,50 @@ class SafetyReport(Report):
 
     @property
     def left_out(self) -> list[tuple[str, str, str]]:
-        """Scenario, what it is left out of, and why: each reason once."""
+        """Scenario, the parts that leave it out, and the reason; each reason once."""
+        unknown_facts = [
+            Skipped(scenario=story.facts["scenario"], reason=reason)
+            for story in self.normal
+            for reason in story.facts["unknown"]
+        ]
         parts = {
             "braking: dropped": self.avoidability.dropped,
             "braking: skipped": self.avoidability.skipped,
             "lead times": self.ledger.skipped,
             "twins": self.twins.skipped,
-            "stories": [
-                Skipped(scenario=each.facts["scenario"], reason=reason)
-                for each in self.normal
-                for reason in each.facts["unknown"]
-            ],
+            "stories": unknown_facts,
             "everything": self.broken,
         }
-        reasons: dict[tuple[str, str], list[str]] = {}
-        for name, skipped in parts.items():
-            for each in skipped:
-                reasons.setdefault((each.scenario, each.reason), []).append(name)
+        parts_by_reason: dict[tuple[str, str], list[str]] = {}
+        for name, omissions in parts.items():
+            for skipped in omissions:
+                parts_by_reason.setdefault((skipped.scenario, skipped.reason), []).append(name)
         return [
-            (scenario, ", ".join(names), reason) for (scenario, reason), names in reasons.items()
+            (scenario, ", ".join(names), reason)
+            for (scenario, reason), names in parts_by_reason.items()
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; None for what is not known."""
+        """Return the values for JSON; None for unknown values."""
+        left_out = [
+            {"scenario": scenario, "part": parts, "reason": reason}
+            for scenario, parts, reason in self.left_out
+        ]
         return {
             "dataroot": self.dataroot,
             "version": self.version,
             "fingerprint": self.twins.fingerprint,
             "scenarios": self.scenarios,
-            "accidents": [each.to_dict() for each in self.rows],
+            "accidents": [row.to_dict() for row in self.rows],
             "lead_times": self.ledger.to_dict()["summary"],
             "margins": dict(self.avoidability.margins),
-            "normal": [{**each.facts, "text": each.text} for each in self.normal],
-            "torn": [asdict(each) for each in self.twins.torn],
-            "left_out": [
-                dict(zip(("scenario", "part", "reason"), each, strict=True))
-                for each in self.left_out
-            ],
+            "normal": [{**story.facts, "text": story.text} for story in self.normal],
+            "torn": [asdict(twins) for twins in self.twins.torn],
+            "left_out": left_out,
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
-        """`accidents`, a row an accident (metres, seconds, m/s, degrees), and `left_out`."""
+        """Return `accidents`, a row for each (metres, seconds, m/s, degrees), and `left_out`."""
         return {
             "accidents": [ROW_HEADING, *map(csv_row, self.rows)],
             "left_out": [("scenario", "part", "reason"), *self.left_out],
@@ -289,8 +305,8 @@ class SafetyReport(Report):
 
 
 @dataclass(frozen=True, slots=True)
-class _Looked:
-    """What one scenario gives; Skipped says why there is nothing, None that there is no accident."""
+class _Examination:
+    """The results for one scenario; Skipped explains a missing one, None means no accident."""
 
     replayed: Avoidability | Skipped | Dropped | None
     times: LeadTimes | Skipped | None
@@ -302,51 +318,54 @@ class _Looked:
 def safety_report(
     dataset: Dataset,
     scenarios: Iterable[RowArgument] | None = None,
-    **how: Unpack[Engine],
+    **engine: Unpack[Engine],
 ) -> SafetyReport:
-    """Last moments to brake, lead times, twins and stories of scenarios, with each accident replayed once.
+    """Return last moments to brake, lead times, twins and stories of scenarios.
+
+    Each accident is replayed once.
 
     Args:
-        dataset: the release.
-        scenarios: tokens or records of those to look at, such as `find` gives; None for all.
-        **how: `workers`, `executor` and `progress`, as `parallel.Engine` says.
+        dataset: The release.
+        scenarios: Tokens or records of scenarios, such as `find` returns; None for all.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        TokenError: no such scenario.
+        TokenError: There is no such scenario.
     """
-    looked = those_of(
-        _Looked, each_scenario(_looked_at, dataset, scenarios, label="safety", at_once=1, **how)
-    )
+    results = each_scenario(_examine, dataset, scenarios, label="safety", at_once=1, **engine)
+    examinations = those_of(_Examination, results)
+    replays, times, twins, normal = [], [], [], []
+    for examination in examinations:
+        replays.append(examination.replayed)
+        times.append(examination.times)
+        twins.append(examination.twin)
+        if examination.story.facts["collision"] is False:
+            normal.append(examination.story)
+    broken = [
+        Skipped(scenario=problem.scenario, reason=" ".join(problem.messages))
+        for problem in dataset.problems
+    ]
     return SafetyReport(
-        scenarios=len(looked),
-        rows=tuple(_rows(looked)),
-        avoidability=report_of(dataset, [each.replayed for each in looked]),
-        ledger=ledger_of(dataset, [each.times for each in looked], ObservationRule()),
-        twins=twins_of(dataset, [each.twin for each in looked]),
-        normal=tuple(
-            sorted(
-                (each.story for each in looked if each.story.facts["collision"] is False),
-                key=_urgency,
-            )
-        ),
-        broken=tuple(
-            Skipped(scenario=each.scenario, reason=" ".join(each.messages))
-            for each in dataset.problems
-        ),
+        scenarios=len(examinations),
+        rows=tuple(_accident_rows(examinations)),
+        avoidability=report_of(dataset, replays),
+        ledger=ledger_of(dataset, times, ObservationRule()),
+        twins=twins_of(dataset, twins),
+        normal=tuple(sorted(normal, key=_urgency)),
+        broken=tuple(broken),
     )
 
 
-def _looked_at(dataset: Dataset, record: ScenarioRecord) -> _Looked:
-    replayed: Avoidability | Dropped | Skipped | None = tried(looked_into, dataset, record)
-    facts = scenario_facts(
-        dataset, record, replayed.why if isinstance(replayed, Dropped) else replayed
-    )
+def _examine(dataset: Dataset, record: ScenarioRecord) -> _Examination:
+    replayed: Avoidability | Dropped | Skipped | None = tried(replay_accident, dataset, record)
+    replay = replayed.why if isinstance(replayed, Dropped) else replayed
+    facts = scenario_facts(dataset, record, replay)
     measures = None
     if facts["accident"] is not None:
-        found = interactions(dataset, record).pairs
-        first, second = (each["actor_id"] for each in facts["accident"]["pair"])
-        measures = PairMeasures.of(found, first, second)
-    return _Looked(
+        pairs = interactions(dataset, record).pairs
+        actor_ids = [collider["actor_id"] for collider in facts["accident"]["pair"]]
+        measures = PairMeasures.of(pairs, *actor_ids)
+    return _Examination(
         replayed=replayed,
         times=tried(lead_times, dataset, record),
         twin=tried(partial(diff_of_accident, parting=Parting()), dataset, record),
@@ -355,19 +374,21 @@ def _looked_at(dataset: Dataset, record: ScenarioRecord) -> _Looked:
     )
 
 
-def _rows(looked: Iterable[_Looked]) -> Iterator[AccidentRow]:
-    for each in looked:
-        if each.story.facts["accident"] is not None:
-            yield AccidentRow(
-                story=each.story,
-                replayed=each.replayed if isinstance(each.replayed, Avoidability) else None,
-                times=None if isinstance(each.times, Skipped) else each.times,
-                twin=None if isinstance(each.twin, Skipped) else each.twin,
-                measures=each.measures,
-            )
+def _accident_rows(examinations: Iterable[_Examination]) -> Iterator[AccidentRow]:
+    for examination in examinations:
+        if examination.story.facts["accident"] is None:
+            continue
+        replayed, times, twin = examination.replayed, examination.times, examination.twin
+        yield AccidentRow(
+            story=examination.story,
+            replayed=replayed if isinstance(replayed, Avoidability) else None,
+            times=None if isinstance(times, Skipped) else times,
+            twin=None if isinstance(twin, Skipped) else twin,
+            measures=examination.measures,
+        )
 
 
 def _urgency(story: Story) -> tuple[float, str]:
     nearest = story.facts["nearest"]
-    least = None if nearest is None else nearest["min_ttc"]
-    return float("inf") if least is None else least, story.facts["scenario"]
+    min_ttc = None if nearest is None else nearest["min_ttc"]
+    return float("inf") if min_ttc is None else min_ttc, story.facts["scenario"]

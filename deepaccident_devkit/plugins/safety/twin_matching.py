@@ -1,4 +1,7 @@
-"""Which frame and which actor of a recording is which of its twin's, whose clock and ids may be others."""
+"""Matching of a recording to its twin: which frames and actors correspond.
+
+The clocks and the ids of the two recordings may differ.
+"""
 
 from __future__ import annotations
 
@@ -16,32 +19,35 @@ from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 MatchedBy = Literal["agent", "id", "start"]
-# Metres between two actors of one class at the first frame that shows both, at most, that may be the same.
+# Largest distance in metres, at the first frame that shows both, of two actors of one class that
+# may be the same actor.
 START_DISTANCE: Final = 2.0
-# Frames by which one recording may begin later than the other, at most.
-MOST_SHIFT: Final = 20
-# Frames at the beginning by which the shift is found.
-_COMPARED: Final = 20
-# Metres from which on it does not matter how far an agent is away: it goes its own way.
-_CAP: Final = 2.0
-# Metres by which a larger shift must be better.
-_CLEARLY: Final = 0.01
-# Agents with equal ids from which on equal ids are taken to mean the same actors.
-_FEWEST_AGENTS: Final = 2
+# Largest number of frames by which one recording may begin later than the other.
+MAX_SHIFT: Final = 20
+# Number of frames at the beginning that decide the shift.
+_COMPARED_FRAMES: Final = 20
+# Distance in metres at which the cost of an agent is capped: farther away, it goes its own way.
+_DISTANCE_CAP_M: Final = 2.0
+# Improvement of the mean distance in metres that a larger shift must bring.
+_MIN_IMPROVEMENT_M: Final = 0.01
+# Smallest number of agents with equal ids for which equal ids mean the same actors.
+_MIN_COMMON_AGENTS: Final = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TwinRecording(FrozenArrays):
-    """The N actors of a scenario over its F frames, from all agents' labels; world, metres, radians.
+    """The N actors of a scenario over its F frames, from all agents' labels.
+
+    Poses are in the world frame, metres, radians.
 
     Attributes:
-        scenario: token.
-        actor_id: (N,) CARLA ids, ascending.
-        category: (N,) positions in `taxonomy.CATEGORIES`.
-        size: (N, 3) length, width, height by the last label.
-        poses: (N, F, 3) x, y, yaw; NaN at frames at which nobody annotated the actor.
-        speeds: (N, F) m/s over the ground, likewise.
-        agents: the vehicles that record → their ids, as far as meta names them.
+        scenario: Token of the scenario.
+        actor_id: CARLA ids, shape (N,), ascending.
+        category: Indices in `taxonomy.CATEGORIES`, shape (N,).
+        size: Length, width, height by the last label, shape (N, 3).
+        poses: x, y, yaw, shape (N, F, 3); NaN at frames at which nobody annotated the actor.
+        speeds: Speeds over the ground in m/s, shape (N, F); NaN likewise.
+        agents: Vehicles that record → their ids, as far as meta names them.
     """
 
     scenario: str
@@ -54,11 +60,11 @@ class TwinRecording(FrozenArrays):
 
 
 def twin_recording(dataset: Dataset, scenario: str) -> TwinRecording:
-    """A scenario's actors as arrays.
+    """Return a scenario's actors as arrays.
 
     Raises:
-        TokenError: no such scenario.
-        NotAvailableError: it has no labels.
+        TokenError: There is no such scenario.
+        NotAvailableError: The scenario has no labels.
     """
     tracks = scenario_tracks(dataset, scenario)
     if not len(tracks.index):
@@ -66,57 +72,57 @@ def twin_recording(dataset: Dataset, scenario: str) -> TwinRecording:
             f"{scenario} has no labels (the test split ships without), which say where actors are"
         )
     frames = dataset.scenario.get(scenario)["num_frames"]
-    ids, first, which = np.unique(tracks.actor_id, return_index=True, return_inverse=True)
+    ids, first_rows, rows = np.unique(tracks.actor_id, return_index=True, return_inverse=True)
+    boxes, columns = tracks.boxes, tracks.index - 1
     poses, speeds = np.full((len(ids), frames, 3), np.nan), np.full((len(ids), frames), np.nan)
-    poses[which, tracks.index - 1] = np.column_stack([tracks.boxes.center[:, :2], tracks.boxes.yaw])
-    speeds[which, tracks.index - 1] = np.linalg.norm(tracks.boxes.velocity[:, :2], axis=1)
+    poses[rows, columns] = np.column_stack([boxes.center[:, :2], boxes.yaw])
+    speeds[rows, columns] = np.linalg.norm(boxes.velocity[:, :2], axis=1)
     size = np.zeros((len(ids), 3))
-    size[which] = tracks.boxes.size
-    own = {
+    size[rows] = boxes.size
+    actors = {
         name: dataset.agent.get(f"{scenario}/{name}")["actor_id"]
         for name in agents_of(dataset, scenario)
     }
     return TwinRecording(
         scenario=scenario,
         actor_id=ids,
-        category=tracks.boxes.category[first],
+        category=boxes.category[first_rows],
         size=size,
         poses=poses,
         speeds=speeds,
-        agents={name: actor for name, actor in own.items() if actor is not None},
+        agents={name: actor for name, actor in actors.items() if actor is not None},
     )
 
 
-def shift_of(first: TwinRecording, second: TwinRecording) -> int:
-    """By how many frames the same moment has a higher number in the second recording than in the first.
+def shift_of(recording: TwinRecording, twin: TwinRecording) -> int:
+    """Return how much higher the frame number of a moment is in the twin than in the recording.
 
-    Twins may begin at slightly different moments. The shift is the one with which the agents of both are nearest to
-    each other in the first two seconds; those that are more than `_CAP` metres apart are left out of account by that.
-    Without a clear answer it is 0.
+    Twins may begin at slightly different moments. The shift is the one with the smallest mean
+    distance between each agent and itself in the twin over the first two seconds, with distances
+    capped at `_DISTANCE_CAP_M`. Without a clear answer it is 0.
     """
-    pairs = _agent_rows(first, second)
-    frames = min(_COMPARED, first.poses.shape[1], second.poses.shape[1])
-    best, least = 0, np.inf
-    for shift in sorted(range(-MOST_SHIFT, MOST_SHIFT + 1), key=abs):
+    pairs = _agent_rows(recording, twin)
+    num_frames, twin_frames = recording.poses.shape[1], twin.poses.shape[1]
+    compared = min(_COMPARED_FRAMES, num_frames, twin_frames)
+    best_shift, lowest_cost = 0, np.inf
+    for shift in sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs):
         begin = max(0, -shift)
-        end = min(begin + frames, first.poses.shape[1], second.poses.shape[1] - shift)
-        if not pairs or end - begin < frames:
+        end = min(begin + compared, num_frames, twin_frames - shift)
+        if not pairs or end - begin < compared:
             continue
-        moved = (
-            second.poses[list(pairs.values()), begin + shift : end + shift]
-            - first.poses[list(pairs), begin:end]
-        )
-        apart = np.minimum(np.hypot(moved[..., 0], moved[..., 1]), _CAP)
-        if np.isnan(apart).all():
+        twin_poses = twin.poses[list(pairs.values()), begin + shift : end + shift]
+        offset = twin_poses - recording.poses[list(pairs), begin:end]
+        distance = np.minimum(np.hypot(offset[..., 0], offset[..., 1]), _DISTANCE_CAP_M)
+        if np.isnan(distance).all():
             continue
-        cost = float(np.nanmean(apart))
-        if cost < least - _CLEARLY:
-            best, least = shift, cost
-    return best
+        cost = float(np.nanmean(distance))
+        if cost < lowest_cost - _MIN_IMPROVEMENT_M:
+            best_shift, lowest_cost = shift, cost
+    return best_shift
 
 
 def shifted_recording(recording: TwinRecording, shift: int) -> TwinRecording:
-    """The recording on a clock whose frame 1 is its frame 1 + shift; NaN before its own first frame."""
+    """Return the recording on a clock that starts `shift` frames later; NaN before its start."""
     if not shift:
         return recording
     poses, speeds = recording.poses[:, max(shift, 0) :], recording.speeds[:, max(shift, 0) :]
@@ -128,44 +134,46 @@ def shifted_recording(recording: TwinRecording, shift: int) -> TwinRecording:
     )
 
 
-def matched_rows(first: TwinRecording, second: TwinRecording) -> dict[int, tuple[int, MatchedBy]]:
-    """Which actor of one recording is which of another's that begins alike.
+def matched_rows(recording: TwinRecording, twin: TwinRecording) -> dict[int, tuple[int, MatchedBy]]:
+    """Match the actors of a recording to the actors of its twin, which begins alike.
 
-    Agents are matched by their names. If at least two agents are in both recordings, and all of these have equal ids,
-    then actors of equal ids and classes are the same. The others are matched by where they start: at the first frame
-    that shows both, actors of one class that are at most `START_DISTANCE` apart, each with one other, so that the sum
-    of the distances is least.
+    Agents are matched by their names. If at least two agents are in both recordings, and all of
+    these have equal ids, then actors of equal ids and classes are the same. The others are matched
+    by where they start: at the first frame that shows both, actors of one class that are at most
+    `START_DISTANCE` apart, one to one, so that the sum of the distances is smallest.
 
     Returns:
-        Row of the first recording → row of the second, and by what.
+        Row of the recording → row of the twin, and what they were matched by.
     """
-    result: dict[int, tuple[int, MatchedBy]] = {
-        row: (other, "agent") for row, other in _agent_rows(first, second).items()
+    matches: dict[int, tuple[int, MatchedBy]] = {
+        row: (twin_row, "agent") for row, twin_row in _agent_rows(recording, twin).items()
     }
-    rows, other_rows = _rows_by_id(first), _rows_by_id(second)
-    common = [name for name in first.agents if name in second.agents]
-    if len(common) >= _FEWEST_AGENTS and all(
-        first.agents[name] == second.agents[name] for name in common
+    rows, twin_rows = _rows_by_id(recording), _rows_by_id(twin)
+    common = [name for name in recording.agents if name in twin.agents]
+    if len(common) >= _MIN_COMMON_AGENTS and all(
+        recording.agents[name] == twin.agents[name] for name in common
     ):
         for actor, row in rows.items():
-            other = other_rows.get(actor)
+            twin_row = twin_rows.get(actor)
             if (
-                row not in result
-                and other is not None
-                and first.category[row] == second.category[other]
+                row not in matches
+                and twin_row is not None
+                and recording.category[row] == twin.category[twin_row]
             ):
-                result[row] = (other, "id")
-    return {**result, **{row: (other, "start") for row, other in _by_start(first, second, result)}}
+                matches[row] = (twin_row, "id")
+    for row, twin_row in _match_by_start(recording, twin, matches):
+        matches[row] = (twin_row, "start")
+    return matches
 
 
-def _agent_rows(first: TwinRecording, second: TwinRecording) -> dict[int, int]:
-    """Row → row of the vehicles that record in both."""
-    rows, other_rows = _rows_by_id(first), _rows_by_id(second)
-    ids = [(actor, second.agents.get(name)) for name, actor in first.agents.items()]
+def _agent_rows(recording: TwinRecording, twin: TwinRecording) -> dict[int, int]:
+    """Return row → row of the twin for the vehicles that record in both."""
+    rows, twin_rows = _rows_by_id(recording), _rows_by_id(twin)
+    actor_pairs = [(actor, twin.agents.get(name)) for name, actor in recording.agents.items()]
     return {
-        rows[mine]: other_rows[theirs]
-        for mine, theirs in ids
-        if mine in rows and theirs in other_rows
+        rows[actor]: twin_rows[twin_actor]
+        for actor, twin_actor in actor_pairs
+        if actor in rows and twin_actor in twin_rows
     }
 
 
@@ -173,34 +181,40 @@ def _rows_by_id(recording: TwinRecording) -> dict[int | None, int]:
     return {actor: row for row, actor in enumerate(recording.actor_id.tolist())}
 
 
-def _by_start(
-    first: TwinRecording, second: TwinRecording, matched: Mapping[int, tuple[int, MatchedBy]]
+def _match_by_start(
+    recording: TwinRecording, twin: TwinRecording, matches: Mapping[int, tuple[int, MatchedBy]]
 ) -> list[tuple[int, int]]:
-    """Further rows that start near each other."""
+    """Match unmatched actors that start near each other; return their rows and the twin's rows."""
     from scipy.optimize import linear_sum_assignment
 
-    left = np.setdiff1d(np.arange(len(first.actor_id)), list(matched))
-    right = np.setdiff1d(np.arange(len(second.actor_id)), [other for other, _ in matched.values()])
-    apart = _start_distances(first, second)[np.ix_(left, right)]
-    near = apart <= START_DISTANCE
-    chosen = linear_sum_assignment(np.where(near, apart, 1e3 * START_DISTANCE))
+    matched_twin_rows = [twin_row for twin_row, _ in matches.values()]
+    rows = np.setdiff1d(np.arange(len(recording.actor_id)), list(matches))
+    twin_rows = np.setdiff1d(np.arange(len(twin.actor_id)), matched_twin_rows)
+    distance = _start_distances(recording, twin)[np.ix_(rows, twin_rows)]
+    is_near = distance <= START_DISTANCE
+    cost = np.where(is_near, distance, 1e3 * START_DISTANCE)
+    assignment = zip(*linear_sum_assignment(cost), strict=True)
     return [
-        (int(left[row]), int(right[column]))
-        for row, column in zip(*chosen, strict=True)
-        if near[row, column]
+        (int(rows[index]), int(twin_rows[twin_index]))
+        for index, twin_index in assignment
+        if is_near[index, twin_index]
     ]
 
 
-def _start_distances(first: TwinRecording, second: TwinRecording) -> FloatArray:
-    """(N, M) metres at the first frame that shows both; infinite for other classes, and if there is no such frame."""
-    starts = [np.argmax(~np.isnan(each.poses[..., 0]), axis=1) for each in (first, second)]
-    frame = np.maximum(starts[0][:, None], starts[1])
-    there = frame < min(first.poses.shape[1], second.poses.shape[1])
-    frame = np.where(there, frame, 0)
-    apart = (
-        first.poses[np.arange(len(starts[0]))[:, None], frame, :2]
-        - second.poses[np.arange(len(starts[1])), frame, :2]
-    )
-    distance = np.hypot(apart[..., 0], apart[..., 1])
-    same = there & (first.category[:, None] == second.category) & ~np.isnan(distance)
-    return np.where(same, distance, np.inf)
+def _start_distances(recording: TwinRecording, twin: TwinRecording) -> FloatArray:
+    """Return the distances in metres at the first frame that shows both actors, shape (N, M).
+
+    Infinite for actors of different classes, and without such a frame.
+    """
+    start = np.argmax(~np.isnan(recording.poses[..., 0]), axis=1)
+    twin_start = np.argmax(~np.isnan(twin.poses[..., 0]), axis=1)
+    frame = np.maximum(start[:, None], twin_start)
+    is_recorded = frame < min(recording.poses.shape[1], twin.poses.shape[1])
+    frame = np.where(is_recorded, frame, 0)
+    position = recording.poses[np.arange(len(start))[:, None], frame, :2]
+    twin_position = twin.poses[np.arange(len(twin_start)), frame, :2]
+    offset = position - twin_position
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    is_same_class = recording.category[:, None] == twin.category
+    is_comparable = is_recorded & is_same_class & ~np.isnan(distance)
+    return np.where(is_comparable, distance, np.inf)

@@ -1,6 +1,7 @@
-"""Bulk work: on this process, on others of this machine, or on any executor of `concurrent.futures`; and its store.
+"""Bulk work on this process, on other processes of this machine, or on any executor; and its store.
 
-Every function that works on many scenarios or samples takes `workers` and `executor`; none has a pool of its own.
+Executors are of `concurrent.futures`. Every function that works on many scenarios or samples takes
+`workers` and `executor`; none has a pool of its own.
 """
 
 from deepaccident_devkit.support.parallel.batches import (

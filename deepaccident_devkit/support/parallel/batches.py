@@ -1,7 +1,7 @@
-"""Running batches of independent work: on one process, on a pool of them, or on the caller's own executor.
+"""Batches of independent work: on one process, on a pool of them, or on the caller's own executor.
 
-Results come back as they are ready. No more items are under way than the workers need to stay busy, so that the memory
-of the caller does not grow with the work.
+Results come back as they are ready. No more items are under way than the workers need to stay busy,
+so that the memory of the caller does not grow with the work.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from deepaccident_devkit.support.parallel.executors import (
     fault_of_workers,
     main_module_hidden,
     own_workers,
-    signals_put_off,
+    signals_deferred,
     width_of,
 )
 from deepaccident_devkit.support.version import __version__
@@ -32,14 +32,16 @@ if TYPE_CHECKING:
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-# Whether to show a progress bar; or a function that gets each item's share of the work, for a bar of the caller's.
+# Whether to show a progress bar; or a function that gets each item's share of the work, for a bar
+# of the caller's own.
 Progress: TypeAlias = "bool | Callable[[float], object]"
-# Seconds in which a signal that ended a worker ends this process too, if it was sent to all processes of a job.
-_SAME_SIGNAL: Final = 0.1
-# Items under way for each one that the workers do at once; and counted from the oldest item that is not done, since
-# what is needed in order waits for it in memory.
-_AHEAD, _FAR_AHEAD = 4, 32
-# Time after which an executor is asked again: workers join and leave.
+# Seconds in which a signal that ended a worker ends this process too, if it was sent to all
+# processes of a job.
+_SIGNAL_DELAY_S: Final = 0.1
+# Items under way for each one that the workers do at once; and the same counted from the oldest
+# unfinished item, since results that are needed in order wait for it in memory.
+_ITEMS_PER_WORKER, _MAX_ITEMS_AHEAD = 4, 32
+# Time after which the number of workers of an executor is read again, since workers join and leave.
 _WIDTH_SECONDS: Final = 5.0
 
 
@@ -48,8 +50,8 @@ class Places:
     """Files and folders that all workers must see.
 
     Attributes:
-        reads: what they read.
-        writes: folders that they write into; made where needed.
+        reads: Files and folders that they read.
+        writes: Folders that they write into; made if necessary.
     """
 
     reads: tuple[Path, ...] = ()
@@ -57,14 +59,15 @@ class Places:
 
 
 class Engine(TypedDict, total=False):
-    """How bulk work runs: every function that works on many scenarios or samples takes these, and raises these errors.
+    """How bulk work runs: arguments of every function that works on many scenarios or samples.
 
-    ChoiceError: `workers` is less than 1. WorkerError: a worker was killed, or cannot do the work.
+    All of these functions raise ChoiceError if `workers` is less than 1, and WorkerError if a
+    worker was killed or cannot do the work.
 
     Attributes:
-        workers: processes; 1 for this one alone, None for as many as the work is worth.
-        executor: any executor of `concurrent.futures` to run on, in place of own workers.
-        progress: whether to show a bar; or a function, as of `run_unordered`.
+        workers: Number of processes; 1 for this one only, None for as many as the work is worth.
+        executor: Any executor of `concurrent.futures` to run on, instead of own workers.
+        progress: Whether to show a bar; or a function, see `run_unordered`.
     """
 
     workers: int | None
@@ -85,19 +88,22 @@ def run_batch(
     """Apply `work` to every item and return the results in the items' order.
 
     Args:
-        work: an importable function of the devkit (workers import it by name).
-        items: what it is applied to, one call an item.
-        workers: processes to use; 1 runs in this one; None takes as many as this process may use cores, or this
-            process alone if the work is too little for a pool or the caller is a worker itself.
-        executor: any `concurrent.futures.Executor` to run on instead (a dask client's, MPI's, a thread pool).
-        label: text of the progress bar.
-        progress: whether to show one; or a function, as of `run_unordered`.
-        places: what the workers of an executor must see; checked before their first item.
+        work: Importable function of the devkit (workers import it by name).
+        items: Arguments of the function, one call for each.
+        workers: Processes to use; 1 runs in this one; None takes as many as this process may use
+            cores, or only this process if the work is too little for a pool or the caller is a
+            worker itself.
+        executor: Any `concurrent.futures.Executor` to run on instead (a dask client's, MPI's, a
+            thread pool).
+        label: Text of the progress bar.
+        progress: Whether to show one; or a function, see `run_unordered`.
+        places: Files and folders that the workers of an executor must see; checked before their
+            first item.
 
     Raises:
         ChoiceError: `workers` is less than 1.
-        WorkerError: a worker was killed; or one of an executor does not see the places, or has no devkit or another
-            version of it.
+        WorkerError: A worker was killed; or a worker of an executor does not see the places, or has
+            no devkit or another version of it.
     """
     results = dict(
         run_unordered(
@@ -124,15 +130,16 @@ def run_unordered(
     sizes: Sequence[int] | None = None,
     places: Places | None = None,
 ) -> Generator[tuple[int, _Result], None, None]:
-    """Apply `work` to every item; yields each one's position and result as soon as it is ready.
+    """Apply `work` to every item; yield each one's position and result as soon as it is ready.
 
-    Closing the generator cancels what has not begun, and ends its own workers, as an interruption does. Arguments and
-    errors are those of `run_batch`; `progress` may be a function that gets each item's share of the work, and `sizes`
-    is how far each item moves the progress bar; None for one step each.
+    Closing the generator cancels items that have not begun, and ends its own workers, as an
+    interruption does. Arguments and errors are the same as of `run_batch`; `progress` may be a
+    function that gets each item's share of the work, and `sizes` is how far each item moves the
+    progress bar; None for one step each.
     """
-    from tqdm.auto import (
-        tqdm,
-    )  # here: with asyncio and multiprocessing, a third of the package's import time
+    # Imported here: with asyncio and multiprocessing, it takes a third of the package's import
+    # time.
+    from tqdm.auto import tqdm
 
     count, steps = _worker_count(workers, len(items)), sizes or [1] * len(items)
     with (
@@ -140,11 +147,11 @@ def run_unordered(
         ExitStack() as stack,
     ):
         if executor is not None:
-            seen = stack.enter_context(marked(places or Places()))
-            results = _on(executor, [Call(work, item, seen) for item in items], cancel=True)
+            paths = stack.enter_context(visible_paths(places or Places()))
+            results = _run_on(executor, [Call(work, item, paths) for item in items], cancel=True)
         elif count > 1:
             pool = stack.enter_context(own_workers(count))
-            results = _on(pool, [Call(work, item, ()) for item in items], cancel=False)
+            results = _run_on(pool, [Call(work, item, ()) for item in items], cancel=False)
         else:
             results = ((position, work(item)) for position, item in enumerate(items))
         for position, result in stack.enter_context(closing(results)):
@@ -155,15 +162,15 @@ def run_unordered(
 
 
 def in_order(results: Generator[tuple[int, _Result], None, None]) -> Generator[_Result, None, None]:
-    """The results of `run_unordered` in the order of their positions, each as soon as all before it are ready."""
+    """Yield the results of `run_unordered` in order, each as soon as all before it are ready."""
     waiting: dict[int, _Result] = {}
-    upcoming = 0
+    next_position = 0
     with closing(results):
         for position, result in results:
             waiting[position] = result
-            while upcoming in waiting:
-                yield waiting.pop(upcoming)
-                upcoming += 1
+            while next_position in waiting:
+                yield waiting.pop(next_position)
+                next_position += 1
 
 
 def _worker_count(workers: int | None, items: int) -> int:
@@ -175,41 +182,43 @@ def _worker_count(workers: int | None, items: int) -> int:
         return 1
     if workers is not None:
         return min(workers, max(items, 1))
-    enough_work = 8  # starting a pool costs a second, a scenario a tenth of one
-    return max(1, min(usable_cores(), items // enough_work))
+    items_per_worker = 8  # starting a pool costs a second, a scenario a tenth of one
+    return max(1, min(usable_cores(), items // items_per_worker))
 
 
-def _on(
+def _run_on(
     executor: Executor, calls: Sequence[Call[_Item, _Result]], *, cancel: bool
 ) -> Generator[tuple[int, _Result], None, None]:
-    """Positions and results of calls, as many of which are under way as keep the workers busy."""
+    """Yield positions and results of calls; as many are under way as keep the workers busy."""
     from queue import SimpleQueue
 
     done: SimpleQueue[Future[_Result]] = SimpleQueue()
     running: dict[Future[_Result], int] = {}
-    upcoming, width, asked = 0, 1, float("-inf")
+    next_position, width, width_time = 0, 1, float("-inf")
     try:
-        while running or upcoming < len(calls):
-            if time.monotonic() - asked >= _WIDTH_SECONDS:
-                width, asked = width_of(executor), time.monotonic()
-            oldest = next(iter(running.values()), upcoming)
-            last = min(
-                len(calls), upcoming + _AHEAD * width - len(running), oldest + _FAR_AHEAD * width
+        while running or next_position < len(calls):
+            if time.monotonic() - width_time >= _WIDTH_SECONDS:
+                width, width_time = width_of(executor), time.monotonic()
+            oldest = next(iter(running.values()), next_position)
+            end = min(
+                len(calls),
+                next_position + _ITEMS_PER_WORKER * width - len(running),
+                oldest + _MAX_ITEMS_AHEAD * width,
             )
-            if upcoming < last:
-                with main_module_hidden(), signals_put_off():
-                    for position in range(upcoming, last):
+            if next_position < end:
+                with main_module_hidden(), signals_deferred():
+                    for position in range(next_position, end):
                         future = executor.submit(calls[position])
                         running[future] = position
                         future.add_done_callback(done.put)
-                upcoming = last
+                next_position = end
             future = done.get()
             yield running.pop(future), future.result()
     except Exception as error:
         fault = fault_of_workers(error)
         if fault is None:
             raise
-        time.sleep(_SAME_SIGNAL)
+        time.sleep(_SIGNAL_DELAY_S)
         raise WorkerError(fault) from error
     finally:
         for future in running if cancel else ():
@@ -221,60 +230,60 @@ class Call(Generic[_Item, _Result]):
     """The work on one item, called without arguments; raises WorkerError where it cannot be done.
 
     Attributes:
-        work: a function that workers can import.
-        item: what it is applied to.
-        seen: paths that must be there.
+        work: Function that workers can import.
+        item: Its argument.
+        paths: Paths that must exist.
     """
 
     work: Callable[[_Item], _Result]
     item: _Item
-    seen: tuple[str, ...]
+    paths: tuple[str, ...]
 
     def __call__(self) -> _Result:
         """Do the work."""
-        _check_worker(__version__, self.seen)
+        _check_worker(__version__, self.paths)
         return self.work(self.item)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle it so that work and item are read when it is called, and nothing of the devkit is needed before.
+        """Pickle the call so that work and item are only unpickled when it is called.
 
-        So a scheduler on the way needs no devkit, and a worker without one, or that cannot open the dataset of the
-        item, says so as the task's error; dask's workers end if a message cannot be unpickled.
+        So a scheduler on the way needs no devkit, and a worker without one, or that cannot open the
+        dataset of the item, reports it as the task's error; dask's workers end if a message cannot
+        be unpickled.
         """
-        from multiprocessing.reduction import (
-            ForkingPickler,
-        )  # here, as it takes ten milliseconds to import
+        # Imported here, as it takes ten milliseconds.
+        from multiprocessing.reduction import ForkingPickler
 
-        done_when_read = _DoneWhenRead(
-            bytes(ForkingPickler.dumps((self.work, self.item))), self.seen
-        )
-        return partial, (ForkingPickler.loads, bytes(ForkingPickler.dumps(done_when_read)))
+        content = bytes(ForkingPickler.dumps((self.work, self.item)))
+        result = _ResultWhenRead(content, self.paths)
+        return partial, (ForkingPickler.loads, bytes(ForkingPickler.dumps(result)))
 
 
 @dataclass(frozen=True, slots=True)
-class _DoneWhenRead:
-    """What becomes the result when it is read of the work whose pickle is `content`."""
+class _ResultWhenRead:
+    """An object that pickle reads as the result of the work and item in `content`."""
 
     content: bytes
-    seen: tuple[str, ...]
+    paths: tuple[str, ...]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _checked_and_done, (__version__, self.seen, self.content)
+        return _check_and_run, (__version__, self.paths, self.content)
 
 
-def _checked_and_done(version: str, seen: tuple[str, ...], content: bytes) -> Any:
+def _check_and_run(version: str, paths: tuple[str, ...], content: bytes) -> Any:
     from multiprocessing.reduction import ForkingPickler
 
-    _check_worker(version, seen)
+    _check_worker(version, paths)
     work, item = ForkingPickler.loads(content)
     return work(item)
 
 
 @contextmanager
-def marked(places: Places) -> Iterator[tuple[str, ...]]:
-    """The paths that workers must see. In folders that they write into a file is there meanwhile, of a new name.
+def visible_paths(places: Places) -> Iterator[tuple[str, ...]]:
+    """Yield the paths that workers must see.
 
-    A folder of the same name on a worker's own disk has no such file.
+    In folders that they write into, there is a file with a new name during the block: a folder of
+    the same name on a worker's own disk has no such file.
     """
     with ExitStack() as stack:
         marks = []
@@ -288,16 +297,21 @@ def marked(places: Places) -> Iterator[tuple[str, ...]]:
 
 
 @lru_cache(maxsize=64)
-def _check_worker(version: str, seen: tuple[str, ...]) -> None:
-    """Raise WorkerError unless this process has the caller's devkit and sees these paths; asked once a process."""
-    here = f"a worker on {platform.node()}"
+def _check_worker(version: str, paths: tuple[str, ...]) -> None:
+    """Raise WorkerError unless this process has the caller's devkit and sees these paths.
+
+    This is checked once a process.
+    """
+    worker = f"a worker on {platform.node()}"
     if version != __version__:
         raise WorkerError(
-            f"{here} has deepaccident_devkit {__version__}, and this is {version}; install the same version on all"
+            f"{worker} has deepaccident_devkit {__version__}, and this is {version}; install the "
+            "same version on all"
         )
-    for path in map(Path, seen):
+    for path in map(Path, paths):
         if not path.exists():
-            unseen = path.parent if path.suffix == ".tmp" else path
+            missing = path.parent if path.suffix == ".tmp" else path
             raise WorkerError(
-                f"{here} does not see {unseen}; give an absolute path on a file system that all workers share"
+                f"{worker} does not see {missing}; give an absolute path on a file system that all "
+                "workers share"
             )

@@ -1,4 +1,4 @@
-"""Executors of other libraries and of a dask cluster, and a pool of processes of this machine.
+"""Executors: of other libraries, of a dask cluster, and a pool of processes of this machine.
 
 The pool ends with the work: after an error, Ctrl-C, or the end of its parent.
 """
@@ -37,41 +37,53 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Tasks at once of an executor that does not say it.
-_USUAL_WIDTH: Final = 64
+# Number of simultaneous tasks of an executor that does not have it as an attribute.
+_DEFAULT_WIDTH: Final = 64
 MPI: Final = "mpi"
-# How long an empty file of a scheduler may still get its address.
+# Seconds in which an empty file of a scheduler may still get its address.
 ADDRESS_WAIT: Final = 10.0
-FEWER_WORKERS: Final = "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (for training: without --workers)"
+FEWER_WORKERS: Final = (
+    "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (for training: "
+    "without --workers)"
+)
 _PACKAGE: Final = __name__.partition(".")[0]
 # Within `workers_kept`: number of processes → a pool of them that waits for work.
-_kept: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
+_idle_pools: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
 
 
 def width_of(executor: Executor) -> int:
-    """How many tasks an executor does at once, as far as it says it."""
-    client: Client | None = getattr(
-        executor, "_client", None
-    )  # of a dask executor, whose workers come and go
+    """Return how many tasks an executor does at once, as far as it is known."""
+    # A dask executor has a client; its workers come and go.
+    client: Client | None = getattr(executor, "_client", None)
     if client is not None:
-        return sum(client.ncores().values()) or _USUAL_WIDTH
-    told: int | None = getattr(executor, "num_workers", None) or getattr(
-        executor, "_max_workers", None
-    )
-    return told or _USUAL_WIDTH  # the first is MPI's name, the second Python's
+        return sum(client.ncores().values()) or _DEFAULT_WIDTH
+    for name in ("num_workers", "_max_workers"):  # MPI's name, and Python's
+        width: int | None = getattr(executor, name, None)
+        if width:
+            return width
+    return _DEFAULT_WIDTH
 
 
 def fault_of_workers(error: Exception) -> str | None:
-    """What an error says of the workers and not of the work; None if it says nothing of them."""
+    """Return what an error reveals about the workers; None if it is about the work."""
     distributed = sys.modules.get("distributed")
     if distributed is not None and isinstance(error, distributed.KilledWorker):
-        return f"the dask worker of a task was killed several times ({error}), perhaps because memory ran out"
+        return (
+            f"the dask worker of a task was killed several times ({error}), perhaps because memory "
+            "ran out"
+        )
     if isinstance(error, BrokenExecutor):
-        return f"a worker process was killed ({error}), perhaps because memory ran out; run it again with fewer workers"
+        return (
+            f"a worker process was killed ({error}), perhaps because memory ran out; run it again "
+            "with fewer workers"
+        )
     if isinstance(error, CancelledError):
-        return "the scheduler has ended, or cancelled a task; start it again, then run the same: it does what is left"
-    absent = isinstance(error, ImportError) or str(error).startswith("Can't get attribute")
-    if absent and _PACKAGE in str(error) and not isinstance(error, DeepAccidentError):
+        return (
+            "the scheduler has ended, or cancelled a task; start it again, then run the same: it "
+            "does what is left"
+        )
+    is_import_fault = isinstance(error, ImportError) or str(error).startswith("Can't get attribute")
+    if is_import_fault and _PACKAGE in str(error) and not isinstance(error, DeepAccidentError):
         return f"a worker cannot do the work ({error}); install {_PACKAGE} {__version__} there"
     return None
 
@@ -80,18 +92,18 @@ def fault_of_workers(error: Exception) -> str | None:
 def cluster_executor(
     address: str | None = None, scheduler_file: Path | None = None
 ) -> Iterator[Executor | None]:
-    """An executor on the workers of a cluster, while the block runs; None without a scheduler.
+    """Yield an executor on the workers of a cluster; None without a scheduler.
 
-    What is sent to a scheduler and comes back is pickled: it must be one that you trust.
+    All data to and from a scheduler is pickled: use one that you trust.
 
     Args:
-        address: of a dask scheduler, such as `tcp://10.0.0.5:8786`; or `mpi` for the other ranks of this MPI program,
-            which was started by `mpiexec … python -m mpi4py.futures`.
-        scheduler_file: the file that a dask scheduler writes its address into, in place of `address`.
+        address: Address of a dask scheduler, such as `tcp://10.0.0.5:8786`; or `mpi` for the other
+            ranks of this MPI program, which was started by `mpiexec … python -m mpi4py.futures`.
+        scheduler_file: File that a dask scheduler writes its address into, instead of `address`.
 
     Raises:
         MissingExtraError: `distributed` or mpi4py is not installed.
-        WorkerError: no scheduler answers, or this is no MPI program of several ranks.
+        WorkerError: No scheduler answers, or this is no MPI program of several ranks.
     """
     if address is None and scheduler_file is None:
         yield None
@@ -108,20 +120,15 @@ def _mpi_executor() -> Iterator[Executor]:
     try:
         from mpi4py import MPI as mpi  # noqa: N811 - the name of its C library
         from mpi4py.futures import MPIPoolExecutor
-    except (
-        ImportError,
-        OSError,
-        RuntimeError,
-    ) as error:  # the last: there is no MPI on this machine
+    except (ImportError, OSError, RuntimeError) as error:  # RuntimeError: this machine has no MPI
         raise MissingExtraError(
             f"mpi4py cannot be imported ({error}); install an MPI, and: pip install mpi4py"
         ) from error
-    if (
-        mpi.COMM_WORLD.size < 2 or mpi.COMM_WORLD.rank
-    ):  # a rank but the first runs this: all would do the same
+    # If a rank other than the first ran this, all ranks would do the same work.
+    if mpi.COMM_WORLD.size < 2 or mpi.COMM_WORLD.rank:
         raise WorkerError(
-            "this is no MPI program whose other ranks wait for work; start it with: mpiexec -n 8 python -m "
-            f"mpi4py.futures -m {_PACKAGE}.cli …"
+            "this is no MPI program whose other ranks wait for work; start it with: mpiexec -n 8 "
+            f"python -m mpi4py.futures -m {_PACKAGE}.cli …"
         )
     with MPIPoolExecutor() as executor:
         yield executor
@@ -135,24 +142,28 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
         raise MissingExtraError(
             "dask is not installed; in a checkout: pip install '.[distributed]'"
         ) from error
-    place = str(scheduler_file or address)
+    source = str(scheduler_file or address)
     try:
         if scheduler_file is not None:
-            address = _address_in(scheduler_file)
-        client = _made(Client, address=address, set_as_default=False)
-    except Exception as error:  # of an odd address dask raises many kinds
-        said = shortened(fault_text(error), MOST_TOLD)
+            address = _read_address(scheduler_file)
+        client = _connect_client(Client, address=address, set_as_default=False)
+    except Exception as error:  # for an odd address, dask raises many kinds
+        fault = shortened(fault_text(error), MOST_TOLD)
         raise WorkerError(
-            f"{place}: no dask scheduler answers ({said}); start one with `dask scheduler`, and give its address"
+            f"{source}: no dask scheduler answers ({fault}); start one with `dask scheduler`, and "
+            "give its address"
         ) from error
     with client:
         if not client.ncores():
-            logger.warning("%s: has no workers yet; waiting for them", place)
+            logger.warning("%s: has no workers yet; waiting for them", source)
         yield client
 
 
-def _made(kind: Any, **options: Any) -> Client:
-    """A dask client; one that cannot connect is closed at once: when it is collected, that may hang the next one."""
+def _connect_client(kind: Any, **options: Any) -> Client:
+    """Return a connected dask client.
+
+    A client that cannot connect is closed at once: its garbage collection may hang the next one.
+    """
     client: Any = kind.__new__(kind)
     try:
         client.__init__(**options)
@@ -163,21 +174,19 @@ def _made(kind: Any, **options: Any) -> Client:
     return client
 
 
-def _address_in(file: Path) -> str:
-    """The address that a dask scheduler wrote into a file; waits for one that has just begun.
+def _read_address(file: Path) -> str:
+    """Return the address that a dask scheduler wrote into a file; wait for one that has just begun.
 
     Raises OSError or ValueError. Dask itself would wait for it for ever, and read anything.
     """
-    from deepaccident_devkit.support.json_text import (
-        as_record,
-        parsed_json,
-    )  # here, as it takes some milliseconds
+    # Imported here, as it takes some milliseconds.
+    from deepaccident_devkit.support.json_text import as_record, parsed_json
 
-    end, content = time.monotonic() + ADDRESS_WAIT, b""
+    deadline, content = time.monotonic() + ADDRESS_WAIT, b""
     while not content:
         with suppress(FileNotFoundError):
             content = read_bytes(file, "spec")
-        if not content and time.monotonic() > end:
+        if not content and time.monotonic() > deadline:
             raise FileNotFoundError(errno.ENOENT, "there is no such file, or it is empty")
         time.sleep(0 if content else 0.1)
     return as_record(parsed_json(content)["address"], str)
@@ -185,24 +194,24 @@ def _address_in(file: Path) -> str:
 
 @contextmanager
 def workers_kept() -> Iterator[None]:
-    """Keep own workers that begin in the block for what comes after in it: to begin takes each most of a second.
+    """Keep own workers that begin in the block for later work in it.
 
-    They end with the outermost such block.
+    To begin takes each of them most of a second. They end with the outermost such block.
     """
     pools: dict[int, ProcessPoolExecutor] = {}
-    token = _kept.set(pools) if _kept.get() is None else None
+    token = _idle_pools.set(pools) if _idle_pools.get() is None else None
     try:
         yield
     finally:
         if token is not None:
-            _kept.reset(token)
+            _idle_pools.reset(token)
         for pool in pools.values():
             pool.shutdown()
 
 
 @contextmanager
 def starting_workers() -> Iterator[None]:
-    """Raise WorkerError if the system has no room for processes, or for their locks in shared memory."""
+    """Raise WorkerError if the system has no room for processes or their locks in shared memory."""
     try:
         yield
     except OSError as error:
@@ -213,16 +222,18 @@ def starting_workers() -> Iterator[None]:
 
 @contextmanager
 def own_workers(count: int) -> Iterator[Executor]:
-    """A pool of spawned processes: an error of an item lets the others end what they do; all else ends them at once.
+    """Yield a pool of spawned processes.
 
-    The pool itself cancels what has not begun: if others did and a process was killed, a thread of it would fail. If
-    one is killed while another begins, the pool would wait for that one for ever.
+    After an error of an item, the other workers finish their items; anything else ends them at
+    once. The pool itself cancels items that have not begun: if other code did and a process was
+    killed, a thread of the pool would fail. If one is killed while another begins, the pool would
+    wait for that one for ever.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
-    kept = _kept.get()
-    pool = kept.pop(count, None) if kept else None
+    idle_pools = _idle_pools.get()
+    pool = idle_pools.pop(count, None) if idle_pools else None
     if pool is None:
         with starting_workers():
             context = multiprocessing.get_context("spawn")
@@ -230,36 +241,39 @@ def own_workers(count: int) -> Iterator[Executor]:
     try:
         yield pool
     except BaseException as error:
-        of_an_item = isinstance(error, Exception) and not isinstance(error, WorkerError)
-        if not of_an_item:  # a killed worker, Ctrl-C, or the generator was closed
-            for process in list((pool._processes or {}).values()):  # noqa: SLF001 - public from Python 3.14
+        is_item_error = isinstance(error, Exception) and not isinstance(error, WorkerError)
+        if not is_item_error:  # a killed worker, Ctrl-C, or the generator was closed
+            # Python 3.14 has a public method for this.
+            for process in list((pool._processes or {}).values()):  # noqa: SLF001
                 process.kill()
-        pool.shutdown(wait=of_an_item, cancel_futures=of_an_item)
+        pool.shutdown(wait=is_item_error, cancel_futures=is_item_error)
         raise
-    if kept is None or kept.setdefault(count, pool) is not pool:
+    if idle_pools is None or idle_pools.setdefault(count, pool) is not pool:
         pool.shutdown()
 
 
 def own_threads() -> ThreadPoolExecutor:
-    """Threads of this process, one for each usable core, in a `with` block: for work whose libraries let others run."""
+    """Return threads of this process, one for each usable core, for a `with` block.
+
+    They suit work in libraries that let other threads run.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     return ThreadPoolExecutor(usable_cores())
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C, which a terminal sends to workers too, to the parent, and end when that ends."""
+    """Leave Ctrl-C, which terminals also send to workers, to the parent, and end with it."""
     from tqdm import tqdm
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    tqdm.set_lock(
-        threading.RLock()
-    )  # its own is one for all processes, and stays in the system if this one is killed
+    # tqdm's own lock is shared by all processes, and stays in the system if this one is killed.
+    tqdm.set_lock(threading.RLock())
     threading.Thread(target=_end_with_parent, name="end-with-parent", daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """Without this a worker whose parent was killed would wait for ever."""
+    """End with the parent; otherwise a worker would wait for ever after its parent was killed."""
     import multiprocessing
 
     parent = multiprocessing.parent_process()
@@ -269,21 +283,21 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def signals_put_off() -> Iterator[None]:
-    """Handle Ctrl-C and SIGTERM after the block, in which processes begin, and let those begin with Ctrl-C blocked.
+def signals_deferred() -> Iterator[None]:
+    """Handle Ctrl-C and SIGTERM after the block, in which processes begin with Ctrl-C blocked.
 
-    An exception amid the start of a process would leave one that nobody knows; and a process that is not ready to
-    ignore Ctrl-C would print a traceback.
+    An exception amid the start of a process would leave a process that nobody knows; and a process
+    that is not ready to ignore Ctrl-C would print a traceback.
     """
-    if threading.current_thread() is not threading.main_thread():  # others get no signals
+    if threading.current_thread() is not threading.main_thread():  # other threads get no signals
         yield
         return
-    came: list[int] = []
+    received: list[int] = []
     handlers = {
-        number: signal.signal(number, lambda each, _frame: came.append(each))
+        number: signal.signal(number, lambda arrived, _frame: received.append(arrived))
         for number in (signal.SIGINT, signal.SIGTERM)
-        if signal.getsignal(number)
-        is not None  # one of a program that embeds Python cannot be put back
+        # The handler of a program that embeds Python is None, and cannot be restored.
+        if signal.getsignal(number) is not None
     }
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -292,26 +306,29 @@ def signals_put_off() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        for each in came:
-            handler = handlers[signal.Signals(each)]
-            handler(each, None) if callable(handler) else signal.raise_signal(each)
+        for arrived in received:
+            handler = handlers[signal.Signals(arrived)]
+            handler(arrived, None) if callable(handler) else signal.raise_signal(arrived)
 
 
 @contextmanager
 def main_module_hidden() -> Iterator[None]:
     """Keep new processes from importing the user's script again.
 
-    A spawned process runs the parent's main script unless that has no file. Our work is always importable from the
-    package, and a user's three-line script has no `if __name__ == "__main__"` guard.
+    A spawned process runs the parent's main script unless that has no file. Our work is always
+    importable from the package, and a user's three-line script has no `if __name__ == "__main__"`
+    guard.
     """
     main = sys.modules["__main__"]
-    hidden = {name: getattr(main, name) for name in ("__file__", "__spec__") if hasattr(main, name)}
+    attributes = {
+        name: getattr(main, name) for name in ("__file__", "__spec__") if hasattr(main, name)
+    }
     try:
-        for name in hidden:
+        for name in attributes:
             setattr(main, name, None)
-        if "__file__" in hidden:
+        if "__file__" in attributes:
             del main.__file__
         yield
     finally:
-        for name, value in hidden.items():
+        for name, value in attributes.items():
             setattr(main, name, value)

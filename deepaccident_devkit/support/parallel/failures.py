@@ -1,4 +1,4 @@
-"""Items of bulk work that fail: the others are done, and what failed is listed at the end."""
+"""Failing items of bulk work: the others are finished, and failures are listed at the end."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """What an item gives in place of a result.
+    """A failure, which stands for the result of an item.
 
     Attributes:
-        message: of its error.
+        message: Message of its error.
     """
 
     message: str
@@ -31,10 +31,12 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Tried(Generic[_Item, _Result]):
-    """Work that gives a Failure for an item with a fault of its own; a full disk or a lost worker still ends it all.
+    """Work that returns a Failure for an item with a fault of its own.
+
+    A full disk or a lost worker still ends it all.
 
     Attributes:
-        work: what is tried.
+        work: Function of an item.
     """
 
     work: Callable[[_Item], _Result]
@@ -52,13 +54,14 @@ class Tried(Generic[_Item, _Result]):
 
 
 def check_failures(results: Iterable[tuple[str, object]], where: str) -> None:
-    """Raise SomeFailedError if there is a Failure among named results; the message lists them all."""
-    everything = list(results)
-    failed = [
-        f"  {name}: {result.message}" for name, result in everything if isinstance(result, Failure)
-    ]
-    if failed:
-        lines = [f"{where}: {len(failed)} of {len(everything)} failed:", *failed]
+    """Raise SomeFailedError if there is a Failure among named results; the message lists all."""
+    count, failures = 0, []
+    for name, result in results:
+        count += 1
+        if isinstance(result, Failure):
+            failures.append(f"  {name}: {result.message}")
+    if failures:
+        lines = [f"{where}: {len(failures)} of {count} failed:", *failures]
         lines.append(
             "The others are done; mend these, and run the same again: it does what is left."
         )

@@ -131,13 +131,13 @@ def test_a_link_is_removed_and_not_what_it_leads_to(tmp_path: Path) -> None:
 def test_plain_names_are_names_on_any_file_system() -> None:
     names = plain_names(
         ["a/b", "A_b", "a?b", "..", "", "x" * 300, f"{'x' * 300}y", "café"],
-        taken=["INDEX.html", "a_b"],
+        reserved=["INDEX.html", "a_b"],
     )
     assert len({name.lower() for name in names.values()} | {"index.html", "a_b"}) == 10
     assert all(
         re.fullmatch(r"[A-Za-z0-9_.-]{1,140}", name) and name.strip(".") for name in names.values()
     )
-    given = plain_names(["index.html", "../../up"], taken=["INDEX.html"])
+    given = plain_names(["index.html", "../../up"], reserved=["INDEX.html"])
     assert given == {"index.html": "index.html_2", "../../up": ".._.._up"}
 
 

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from refusals import assert_refused
 
-from deepaccident_devkit.support.json_text import MOST_LEVELS, parsed_json, parsed_record
+from deepaccident_devkit.support.json_text import MAX_LEVELS, parsed_json, parsed_record
 
 
 @pytest.mark.parametrize(
@@ -23,12 +23,12 @@ def test_json_is_read(value: Any) -> None:
 )
 def test_brackets_in_texts_are_no_levels(text: str) -> None:
     assert parsed_json(json.dumps({"a": text}).encode()) == {"a": text}
-    after = b'["\\\\", "\\"", ' + b"[" * MOST_LEVELS + b"]" * (MOST_LEVELS + 1)
+    after = b'["\\\\", "\\"", ' + b"[" * MAX_LEVELS + b"]" * (MAX_LEVELS + 1)
     assert_refused(
         (
             lambda: parsed_json(after),
             ValueError,
-            (f"is nested more than {MOST_LEVELS} levels deep",),
+            (f"is nested more than {MAX_LEVELS} levels deep",),
         )
     )
 
@@ -36,7 +36,7 @@ def test_brackets_in_texts_are_no_levels(text: str) -> None:
 @pytest.mark.parametrize("far", [0, 3 << 20])
 def test_levels_are_counted(far: int) -> None:
     """Also across the blocks that are looked at one after another."""
-    deepest = b"[" + b" " * far + b"[" * (MOST_LEVELS - 1) + b"]" * MOST_LEVELS
+    deepest = b"[" + b" " * far + b"[" * (MAX_LEVELS - 1) + b"]" * MAX_LEVELS
     assert parsed_json(deepest)
     assert_refused(
         (lambda: parsed_json(b"[" + deepest + b"]"), ValueError, "nested more than"),

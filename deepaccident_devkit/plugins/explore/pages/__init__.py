@@ -1,9 +1,12 @@
-"""The pages, and `make_app`: all of an explorer as one ASGI application, without a guard (`access.Gate`)."""
+"""The pages, and `make_app`: an explorer as one ASGI application, without access control.
+
+Access control is `access.Gate`.
+"""
 
 from __future__ import annotations
 
 import logging
-from typing import Any, Final
+from typing import Final
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -22,11 +25,11 @@ from deepaccident_devkit.plugins.explore.pages import models, release, scenario
 from deepaccident_devkit.plugins.explore.pages.responses import page, static_routes
 
 logger = logging.getLogger(__name__)
-_NOT_THERE: Final = (TokenError, ChoiceError, FieldError, NotAvailableError)
+_NOT_FOUND_ERRORS: Final = (TokenError, ChoiceError, FieldError, NotAvailableError)
 
 
 def make_app(explorer: Explorer) -> Starlette:
-    """The pages of an explorer.
+    """Return the pages of an explorer as an application.
 
     Every address in them is relative, so that they work behind any proxy and below any path.
     """
@@ -37,25 +40,30 @@ def make_app(explorer: Explorer) -> Starlette:
             *scenario.routes(),
             *models.routes(),
         ],
-        exception_handlers={HTTPException: _refused, DeepAccidentError: _failed},
+        exception_handlers={
+            HTTPException: _answer_http_error,
+            DeepAccidentError: _answer_devkit_error,
+        },
     )
     app.router.redirect_slashes = False  # its redirects are absolute
     app.state.explorer = explorer
     return app
 
 
-async def _refused(request: Request, error: Exception) -> Response:
-    status = error.status_code if isinstance(error, HTTPException) else 500
-    words = "There is no such page." if status == 404 else "This cannot be done here."
+async def _answer_http_error(request: Request, error: Exception) -> Response:
+    status = 500
+    if isinstance(error, HTTPException):
+        status = error.status_code
+    words = "This cannot be done here."
+    if status == 404:
+        words = "There is no such page."
     return page(request, "error.html", status=status, title="Not found", words=words)
 
 
-async def _failed(request: Request, error: Exception) -> Response:
-    """What the devkit cannot read or find, in its own words."""
-    found = not isinstance(error, _NOT_THERE)
+async def _answer_devkit_error(request: Request, error: Exception) -> Response:
+    """Answer with the devkit's own message about what it cannot read or find."""
+    status, title = 500, "Cannot be shown"
+    if isinstance(error, _NOT_FOUND_ERRORS):
+        status, title = 404, "Not here"
     logger.debug("%s", request.url.path, exc_info=error)
-    said: dict[str, Any] = {
-        "title": "Cannot be shown" if found else "Not here",
-        "words": str(error),
-    }
-    return page(request, "error.html", status=500 if found else 404, **said)
+    return page(request, "error.html", status=status, title=title, words=str(error))

@@ -1,10 +1,13 @@
-"""A release: its scenarios, with filters and a selection as a file; what it holds, its towns' maps, and conventions."""
+"""Pages of a release: scenarios with filters, contents, town maps, and conventions.
+
+A selection of scenarios can be saved as a file.
+"""
 
 from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -20,8 +23,8 @@ from deepaccident_devkit.plugins.explore.choices import (
     SCORE_PREFIX,
     SORTS,
     Choices,
-    Found,
-    found_by,
+    Matches,
+    match_scenarios,
 )
 from deepaccident_devkit.plugins.explore.explorer import Explorer
 from deepaccident_devkit.plugins.explore.models import Model
@@ -44,28 +47,29 @@ from deepaccident_devkit.taxonomy import SPLITS
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-# Columns of the table that may not be there yet → their headings.
+# Columns of the table that may not be ready yet → their headings.
 SLOW: Final[Mapping[str, str]] = {
     "accident_visibility": "visibility",
     "lead": "lead, ego (s)",
     "lead_all": "lead, all (s)",
     "min_ttc": "least TTC (s)",
 }
-# So many facets are open at first.
-_OPEN: Final = 4
+# Number of facets expanded initially.
+_NUM_OPEN_FACETS: Final = 4
 # Last part of the address → its name for readers.
 TABS: Final[Mapping[str, str]] = {
     "": "Contents",
     "maps": "Town maps",
     "conventions": "Conventions",
 }
-_SIZE: Final = (8.0, 8.0)
-# How an overview calls an unknown value.
-_NONE: Final = "none"
+# Width and height in inches.
+_MAP_SIZE: Final = (8.0, 8.0)
+# Text of an unknown value in an overview.
+_OVERVIEW_UNKNOWN: Final = "none"
 
 
 def routes() -> list[Route]:
-    """The addresses."""
+    """Return the routes of the pages."""
     return [
         Route("/", _list),
         Route("/selection.txt", _selection),
@@ -79,41 +83,35 @@ def routes() -> list[Route]:
 
 
 def choices_of(request: Request) -> Choices:
-    """What an address chose of the scenarios."""
+    """Return the choices that an address makes among the scenarios."""
     return Choices.of(request.query_params.multi_items(), explorer_of(request).scenarios)
 
 
 def _list(request: Request) -> Response:
     explorer, choices = explorer_of(request), choices_of(request)
-    found = found_by(explorer.scenarios, choices, explorer.scores)
-    return page(request, "scenarios.html", **list_context(explorer, choices, found))
+    matches = match_scenarios(explorer.scenarios, choices, explorer.scores)
+    return page(request, "scenarios.html", **list_context(explorer, choices, matches))
 
 
-def list_context(explorer: Explorer, choices: Choices, found: Found) -> dict[str, Any]:
-    """What the list's template shows."""
-    pages = max(1, -(-len(found.rows) // SCENARIOS_PER_PAGE))
-    here = min(choices.page, pages)
-    shown = found.rows[(here - 1) * SCENARIOS_PER_PAGE : here * SCENARIOS_PER_PAGE].tolist()
-    sorts = [
-        *SORTS.items(),
-        *((name, f"score of {name.removeprefix(SCORE_PREFIX)}") for name in explorer.scores),
-    ]
+def list_context(explorer: Explorer, choices: Choices, matches: Matches) -> dict[str, Any]:
+    """Return the variables of the list's template."""
+    pages = max(1, -(-len(matches.rows) // SCENARIOS_PER_PAGE))
+    number = min(choices.page, pages)
+    begin = (number - 1) * SCENARIOS_PER_PAGE
+    rows = matches.rows[begin : begin + SCENARIOS_PER_PAGE].tolist()
+    titles = dict(SORTS)
+    for name in explorer.scores:
+        titles[name] = f"score of {name.removeprefix(SCORE_PREFIX)}"
     return {
         "choices": choices,
-        "found": found,
+        "found": matches,
         "total": len(explorer.scenarios),
-        "entries": entries(explorer, shown, choices.sort),
-        "facets": [
-            {"name": name, "counts": values, "open": place < _OPEN or name in choices.facets}
-            for place, (name, counts) in enumerate(found.counts.items())
-            if (
-                values := [each for each in counts if each["count"] or each["chosen"]]
-            )  # others would find nothing
-        ],
-        "chosen": _chosen(choices),
-        "sorts": [(name, title, _sort_waits(explorer, name)) for name, title in sorts],
+        "entries": entries(explorer, rows, choices.sort),
+        "facets": list(_facets(choices, matches)),
+        "chosen": _filter_links(choices),
+        "sorts": [(name, title, _sort_waits(explorer, name)) for name, title in titles.items()],
         "slow": SLOW,
-        "here": here,
+        "here": number,
         "pages": pages,
         "python": choices.python(),
         "command": choices.command(str(explorer.dataset.dataroot)),
@@ -123,33 +121,37 @@ def list_context(explorer: Explorer, choices: Choices, found: Found) -> dict[str
     }
 
 
+def _facets(choices: Choices, matches: Matches) -> Iterator[dict[str, Any]]:
+    """Yield the facets without the values that would match nothing."""
+    for index, (name, counts) in enumerate(matches.counts.items()):
+        values = [value for value in counts if value["count"] or value["chosen"]]
+        if values:
+            is_open = index < _NUM_OPEN_FACETS or name in choices.facets
+            yield {"name": name, "counts": values, "open": is_open}
+
+
 def entries(explorer: Explorer, rows: Sequence[int], sort: str) -> list[dict[str, Any]]:
-    """What the grid and the table show of scenarios."""
-    scenarios, scores = explorer.scenarios, explorer.scores
-    slow = {name: scenarios.values(name) for name in SLOW}
-    shown = []
+    """Return what the grid and the table show of scenarios."""
+    scenarios, models = explorer.scenarios, explorer.scores
+    columns = {name: scenarios.values(name) for name in SLOW}
+    result = []
     for row in rows:
         record = scenarios.records[row]
         measures = {
-            name: WAITING if values is None else cell(values[row]) for name, values in slow.items()
+            name: WAITING if values is None else cell(values[row])
+            for name, values in columns.items()
         }
-        shown.append(
-            entry(
-                record,
-                measures,
-                {name: score_cell(each, record["token"]) for name, each in scores.items()},
-                sort,
-            )
-        )
-    return shown
+        scores = {name: score_cell(model, record["token"]) for name, model in models.items()}
+        result.append(entry(record, measures, scores, sort))
+    return result
 
 
 class _TableCell(NamedTuple):
     """A value in a table.
 
     Attributes:
-        text: for readers.
-        key: a number by which a script sorts; empty for an unknown value, None to sort by the text.
+        text: Text for readers.
+        key: Number by which a script sorts; empty for an unknown value, None to sort by the text.
     """
 
     text: str
@@ -165,159 +167,160 @@ def entry(
     scores: Mapping[str, _TableCell],
     sort: str = "",
 ) -> dict[str, Any]:
-    """What the grid and the table show of a scenario: its values of `SLOW`, and models' scores by their columns.
+    """Return what the grid and the table show of a scenario.
 
     The value of the column by which the grid is sorted stands below the picture.
+
+    Args:
+        record: Record of the scenario.
+        measures: Its values of `SLOW`.
+        scores: Models' scores, by their columns.
+        sort: Column by which the grid is sorted.
     """
-    named = {**measures, **scores, "num_frames": _TableCell(f"{record['num_frames']} frames", "")}
+    num_frames = _TableCell(f"{record['num_frames']} frames", "")
+    cells = {**measures, **scores, "num_frames": num_frames}
     return {
         "token": record["token"],
         "name": scenario_words(record),
         "record": record,
         "cells": [*measures.values(), *scores.values()],
         "scores": scores,
-        "sorted": named[sort].text if sort in named else "",
+        "sorted": cells[sort].text if sort in cells else "",
     }
 
 
 def cell(value: float | str | None) -> _TableCell:
-    """A measure, or a visibility."""
-    rank = VISIBILITY_RANKS.get(value) if isinstance(value, str) else value
-    return _TableCell(value if isinstance(value, str) else number_text(value), sort_key(rank))
+    """Return the cell of a measure, or of a visibility."""
+    if isinstance(value, str):
+        return _TableCell(value, sort_key(VISIBILITY_RANKS.get(value)))
+    return _TableCell(number_text(value), sort_key(value))
 
 
 def sort_key(value: float | None) -> str:
-    """A number as a script reads it; empty for an unknown one."""
-    return "" if value is None or math.isnan(value) else repr(value).replace("inf", "Infinity")
+    """Return a number as a script reads it; empty for an unknown one."""
+    if value is None or math.isnan(value):
+        return ""
+    return repr(value).replace("inf", "Infinity")
 
 
 def score_cell(model: Model, token: str) -> _TableCell:
-    """A model's score of a scenario."""
+    """Return the cell of a model's score of a scenario."""
+    missing = _TableCell("–", "")
     if model.scores is None:
-        return _TableCell("–", "") if model.job.is_done else WAITING
+        if model.job.is_done:
+            return missing
+        return WAITING
     score = model.scores.scenarios.get(token)
-    return _TableCell("–", "") if score is None else _TableCell(score.text, sort_key(score.value))
+    if score is None:
+        return missing
+    return _TableCell(score.text, sort_key(score.value))
 
 
 def _sort_waits(explorer: Explorer, name: str) -> bool:
-    """Whether a column is not there yet."""
+    """Return whether a column is not ready yet."""
     if name in explorer.scores:
         return explorer.scores[name].scores is None
     return name in SLOW and explorer.scenarios.values(name) is None
 
 
-def _chosen(choices: Choices) -> list[tuple[str, str]]:
-    """What was chosen, each with the address without it."""
-    chosen = []
+def _filter_links(choices: Choices) -> list[tuple[str, str]]:
+    """Return each chosen filter with the address that drops it."""
+    links = []
     for name, values in choices.facets.items():
         for value in values:
-            left = tuple(each for each in values if each != value)
-            facets = (
-                {**choices.facets, name: left}
-                if left
-                else {k: v for k, v in choices.facets.items() if k != name}
-            )
-            chosen.append((f"{name}={value}", choices.address(facets=facets, page=1)))
-    return chosen + [
-        (
-            line,
-            choices.address(
-                query="; ".join(each for each in choices.lines if each != line), page=1
-            ),
-        )
-        for line in choices.lines
-    ]
+            facets = dict(choices.facets)
+            facets[name] = tuple(other for other in values if other != value)
+            if not facets[name]:
+                del facets[name]
+            links.append((f"{name}={value}", choices.address(facets=facets, page=1)))
+    for line in choices.lines:
+        query = "; ".join(other for other in choices.lines if other != line)
+        links.append((line, choices.address(query=query, page=1)))
+    return links
 
 
 def _selection(request: Request) -> Response:
-    """The scenarios that were chosen as a split file, in the order of the list."""
+    """Return the matching scenarios as a split file, in the order of the list."""
     explorer = explorer_of(request)
-    found = found_by(explorer.scenarios, choices_of(request), explorer.scores)
-    if found.faults or found.waiting:
-        words = " ".join([*found.faults, *found.waiting])
+    matches = match_scenarios(explorer.scenarios, choices_of(request), explorer.scores)
+    if matches.faults or matches.waiting:
+        words = " ".join([*matches.faults, *matches.waiting])
         return page(request, "error.html", status=409, title="Not saved", words=words)
     with tempfile.TemporaryDirectory() as folder:
-        tokens = [explorer.scenarios.tokens[row] for row in found.rows.tolist()]
+        tokens = [explorer.scenarios.tokens[row] for row in matches.rows.tolist()]
         content = save_selection(tokens, Path(folder, "selection.txt")).read_bytes()
-    how = {"Content-Disposition": 'attachment; filename="selection.txt"'}
-    return Response(content, media_type="text/plain", headers=how)
+    headers = {"Content-Disposition": 'attachment; filename="selection.txt"'}
+    return Response(content, media_type="text/plain", headers=headers)
 
 
 async def _waiting(request: Request) -> Response:
-    """Titles of the work that is not done, for the script that loads the page again when some of it is."""
+    """Return titles of unfinished jobs; a script reloads the page when one of them is done."""
     return JSONResponse([job.title for job in explorer_of(request).jobs.all() if not job.is_done])
 
 
 def _page(
     request: Request, tab: str, *, job: Job | None = None, state: State = "ready", **context: Any
 ) -> Response:
-    """A page about the release; as long as a job's state says that it is not done, the page loads itself again."""
-    return page(
-        request,
-        f"release_{tab or 'contents'}.html",
-        tab=tab,
-        tabs=TABS,
-        job=job,
-        state=state,
-        **context,
-    )
+    """Return a page about the release; it reloads itself until the job's state is done."""
+    template = f"release_{tab or 'contents'}.html"
+    return page(request, template, tab=tab, tabs=TABS, job=job, state=state, **context)
 
 
 def _contents(request: Request) -> Response:
-    """Counted in the background, since the folders of all sensors are listed."""
+    """Return the contents of a release.
+
+    They are counted in the background, since the folders of all sensors are listed.
+    """
     explorer = explorer_of(request)
     job = explorer.jobs.ask(
         "overview", "what the release holds", lambda: overview(explorer.dataset)
     )
-    state = job.state  # looked at once: it changes at any moment
-    return _page(
-        request,
-        "",
-        job=job,
-        state=state,
-        **(_overview_context(job.result) if state == "ready" else {}),
-    )
+    state = job.state  # read once, since it can change at any moment
+    context = _overview_context(job.result) if state == "ready" else {}
+    return _page(request, "", job=job, state=state, **context)
 
 
-def _overview_context(told: Overview) -> dict[str, Any]:
-    """What the overview's template shows: counts, those of attributes with the values that the list knows them by."""
-    of_splits = set(told.expected) == set(SPLITS)
+def _overview_context(counts: Overview) -> dict[str, Any]:
+    """Return the variables of the overview's template.
+
+    Values of attributes are named as in the filters of the list.
+    """
+    has_splits = set(counts.expected) == set(SPLITS)
+    splits = [(name, count, counts.expected.get(name)) for name, count in counts.splits.items()]
+    attributes = {}
+    for field, by_value in counts.attributes.items():
+        attributes[field] = [
+            (UNKNOWN_VALUE if value == _OVERVIEW_UNKNOWN else value, count)
+            for value, count in by_value.items()
+        ]
     return {
-        "told": told,
-        "splits": [(name, count, told.expected.get(name)) for name, count in told.splits.items()],
-        "whole": None if of_splits else sum(told.expected.values()),
-        "attributes": {
-            field: [
-                (UNKNOWN_VALUE if value == _NONE else value, count)
-                for value, count in counts.items()
-            ]
-            for field, counts in told.attributes.items()
-        },
+        "told": counts,
+        "splits": splits,
+        "whole": None if has_splits else sum(counts.expected.values()),
+        "attributes": attributes,
     }
 
 
 def _maps(request: Request) -> Response:
-    """The maps that are kept beside the index."""
+    """Return the maps that are stored beside the index."""
     dataset = explorer_of(request).dataset
-    return _page(
-        request, "maps", towns={town: kept_town_map(dataset, town) for town in towns_of(dataset)}
-    )
+    towns = {town: kept_town_map(dataset, town) for town in towns_of(dataset)}
+    return _page(request, "maps", towns=towns)
 
 
 def _map(request: Request) -> Response:
     explorer, town = explorer_of(request), request.path_params["town"]
-    found = kept_town_map(explorer.dataset, town)
-    if found is None:
+    town_map = kept_town_map(explorer.dataset, town)
+    if town_map is None:
         raise NotAvailableError(f"{town}: its map is not made yet")
 
     def draw() -> Any:
-        figure = detached_figure(_SIZE)
-        draw_whole_map(found, figure.subplots())
+        figure = detached_figure(_MAP_SIZE)
+        draw_whole_map(town_map, figure.subplots())
         return figure
 
-    return picture(
-        explorer.drawn(("map", town, found.looks, found.missing, found.damaged), draw), "png"
-    )
+    key = ("map", town, town_map.looks, town_map.missing, town_map.damaged)
+    return picture(explorer.drawn(key, draw), "png")
 
 
 def _conventions(request: Request) -> Response:

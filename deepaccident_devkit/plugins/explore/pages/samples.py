@@ -1,4 +1,4 @@
-"""A model's samples: those of a group or a scenario, the worst first, and each of them over its truth."""
+"""A model's samples: of a group or a scenario, the worst first, and each with its ground truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation.breakdowns import (
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader, agent_of, scenario_of
 from deepaccident_devkit.plugins.explore.background import Job
-from deepaccident_devkit.plugins.explore.choices import MOST_WORD
+from deepaccident_devkit.plugins.explore.choices import MAX_WORD_LENGTH
 from deepaccident_devkit.plugins.explore.evaluations import finite, other_values, verdict_text
 from deepaccident_devkit.plugins.explore.explorer import Explorer
 from deepaccident_devkit.plugins.explore.models import Model, sample_values_job
@@ -48,16 +48,17 @@ ORDERS: Final[Mapping[_SampleOrder, str]] = {
 }
 _PictureKind = Literal["above", "cameras"]
 _PictureSize = Literal["whole", "half"]
-# Inches; half is for two side by side. A whole picture from above has its task's own size.
-_SIZES: Final[Mapping[tuple[_PictureKind, _PictureSize], tuple[float, float]]] = {
+# Width and height in inches; half is for two pictures side by side. A whole picture from above has
+# its task's own size.
+_FIGURE_SIZES: Final[Mapping[tuple[_PictureKind, _PictureSize], tuple[float, float]]] = {
     ("above", "half"): (7.7, 4.6),
     ("cameras", "whole"): (15.2, 7.4),
     ("cameras", "half"): (7.7, 4.7),
 }
 # Seconds that the pictures of explicit accidents look ahead.
-_OTHER_HORIZON: Final = 2.0
+_ACCIDENT_HORIZON_S: Final = 2.0
 SAMPLE = "{type}/{name}/{agent}/{frame:int}"
-# Samples on a page of the list.
+# Number of samples on a page of the list.
 SAMPLES_PER_PAGE: Final = 60
 
 
@@ -66,10 +67,11 @@ class SampleChoices:
     """What a reader chose of a model's samples.
 
     Attributes:
-        by: an attribute; empty for all samples.
-        value: of the attribute, `unknown` where it is not known.
-        scenario: token; empty for all.
-        order: None for the usual one: the worst first, or in time where samples have no numbers.
+        by: An attribute; empty for all samples.
+        value: Value of the attribute, `unknown` where it is not known.
+        scenario: Token of a scenario; empty for all.
+        order: Order of the list; None for the default: the worst first, or in time where samples
+            have no numbers.
     """
 
     by: str = ""
@@ -78,44 +80,62 @@ class SampleChoices:
     order: _SampleOrder | None = None
 
     @classmethod
-    def of(cls, given: Mapping[str, str]) -> SampleChoices:
-        """Those of the parameters of an address. Raises ChoiceError: there is no such attribute."""
-        by: str = given.get("by", "")
-        order: Any = given.get("order")
+    def of(cls, parameters: Mapping[str, str]) -> SampleChoices:
+        """Return the choices of the parameters of an address.
+
+        Raises ChoiceError if there is no such attribute.
+        """
+        by: str = parameters.get("by", "")
+        order: Any = parameters.get("order")
         return cls(
             by=attribute_name(by) if by else "",
-            value=given.get("value", "")[:MOST_WORD] if by else "",
-            scenario=given.get("scenario", "")[:MOST_WORD],
+            value=parameters.get("value", "")[:MAX_WORD_LENGTH] if by else "",
+            scenario=parameters.get("scenario", "")[:MAX_WORD_LENGTH],
             order=order if order in get_args(_SampleOrder) else None,
         )
 
-    def address(self, *, ahead: int = 0, **changed: Any) -> str:
-        """The parameters of the address with some choices changed, and a frame ahead: `?by=agent&value=ego_vehicle`."""
-        chosen = replace(self, **changed)
-        pairs = [("by", chosen.by), ("value", chosen.value)] if chosen.by else []
-        pairs += [("scenario", chosen.scenario)] * bool(chosen.scenario)
-        pairs += [("order", str(chosen.order))] * (chosen.order is not None)
-        pairs += [("ahead", str(ahead))] * (ahead > 0)
-        return f"?{urlencode(pairs)}" if pairs else ""
+    def address(self, *, ahead: int = 0, **changes: Any) -> str:
+        """Return the parameters of the address: `?by=agent&value=ego_vehicle`.
+
+        Keyword arguments change some of the choices; `ahead` is a frame ahead.
+        """
+        choices = replace(self, **changes)
+        pairs: list[tuple[str, str]] = []
+        if choices.by:
+            pairs += [("by", choices.by), ("value", choices.value)]
+        if choices.scenario:
+            pairs.append(("scenario", choices.scenario))
+        if choices.order is not None:
+            pairs.append(("order", str(choices.order)))
+        if ahead > 0:
+            pairs.append(("ahead", str(ahead)))
+        if pairs:
+            return f"?{urlencode(pairs)}"
+        return ""
 
     def words(self) -> str:
-        """In words: `time to impact 1 s`; empty for all samples."""
-        group = [f"{self.by.replace('_', ' ')} {self.value}"] if self.by else []
-        return ", ".join([*group, *[self.scenario] * bool(self.scenario)])
+        """Return the choices in words: `time to impact 1 s`; empty for all samples."""
+        words = []
+        if self.by:
+            words.append(f"{self.by.replace('_', ' ')} {self.value}")
+        if self.scenario:
+            words.append(self.scenario)
+        return ", ".join(words)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Listed:
-    """The samples that choices come to.
+class SampleList:
+    """The samples that match choices.
 
     Attributes:
-        tokens: in order.
-        order: in which they are.
-        ranked: whether they can be in another order than in time.
-        groups: value → how many samples, of the attribute of choice; empty without one, and until they are known.
-        unknown: samples that are not in this release, so that nothing is known of their group.
-        waits: titles of the work that is waited for.
-        faults: sentences on what cannot be told.
+        tokens: Tokens, in order.
+        order: Order of the samples.
+        ranked: Whether they can be in another order than in time.
+        groups: Value of the chosen attribute → number of samples; empty without an attribute, and
+            until they are known.
+        unknown: Number of samples that are not in this release, so that their group is unknown.
+        waits: Titles of jobs that are not done.
+        faults: Sentences on failed jobs.
     """
 
     tokens: tuple[str, ...]
@@ -127,73 +147,91 @@ class Listed:
     faults: tuple[str, ...]
 
 
-def listed_samples(explorer: Explorer, model: Model, choices: SampleChoices) -> Listed:
-    """The samples of a model that choices come to."""
+def list_samples(explorer: Explorer, model: Model, choices: SampleChoices) -> SampleList:
+    """Return the samples of a model that match choices."""
     tokens = list(model.tokens)
-    known = attributes_job(explorer, model) if choices.by else None
-    ranks = sample_values_job(explorer.jobs, model) if model.bundle is not None else None
-    jobs = [job for job in (known, ranks) if job is not None]
-    waiting = [
-        job for job in jobs if not job.is_done
-    ]  # before their results are read: what comes later is not missed
+    attributes = None
+    if choices.by:
+        attributes = attributes_job(explorer, model)
+    ranks = None
+    if model.bundle is not None:
+        ranks = sample_values_job(explorer.jobs, model)
+    jobs = [job for job in (attributes, ranks) if job is not None]
+    # Listed before the results are read, so that a job that ends meanwhile is not missed.
+    waiting = [job for job in jobs if not job.is_done]
     groups: dict[str, int] = {}
-    unknown = 0
-    if known is not None:
-        found: Mapping[str, SampleAttributes] | None = known.result
+    num_unknown = 0
+    if attributes is not None:
+        by_token: Mapping[str, SampleAttributes] | None = attributes.result
         values = {
-            token: each.value(choices.by) or UNKNOWN_VALUE for token, each in (found or {}).items()
+            token: sample.value(choices.by) or UNKNOWN_VALUE
+            for token, sample in (by_token or {}).items()
         }
-        groups = dict(
-            sorted(Counter(values.values()).items(), key=lambda item: natural_order(item[0]))
-        )
-        unknown = 0 if found is None else len(tokens) - len(values)
+        counts = Counter(values.values())
+        groups = {value: counts[value] for value in sorted(counts, key=natural_order)}
+        if by_token is not None:
+            num_unknown = len(tokens) - len(values)
         tokens = [token for token in tokens if values.get(token) == choices.value]
     if choices.scenario:
         tokens = [token for token in tokens if scenario_of(token) == choices.scenario]
-    # warnings are judged over recordings: single samples have no numbers
-    ranked = ranks is not None and (
-        ranks.result is None or any(each is not None for each in ranks.result.values())
-    )
+    ranked, numbers = _ranking(ranks)
     order: _SampleOrder = choices.order or "worst" if ranked else "time"
-    return Listed(
-        tokens=tuple(_ordered(tokens, order, ranks.result or {} if ranks is not None else {})),
+    return SampleList(
+        tokens=tuple(_order_samples(tokens, order, numbers)),
         order=order,
         ranked=ranked,
         groups=groups,
-        unknown=unknown,
-        waits=tuple(job.title for job in waiting if job is known or order != "time"),
+        unknown=num_unknown,
+        waits=tuple(job.title for job in waiting if job is attributes or order != "time"),
         faults=tuple(f"{job.title}: {job.error}" for job in jobs if job.state == "failed"),
     )
 
 
-def _ordered(
+def _ranking(ranks: Job | None) -> tuple[bool, Mapping[str, float | None]]:
+    """Return whether samples can be ranked, and their main numbers as far as they are computed.
+
+    Warnings are judged over recordings: single samples have no numbers.
+    """
+    if ranks is None:
+        return False, {}
+    numbers: Mapping[str, float | None] | None = ranks.result
+    if numbers is None:
+        return True, {}
+    return any(number is not None for number in numbers.values()), numbers
+
+
+def _order_samples(
     tokens: Iterable[str], order: _SampleOrder, values: Mapping[str, float | None]
 ) -> list[str]:
-    """By the main number, samples without one last; in time as long as they are not known."""
+    """Return tokens by the main number, samples without one last.
+
+    They are in time as long as the numbers are unknown.
+    """
     in_time = sorted(tokens)
-    chosen = set() if order == "time" else set(in_time)
-    ranked = [token for token, value in values.items() if value is not None and token in chosen]
-    others = set(ranked)
-    return [
-        *(ranked if order == "worst" else ranked[::-1]),
-        *(token for token in in_time if token not in others),
-    ]
+    if order == "time":
+        return in_time
+    present = set(in_time)
+    ranked = [token for token, value in values.items() if value is not None and token in present]
+    ranked_set = set(ranked)
+    if order == "best":
+        ranked.reverse()
+    return [*ranked, *(token for token in in_time if token not in ranked_set)]
 
 
 def attributes_job(explorer: Explorer, model: Model) -> Job:
-    """The work that gives the attributes of a model's samples, as far as they are in the release."""
+    """Return the job that computes the attributes of a model's samples in the release."""
     dataset = explorer.dataset
-    return explorer.jobs.ask(
-        f"attributes {model.name}",
-        f"attributes of the samples of {model.name}",
-        lambda: sample_attributes(
-            dataset, [token for token in model.tokens if is_sample(dataset, token)]
-        ),
-    )
+
+    def attributes() -> Mapping[str, SampleAttributes]:
+        tokens = [token for token in model.tokens if is_sample(dataset, token)]
+        return sample_attributes(dataset, tokens)
+
+    title = f"attributes of the samples of {model.name}"
+    return explorer.jobs.ask(f"attributes {model.name}", title, attributes)
 
 
 def is_sample(dataset: Dataset, token: str) -> bool:
-    """Whether the release has a sample."""
+    """Return whether the release has a sample."""
     try:
         dataset.getind("sample", token)
     except TokenError:
@@ -203,12 +241,12 @@ def is_sample(dataset: Dataset, token: str) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PictureChoice:
-    """Which picture.
+    """A picture of a sample.
 
     Attributes:
-        kind: from above or in the cameras.
-        size: of the picture.
-        ahead: of motion in cameras: frames ahead, 0 for the present.
+        kind: From above or in the cameras.
+        size: Size of the picture.
+        ahead: Frames ahead, for motion in cameras; 0 for the present.
     """
 
     kind: _PictureKind
@@ -217,20 +255,20 @@ class _PictureChoice:
 
 
 def why_not(explorer: Explorer, model: Model, token: str) -> str:
-    """Why there is no picture of a sample, in a sentence; empty if there is one."""
+    """Return why there is no picture of a sample, in a sentence; empty if there is one."""
     if not is_sample(explorer.dataset, token):
         return "This sample is not in this release."
     if model.results is None:
         return f"The predictions of {model.name} were not given."
     if not model.has(token):
         return f"{model.name} predicts nothing for this sample."
-    if _task(model) not in FIGURE_SIZES:
+    if _picture_task(model) not in FIGURE_SIZES:
         return f"There are no pictures of {model.setup.task}."
     try:
         SampleLoader(explorer.dataset, model.results, model.setup)
     except EvaluationError as error:
         return str(error)
-    return _why_no_truth(explorer, token, needs_meta=_task(model) == "accident")
+    return _why_no_truth(explorer, token, needs_meta=_picture_task(model) == "accident")
 
 
 def _why_no_truth(explorer: Explorer, token: str, *, needs_meta: bool) -> str:
@@ -242,117 +280,131 @@ def _why_no_truth(explorer: Explorer, token: str, *, needs_meta: bool) -> str:
 
 
 def rules_words(model: Model) -> str:
-    """How far the pictures are not made by the bundle's own rules; empty if they are."""
+    """Return how the pictures deviate from the bundle's own rules; empty if they do not."""
     if model.setup.task == "warning":
         return "Warnings are judged over whole recordings; these pictures judge single accidents."
-    if _task(model) == "accident" and model.results is not None:
+    if _picture_task(model) == "accident" and model.results is not None:
         form = model.results.form
-        ahead = _OTHER_HORIZON if form is None else (form.frames - 1) * form.step
-        if abs(ahead - model.setup.horizon) > FRAME_PERIOD / 2:
-            return (
-                f"These pictures look {ahead:g} s ahead, the evaluation {model.setup.horizon:g} s."
-            )
+        ahead = _ACCIDENT_HORIZON_S if form is None else (form.frames - 1) * form.step
+        horizon = model.setup.horizon
+        if abs(ahead - horizon) > FRAME_PERIOD / 2:
+            return f"These pictures look {ahead:g} s ahead, the evaluation {horizon:g} s."
     return ""
 
 
-def _sample_picture(explorer: Explorer, model: Model, token: str, shown: _PictureChoice) -> bytes:
-    """A picture as PNG; raises NotAvailableError with the words of `why_not`, or ChoiceError: no such frame."""
+def _sample_picture(explorer: Explorer, model: Model, token: str, choice: _PictureChoice) -> bytes:
+    """Return a picture as PNG.
+
+    Raises NotAvailableError with the words of `why_not`, or ChoiceError if there is no such frame.
+    """
     reason = why_not(explorer, model, token)
     if reason:
         raise NotAvailableError(f"{token}: {reason}")
-    return explorer.drawn(
-        ("predicted", model.name, token, shown), lambda: _figure(explorer, model, token, shown)
-    )
+    key = ("predicted", model.name, token, choice)
+    return explorer.drawn(key, lambda: _render_picture(explorer, model, token, choice))
 
 
 def frames_ahead(explorer: Explorer, model: Model, token: str) -> list[float]:
-    """Seconds ahead of the frames that motion is evaluated at and that are recorded; none of other tasks."""
-    form = None if model.results is None else model.results.form
+    """Return the seconds ahead of the recorded frames at which motion is evaluated.
+
+    Empty for other tasks.
+    """
+    form = None
+    if model.results is not None:
+        form = model.results.form
     if model.setup.task != "motion" or form is None or not is_sample(explorer.dataset, token):
         return []
-    last = min(model.setup.horizon, float(explorer.dataset.get("sample", token)["time_to_end"]))
-    return [number * form.step for number in range(int((last + FRAME_PERIOD / 2) / form.step) + 1)]
+    time_to_end = float(explorer.dataset.get("sample", token)["time_to_end"])
+    max_time = min(model.setup.horizon, time_to_end)
+    count = int((max_time + FRAME_PERIOD / 2) / form.step) + 1
+    return [number * form.step for number in range(count)]
 
 
-def _task(model: Model) -> str:
-    return "accident" if model.setup.task == "warning" else model.setup.task
+def _picture_task(model: Model) -> str:
+    if model.setup.task == "warning":
+        return "accident"
+    return model.setup.task
 
 
-def _figure(explorer: Explorer, model: Model, token: str, shown: _PictureChoice) -> Any:
+def _render_picture(explorer: Explorer, model: Model, token: str, choice: _PictureChoice) -> Any:
     results = model.results
     if results is None:
         raise NotAvailableError(f"{model.name}: its predictions were not given")
     loader = SampleLoader(explorer.dataset, results, model.setup)
-    prediction, rules = loader.prediction(token), model.setup.rules
-    how: dict[str, Any] = {
-        "task": _task(model),
-        "protocol": None if model.setup.task == "warning" else rules,
-    }
+    prediction, task = loader.prediction(token), _picture_task(model)
+    protocol = None if model.setup.task == "warning" else model.setup.rules
+    arguments: dict[str, Any] = {"task": task, "protocol": protocol}
     if not isinstance(prediction, DetectedBoxes):
-        how["label"] = loader.label(token)
-    figure = detached_figure(_SIZES.get((shown.kind, shown.size), FIGURE_SIZES[_task(model)]))
-    if shown.kind == "above":
-        return render_evaluation(explorer.dataset, token, prediction, **how, fig=figure)
-    frame = shown.ahead if model.setup.task == "motion" else None
-    return render_outcome_in_cameras(
-        explorer.dataset, token, prediction, **how, frame=frame, fig=figure
-    )
+        arguments["label"] = loader.label(token)
+    size = _FIGURE_SIZES.get((choice.kind, choice.size), FIGURE_SIZES[task])
+    arguments["fig"] = detached_figure(size)
+    if choice.kind == "above":
+        return render_evaluation(explorer.dataset, token, prediction, **arguments)
+    arguments["frame"] = choice.ahead if model.setup.task == "motion" else None
+    return render_outcome_in_cameras(explorer.dataset, token, prediction, **arguments)
 
 
 def model_of(request: Request, name: str = "model") -> Model:
-    """The model that a part of an address names; raises NotAvailableError."""
-    given, models = request.path_params[name], explorer_of(request).models
-    if given not in models:
+    """Return the model that a part of an address names; raise NotAvailableError."""
+    model_name, models = request.path_params[name], explorer_of(request).models
+    if model_name not in models:
         raise NotAvailableError(
-            f"there is no model {given!r}; those that were given: {', '.join(models) or 'none'}"
+            f"there is no model {model_name!r}; those that were given: "
+            f"{', '.join(models) or 'none'}"
         )
-    return models[given]
+    return models[model_name]
 
 
 def sample_path(token: str) -> str:
-    """A sample in an address: `type/scenario/agent/12`."""
+    """Return a sample's path in an address: `type/scenario/agent/12`."""
     scenario, _, frame = token.rpartition("/")
-    return path_in_address(
-        f"{scenario}/{int(frame)}" if frame.isdecimal() and frame.isascii() else token
-    )
+    if frame.isdecimal() and frame.isascii():
+        return path_in_address(f"{scenario}/{int(frame)}")
+    return path_in_address(token)
 
 
 def known_sample(request: Request, *models: Model) -> str:
-    """The sample that an address names; raises TokenError if neither the release nor a model has it."""
+    """Return the sample that an address names.
+
+    Raises TokenError if neither the release nor a model has it.
+    """
     token = sample_of(request)
-    if not is_sample(explorer_of(request).dataset, token) and not any(
-        token in model.tokens for model in models
-    ):
-        raise TokenError(
-            f"neither the release nor {', '.join(each.name for each in models)} has the sample {token!r}"
-        )
+    if is_sample(explorer_of(request).dataset, token):
+        return token
+    if not any(token in model.tokens for model in models):
+        names = ", ".join(model.name for model in models)
+        raise TokenError(f"neither the release nor {names} has the sample {token!r}")
     return token
 
 
-def beside_in_time(tokens: Iterable[str], token: str) -> tuple[str | None, str | None]:
-    """The samples before and after one, of those of the same agent."""
+def neighbours_in_time(tokens: Iterable[str], token: str) -> tuple[str | None, str | None]:
+    """Return the samples of the same agent before and after a sample."""
     recording = token.rpartition("/")[0] + "/"
-    same = sorted(each for each in tokens if each.startswith(recording))
-    before, after = [each for each in same if each < token], [each for each in same if each > token]
-    return before[-1] if before else None, after[0] if after else None
+    samples = [sample for sample in tokens if sample.startswith(recording)]
+    before = max((sample for sample in samples if sample < token), default=None)
+    after = min((sample for sample in samples if sample > token), default=None)
+    return before, after
 
 
 def titles(jobs: Iterable[Job]) -> list[str]:
-    """What is waited for, of the jobs that are not done."""
+    """Return the titles of the jobs that are not done."""
     return [job.title for job in jobs if not job.is_done]
 
 
 def models_of_task(explorer: Explorer, task: str) -> list[Model]:
-    """The evaluated models of a task."""
+    """Return the evaluated models of a task."""
     return [
-        each
-        for each in explorer.models.values()
-        if each.bundle is not None and each.setup.task == task
+        model
+        for model in explorer.models.values()
+        if model.bundle is not None and model.setup.task == task
     ]
 
 
 def routes() -> list[Route]:
-    """The addresses; those of a sample take the choices of the list, so that the way through it is known."""
+    """Return the routes of the pages.
+
+    The addresses of samples take the choices of the list, so that the position in it is known.
+    """
     return [
         Route("/model/{model}/samples", _samples),
         Route(f"/model/{{model}}/sample/{SAMPLE}", _sample),
@@ -361,11 +413,15 @@ def routes() -> list[Route]:
 
 
 def rows_of(explorer: Explorer, model: Model, tokens: Iterable[str]) -> list[dict[str, Any]]:
-    """What lists show of samples."""
-    samples = model.scores.samples if model.scores is not None else {}
+    """Return what lists show of samples."""
+    scores = model.scores.samples if model.scores is not None else {}
     rows = []
     for token in tokens:
         row = model.rows.get(token)
+        time_to_impact, verdict = None, ""
+        if row is not None:
+            time_to_impact = finite(row.get("time_to_impact"))
+            verdict = verdict_text(model.setup.task, row)
         rows.append(
             {
                 "token": token,
@@ -373,9 +429,9 @@ def rows_of(explorer: Explorer, model: Model, tokens: Iterable[str]) -> list[dic
                 "scenario": scenario_of(token),
                 "agent": agent_of(token),
                 "frame": token.rpartition("/")[2],
-                "ahead": None if row is None else finite(row.get("time_to_impact")),
-                "verdict": "" if row is None else verdict_text(model.setup.task, row),
-                "number": samples[token].text if token in samples else "",
+                "ahead": time_to_impact,
+                "verdict": verdict,
+                "number": scores[token].text if token in scores else "",
                 "here": is_sample(explorer.dataset, token),
             }
         )
@@ -385,19 +441,22 @@ def rows_of(explorer: Explorer, model: Model, tokens: Iterable[str]) -> list[dic
 def _samples(request: Request) -> Response:
     explorer, model = explorer_of(request), model_of(request)
     choices = SampleChoices.of(request.query_params)
-    found = listed_samples(explorer, model, choices)
-    part = part_of(request, found.tokens, SAMPLES_PER_PAGE)
+    samples = list_samples(explorer, model, choices)
+    part = part_of(request, samples.tokens, SAMPLES_PER_PAGE)
+    number = ""
+    if model.scores is not None and samples.ranked:
+        number = model.scores.name
     return page(
         request,
         "samples.html",
         model=model,
         choices=choices,
-        found=found,
+        found=samples,
         orders=ORDERS,
         part=part,
         rows=rows_of(explorer, model, part.entries),
-        waits=[*found.waits],
-        number=model.scores.name if model.scores is not None and found.ranked else "",
+        waits=[*samples.waits],
+        number=number,
     )
 
 
@@ -405,8 +464,8 @@ def _sample(request: Request) -> Response:
     explorer, model = explorer_of(request), model_of(request)
     token = known_sample(request, model)
     choices = SampleChoices.of(request.query_params)
-    before, after = beside_in_time(model.tokens, token)
-    found = listed_samples(explorer, model, choices)
+    before, after = neighbours_in_time(model.tokens, token)
+    samples = list_samples(explorer, model, choices)
     return page(
         request,
         "sample.html",
@@ -414,21 +473,29 @@ def _sample(request: Request) -> Response:
         before=before,
         after=after,
         choices=choices,
-        place=list_position(found.tokens, token),
-        order=ORDERS[found.order],
-        ahead=asked_ahead(request),
-        waits=[*found.waits],
+        place=list_position(samples.tokens, token),
+        order=ORDERS[samples.order],
+        ahead=requested_frame(request),
+        waits=[*samples.waits],
         aheads=frames_ahead(explorer, model, token),
         sample_path=sample_path,
     )
 
 
 def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, Any]:
-    """What is shown of a model at a sample."""
+    """Return what is shown of a model at a sample."""
     row = model.rows.get(token)
-    name, score = (
-        ("", None) if model.scores is None else (model.scores.name, model.scores.samples.get(token))
-    )
+    verdict = ""
+    values: dict[str, str] = {}
+    if row is not None:
+        verdict = verdict_text(model.setup.task, row, in_full=True)
+        values = other_values(row)
+    number, scores = "", model.scores
+    if scores is not None and token in scores.samples:
+        score = scores.samples[token]
+        if score.value is not None:
+            number = f"{scores.name} {score.text}"
+    _, figure_height = FIGURE_SIZES.get(_picture_task(model), (0.0, 0.0))
     return {
         "model": model,
         "token": token,
@@ -438,36 +505,36 @@ def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, An
         "frame": int(token.rpartition("/")[2]),
         "here": is_sample(explorer.dataset, token),
         "evaluated": row is not None,
-        "verdict": "" if row is None else verdict_text(model.setup.task, row, whole=True),
-        "values": {} if row is None else other_values(row),
-        "number": "" if score is None or score.value is None else f"{name} {score.text}",
+        "verdict": verdict,
+        "values": values,
+        "number": number,
         "why_not": why_not(explorer, model, token),
         "rules": rules_words(model),
-        "tall": round(80 * FIGURE_SIZES.get(_task(model), (0.0, 0.0))[1]),
+        "tall": round(80 * figure_height),
         "remedy": _remedy(model),
     }
 
 
 def _remedy(model: Model) -> str:
-    """Where the results were of a bundle that has none to show; empty if there are results."""
-    return (
-        ""
-        if model.results is not None or model.bundle is None
-        else str(model.bundle.summary["results"]["path"])
-    )
+    """Return the path of the results of a bundle without a copy; empty if there are results."""
+    if model.results is not None or model.bundle is None:
+        return ""
+    return str(model.bundle.summary["results"]["path"])
 
 
 def list_position(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
-    """Where a sample is in a list: its number, how many there are, and those before and after it; None if it is not."""
+    """Return where a sample is in a list; None if it is not in it.
+
+    This is its number, the length of the list, and the samples before and after it.
+    """
     if token not in tokens:
         return None
-    at = tokens.index(token)
-    before, after = tokens[:at][-1:], tokens[at + 1 : at + 2]
+    index = tokens.index(token)
     return {
-        "number": at + 1,
+        "number": index + 1,
         "count": len(tokens),
-        "before": before[0] if before else None,
-        "after": after[0] if after else None,
+        "before": tokens[index - 1] if index else None,
+        "after": tokens[index + 1] if index + 1 < len(tokens) else None,
     }
 
 
@@ -476,15 +543,17 @@ def _picture(request: Request) -> Response:
     if kind not in get_args(_PictureKind):
         raise HTTPException(404)
     size: _PictureSize = "half" if request.query_params.get("size") == "half" else "whole"
-    shown = _PictureChoice(
-        kind=kind, size=size, ahead=asked_ahead(request) if kind == "cameras" else 0
-    )
-    return picture(_sample_picture(explorer, model, known_sample(request, model), shown), "png")
+    ahead = 0
+    if kind == "cameras":
+        ahead = requested_frame(request)
+    choice = _PictureChoice(kind=kind, size=size, ahead=ahead)
+    token = known_sample(request, model)
+    return picture(_sample_picture(explorer, model, token, choice), "png")
 
 
-def asked_ahead(request: Request) -> int:
-    """The frame that cameras show; raises HTTPException."""
-    given = request.query_params.get("ahead", "0")
-    if not (given.isascii() and given.isdecimal() and len(given) < 3):
+def requested_frame(request: Request) -> int:
+    """Return the frame ahead that cameras show; raise HTTPException."""
+    text = request.query_params.get("ahead", "0")
+    if not (text.isascii() and text.isdecimal() and len(text) < 3):
         raise HTTPException(404)
-    return int(given)
+    return int(text)

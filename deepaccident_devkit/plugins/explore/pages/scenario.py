@@ -1,4 +1,7 @@
-"""A scenario: its replay, story, pairs, lead times, twin and findings; a moment's boxes; its pictures and points."""
+"""Pages of a scenario: its replay, story, pairs, lead times, twin and findings.
+
+Also a moment's boxes, with its pictures and points.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.plugins.explore.explorer import Explorer
 from deepaccident_devkit.plugins.explore.models import FORESEEN
 from deepaccident_devkit.plugins.explore.pages.responses import (
-    KEPT,
+    PICTURE_CACHING,
     explorer_of,
     page,
     picture,
@@ -37,15 +40,15 @@ from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, short_name
 from deepaccident_devkit.validation import findings
 
 _SCENARIO_ROUTE: Final = "/scenario/{type}/{name}"
-# Pixels that an image may be asked for: few, so that they are kept.
+# Widths of images in pixels: few, so that they stay in memory.
 _WIDTHS: Final = (160, 320, 640, 960, 1600)
-_QUALITY: Final = 80
-# What is rendered of a moment → by what, and how large in inches.
+_JPEG_QUALITY: Final = 80
+# View of a moment → the function that renders it, and its width and height in inches.
 _VIEWS: Final[Mapping[str, tuple[Callable[..., Any], tuple[float, float]]]] = {
     "sample": (render_sample, (15.5, 5.4)),
     "labels": (render_motion_labels, (12.5, 9.4)),
 }
-_MOST_PAIRS: Final = 30
+_MAX_PAIRS: Final = 30
 # Part → its heading.
 PARTS: Final[Mapping[str, str]] = {
     "story": "What happens",
@@ -57,7 +60,7 @@ PARTS: Final[Mapping[str, str]] = {
 
 
 def routes() -> list[Route]:
-    """The addresses."""
+    """Return the routes of the pages."""
     return [
         Route(_SCENARIO_ROUTE, with_slash),
         Route(f"{_SCENARIO_ROUTE}/", _scenario),
@@ -73,12 +76,12 @@ def routes() -> list[Route]:
 
 
 def _scenario_token(request: Request) -> str:
-    """The scenario that an address names."""
+    """Return the scenario that an address names."""
     return "{type}/{name}".format(**request.path_params)
 
 
 def sample_of(request: Request) -> str:
-    """The sample that an address names; raises HTTPException for an agent that cannot be."""
+    """Return the sample that an address names; raise HTTPException for an impossible agent."""
     agent, frame = request.path_params["agent"], request.path_params["frame"]
     if agent not in AGENTS or not 0 < frame < 1000:
         raise HTTPException(404)
@@ -88,16 +91,13 @@ def sample_of(request: Request) -> str:
 def _scenario(request: Request) -> Response:
     explorer, token = explorer_of(request), _scenario_token(request)
     if token not in explorer.scenarios.row_of:
-        return _left_out(request, explorer, token)
-    return page(
-        request,
-        "scenario.html",
-        **scenario_context(explorer, token, request.query_params.get("model")),
-    )
+        return _broken_scenario(request, explorer, token)
+    context = scenario_context(explorer, token, request.query_params.get("model"))
+    return page(request, "scenario.html", **context)
 
 
-def _left_out(request: Request, explorer: Explorer, token: str) -> Response:
-    """A scenario that is broken has findings alone; raises TokenError if there is none of this name."""
+def _broken_scenario(request: Request, explorer: Explorer, token: str) -> Response:
+    """Return the page of a broken scenario, which only has findings; raise TokenError."""
     if token not in {problem.scenario for problem in explorer.dataset.problems}:
         raise TokenError(f"the release has no scenario {token!r}")
     context: dict[str, Any] = {"token": token, "findings": findings(explorer.dataset, token)}
@@ -105,42 +105,46 @@ def _left_out(request: Request, explorer: Explorer, token: str) -> Response:
 
 
 def scenario_context(explorer: Explorer, token: str, model: str | None) -> dict[str, Any]:
-    """What a scenario's page shows, with the predictions of a model (a name) in its replay; None for none."""
-    row, rows = explorer.scenarios.row_of[token], explorer.scenarios
-    telling = [
-        name for name, each in explorer.models.items() if each.results and token in each.scenarios
+    """Return what a scenario's page shows.
+
+    Args:
+        explorer: Explorer of the release.
+        token: Token of the scenario.
+        model: Name of the model with the predictions of the replay; None for none.
+    """
+    scenarios = explorer.scenarios
+    row = scenarios.row_of[token]
+    models = [
+        name
+        for name, candidate in explorer.models.items()
+        if candidate.results and token in candidate.scenarios
     ]
-    shown = (
-        model
-        if model in telling and explorer.models[model].setup.task in (*FORESEEN, "warning")
-        else None
-    )
-    twin, played = twin_of(explorer.dataset, token), explorer.replay(token, shown)
+    replayed_model = None
+    if model in models and explorer.models[model].setup.task in (*FORESEEN, "warning"):
+        replayed_model = model
+    twin, replay = twin_of(explorer.dataset, token), explorer.replay(token, replayed_model)
     return {
         "token": token,
-        "before": rows.tokens[row - 1] if row else None,
-        "after": rows.tokens[row + 1] if row + 1 < len(rows) else None,
+        "before": scenarios.tokens[row - 1] if row else None,
+        "after": scenarios.tokens[row + 1] if row + 1 < len(scenarios) else None,
         "twin": None if twin is None else twin["token"],
-        "telling": telling,
-        "model": shown,
-        "data": script_json(played),
+        "telling": models,
+        "model": replayed_model,
+        "data": script_json(replay),
         "parts": PARTS,
-        "first_agent": played["agents"][0]["name"],
+        "first_agent": replay["agents"][0]["name"],
     }
 
 
 def _player(request: Request) -> Response:
-    """The replay alone, for a page that shows two of them side by side."""
+    """Return a page with only the replay, for a page that shows two of them side by side."""
     explorer, token = explorer_of(request), _scenario_token(request)
-    return page(
-        request,
-        "player.html",
-        **scenario_context(explorer, token, request.query_params.get("model")),
-    )
+    context = scenario_context(explorer, token, request.query_params.get("model"))
+    return page(request, "player.html", **context)
 
 
 def _twin(request: Request) -> Response:
-    """A scenario and its twin side by side, in step."""
+    """Return a scenario and its twin side by side, in step."""
     explorer, token = explorer_of(request), _scenario_token(request)
     twin = twin_of(explorer.dataset, token)
     if twin is None:
@@ -153,38 +157,37 @@ def _twin(request: Request) -> Response:
     except NotAvailableError:
         shift = 0
     offset = explorer.recording(twin["token"]).origin - explorer.recording(token).origin
-    others: dict[str, Any] = {
+    context: dict[str, Any] = {
         "token": token,
         "twin": twin["token"],
         "shift": shift,
         "offset": offset.tolist(),
     }
-    return page(request, "twins.html", **others)
+    return page(request, "twins.html", **context)
 
 
-# the parts below a replay
+# The parts below a replay.
 
 
 def _part(request: Request) -> Response:
-    explorer, token, name = (
-        explorer_of(request),
-        _scenario_token(request),
-        request.path_params["part"],
-    )
+    explorer, token = explorer_of(request), _scenario_token(request)
+    name = request.path_params["part"]
     if name not in PARTS:
         raise HTTPException(404)
     return HTMLResponse(part_html(explorer, token, name, root_of(request.scope["path"])))
 
 
 def part_html(explorer: Explorer, token: str, name: str, root: str) -> str:
-    """One of `PARTS` of a scenario as HTML."""
-    return rendered_page(
-        explorer, f"parts/{name}.html", root, **part_context(explorer.dataset, token, name)
-    )
+    """Return one of `PARTS` of a scenario as HTML."""
+    context = part_context(explorer.dataset, token, name)
+    return rendered_page(explorer, f"parts/{name}.html", root, **context)
 
 
 def part_context(dataset: Dataset, token: str, name: str) -> dict[str, Any]:
-    """What the template of one of `PARTS` shows; where it cannot be told, `missing` is a sentence that says why."""
+    """Return the variables of the template of one of `PARTS`.
+
+    If it is not available, `missing` is a sentence with the reason.
+    """
     try:
         context = _CONTEXTS[name](dataset, token)
     except NotAvailableError as error:
@@ -193,71 +196,78 @@ def part_context(dataset: Dataset, token: str, name: str) -> dict[str, Any]:
 
 
 def _pairs(dataset: Dataset, token: str) -> dict[str, Any]:
-    """Pairs that come near each other, the soonest collision first."""
+    """Return pairs that come near each other, the soonest collision first."""
     pairs = interactions(dataset, token).pairs
-    names = _actor_names(dataset, token)
-    rows = [
-        {
-            "names": [names(actor) for actor in pairs.actor_ids[at].tolist()],
-            "moving": bool(pairs.moving[at]),
-            **{
-                name: float(getattr(pairs, name)[at])
-                for name in ("min_ttc", "min_gap", "max_drac", "pet")
-            },
-            "ttc_frame": int(pairs.min_ttc_frame[at]),
-            "gap_frame": int(pairs.min_gap_frame[at]),
-        }
-        for at in range(len(pairs))
-    ]
+    name_of = _actor_names(dataset, token)
+    rows = []
+    for index in range(len(pairs)):
+        rows.append(
+            {
+                "names": [name_of(actor) for actor in pairs.actor_ids[index].tolist()],
+                "moving": bool(pairs.moving[index]),
+                "min_ttc": float(pairs.min_ttc[index]),
+                "min_gap": float(pairs.min_gap[index]),
+                "max_drac": float(pairs.max_drac[index]),
+                "pet": float(pairs.pet[index]),
+                "ttc_frame": int(pairs.min_ttc_frame[index]),
+                "gap_frame": int(pairs.min_gap_frame[index]),
+            }
+        )
     rows.sort(key=lambda row: (not row["moving"], row["min_ttc"], row["min_gap"]))
-    return {"rows": rows[:_MOST_PAIRS], "more": max(0, len(rows) - _MOST_PAIRS)}
+    return {"rows": rows[:_MAX_PAIRS], "more": max(0, len(rows) - _MAX_PAIRS)}
 
 
 def _actor_names(dataset: Dataset, token: str) -> Callable[[int], str]:
     agents = {actor: short_name(agent) for actor, agent in recorders_of(dataset, token).items()}
 
     def name(actor: int) -> str:
-        kind = dataset.get("instance", f"{token}/actor/{actor}")["category"]
-        return f"{kind} {actor}" + (f" ({agents[actor]})" if actor in agents else "")
+        category = dataset.get("instance", f"{token}/actor/{actor}")["category"]
+        if actor in agents:
+            return f"{category} {actor} ({agents[actor]})"
+        return f"{category} {actor}"
 
     return name
 
 
 def _ledger(dataset: Dataset, token: str) -> dict[str, Any]:
-    """Since when sets of agents see both colliders, and what each partner adds."""
-    leads = lead_times(dataset, token)
-    if leads is None:
+    """Return since when sets of agents see both colliders, and what each partner adds."""
+    times = lead_times(dataset, token)
+    if times is None:
         raise NotAvailableError(f"{token}: nobody collides, so that there is no lead time")
-    sets = [
-        {
-            "agents": ", ".join(map(short_name, agents)),
-            "lead": lead,
-            "frame": frame,
-        }
-        for agents, lead, frame in zip(
-            COALITIONS, leads.leads.tolist(), leads.first_frames.tolist(), strict=True
-        )
-        if not math.isnan(lead)
-    ]
+    sets = []
+    for agents, lead, frame in zip(
+        COALITIONS, times.leads.tolist(), times.first_frames.tolist(), strict=True
+    ):
+        if not math.isnan(lead):
+            names = ", ".join(map(short_name, agents))
+            sets.append({"agents": names, "lead": lead, "frame": frame})
     partners = zip(
-        PARTNERS, leads.gains.tolist(), leads.losses.tolist(), leads.shapley.tolist(), strict=True
+        map(short_name, PARTNERS),
+        times.gains.tolist(),
+        times.losses.tolist(),
+        times.shapley.tolist(),
+        strict=True,
     )
-    return {"sets": sets, "partners": [(short_name(name), *values) for name, *values in partners]}
+    return {"sets": sets, "partners": list(partners)}
 
 
 def _twins(dataset: Dataset, token: str) -> dict[str, Any]:
-    told = twin_diff(dataset, token).to_dict()
-    actors = [each for each in told["actors"] if each["parting_frame"]]
-    return {"told": told, "actors": actors, "is_accident": told["accident"] == token}
+    diff = twin_diff(dataset, token).to_dict()
+    actors = [actor for actor in diff["actors"] if actor["parting_frame"]]
+    return {"told": diff, "actors": actors, "is_accident": diff["accident"] == token}
 
 
 def _findings(dataset: Dataset, token: str) -> dict[str, Any]:
-    """What `validate` finds, how many sensor files there are of how many, and at how many frames any."""
-    files, frames = dataset.sensor_frames(token), dataset.get("scenario", token)["num_frames"]
+    """Return what `validate` finds, and how many of the sensor files and frames exist.
+
+    A frame exists if it has any sensor file.
+    """
+    files, num_frames = dataset.sensor_frames(token), dataset.get("scenario", token)["num_frames"]
+    recorded_frames = set().union(*files.values())
     return {
         "findings": findings(dataset, token),
-        "files": {"here": sum(map(len, files.values())), "whole": frames * len(files)},
-        "frames": {"here": len(set().union(*files.values())), "whole": frames},
+        "files": {"here": sum(map(len, files.values())), "whole": num_frames * len(files)},
+        "frames": {"here": len(recorded_frames), "whole": num_frames},
     }
 
 
@@ -270,19 +280,25 @@ _CONTEXTS: Final[Mapping[str, Callable[[Dataset, str], dict[str, Any]]]] = {
 }
 
 
-# a moment
+# Moments.
 
 
 def _moment(request: Request) -> Response:
-    """What an agent recorded at a moment: its cameras and LiDAR with boxes, motion labels, and the boxes in numbers."""
+    """Return what an agent recorded at a moment.
+
+    This is its cameras and LiDAR with boxes, motion labels, and the boxes in numbers.
+    """
     explorer, token, sample = explorer_of(request), _scenario_token(request), sample_of(request)
     record = explorer.dataset.get("sample", sample)
     boxes = explorer.dataset.get_boxes(record, "ego")
     scenario = explorer.dataset.get("scenario", token)
-    agents = [each["agent"] for each in explorer.dataset.samples_of(record["frame_token"])]
+    samples = explorer.dataset.samples_of(record["frame_token"])
     agent, frame = request.path_params["agent"], request.path_params["frame"]
-    files = explorer.dataset.sensor_frames(token).items()
-    filed = {number for (name, _), frames in files if name == agent for number in frames}
+    recorded_frames: set[int] = set()
+    for (name, _), frames in explorer.dataset.sensor_frames(token).items():
+        if name == agent:
+            recorded_frames.update(frames)
+    nearest = min(recorded_frames, key=lambda number: abs(number - frame), default=frame)
     return page(
         request,
         "moment.html",
@@ -290,9 +306,9 @@ def _moment(request: Request) -> Response:
         sample=sample,
         agent=agent,
         frame=frame,
-        nearest=min(filed, key=lambda number: abs(number - frame), default=frame),
+        nearest=nearest,
         frames=scenario["num_frames"],
-        agents=agents,
+        agents=[other["agent"] for other in samples],
         labelled=record["labelled"],
         boxes=boxes,
     )
@@ -303,48 +319,49 @@ def _thumbnail(request: Request) -> Response:
 
 
 def _image(request: Request) -> Response:
-    """A camera's image; smaller ones in memory for the next reader."""
+    """Return a camera's image; smaller ones stay in memory for the next reader."""
     sample, channel = sample_of(request), request.path_params["channel"]
     if channel not in CAMERAS:
         raise HTTPException(404)
     explorer = explorer_of(request)
     width = _width(request.query_params.get("width", ""))
-    made = explorer.pictures.get(
-        (sample, channel, width), lambda: _jpeg(explorer, sample, channel, width)
-    )
-    return picture(made, "jpeg")
+    key = (sample, channel, width)
+    content = explorer.pictures.get(key, lambda: _jpeg(explorer, sample, channel, width))
+    return picture(content, "jpeg")
 
 
-def _width(asked: str) -> int:
-    if not re.fullmatch(r"\d{1,4}", asked):
+def _width(text: str) -> int:
+    if not re.fullmatch(r"\d{1,4}", text):
         return _WIDTHS[-1]
-    return next((width for width in _WIDTHS if width >= int(asked)), _WIDTHS[-1])
+    return next((width for width in _WIDTHS if width >= int(text)), _WIDTHS[-1])
 
 
 def _jpeg(explorer: Explorer, sample: str, channel: str, width: int) -> bytes:
     from PIL import Image
 
-    lens = explorer.dataset.camera(sample, channel)
-    size = min(width, lens.width), max(1, round(lens.height * min(width, lens.width) / lens.width))
-    image = explorer.dataset.load_image(sample, channel, min_size=size[::-1], size=size[::-1])
-    return picture_bytes(Image.fromarray(image), "JPEG", quality=_QUALITY)
+    camera = explorer.dataset.camera(sample, channel)
+    width = min(width, camera.width)
+    size = max(1, round(camera.height * width / camera.width)), width
+    image = explorer.dataset.load_image(sample, channel, min_size=size, size=size)
+    return picture_bytes(Image.fromarray(image), "JPEG", quality=_JPEG_QUALITY)
 
 
 def _points(request: Request) -> Response:
     sample, explorer = sample_of(request), explorer_of(request)
     recording = explorer.recording(_scenario_token(request))
-    coded = cloud_text(recording, request.path_params["agent"], request.path_params["frame"])
-    if coded is None:
+    text = cloud_text(recording, request.path_params["agent"], request.path_params["frame"])
+    if text is None:
         raise HTTPException(404, f"{sample}: no LiDAR file")
-    return PlainTextResponse(coded, headers={"Cache-Control": KEPT})
+    return PlainTextResponse(text, headers={"Cache-Control": PICTURE_CACHING})
 
 
 def _view(request: Request) -> Response:
     explorer, sample, name = explorer_of(request), sample_of(request), request.path_params["view"]
     if name not in _VIEWS:
         raise HTTPException(404)
-    draw, size = _VIEWS[name]
-    made = explorer.drawn(
-        (name, sample), lambda: draw(explorer.dataset, sample, fig=detached_figure(size))
-    )
-    return picture(made, "png")
+    render, size = _VIEWS[name]
+
+    def draw() -> Any:
+        return render(explorer.dataset, sample, fig=detached_figure(size))
+
+    return picture(explorer.drawn((name, sample), draw), "png")

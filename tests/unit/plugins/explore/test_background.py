@@ -26,7 +26,7 @@ def test_a_failure_is_told_and_the_next_is_done() -> None:
 def test_the_results_that_were_not_asked_for_the_longest_go(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(background, "MOST_JOBS", 3)
+    monkeypatch.setattr(background, "MAX_JOBS", 3)
     jobs, done = Jobs(), []
     for name in ("a", "b", "c", "a", "d", "a", "b"):  # with d, b has to go, and with b, c
         jobs.ask(name, "", lambda name=name: done.append(name))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.plugins.explore.background import Jobs
-from deepaccident_devkit.plugins.explore.choices import Choices, found_by
+from deepaccident_devkit.plugins.explore.choices import Choices, match_scenarios
 from deepaccident_devkit.plugins.explore.scenarios import Scenarios
 from deepaccident_devkit.selection.fields import FIELDS
 
@@ -48,7 +48,7 @@ def waiting(da: DeepAccident) -> Iterator[Scenarios]:
 
 
 def tokens(scenarios: Scenarios, **chosen: Any) -> list[str]:
-    found = found_by(scenarios, Choices(**chosen), {})
+    found = match_scenarios(scenarios, Choices(**chosen), {})
     assert (found.faults, found.waiting) == ((), ())
     return [scenarios.tokens[row] for row in found.rows.tolist()]
 
@@ -85,7 +85,7 @@ def test_facets_find_what_the_devkit_finds(
     }
     chosen = {name: tuple(data.draw(values)) for name, values in some.items()}
     choices = Choices(facets=chosen)
-    found = found_by(scenarios, choices, {})
+    found = match_scenarios(scenarios, choices, {})
     assert [scenarios.tokens[row] for row in found.rows] == [
         each["token"] for each in da.find(*choices.filters)
     ]
@@ -171,7 +171,7 @@ def test_a_sort_puts_unknown_values_last_in_both_orders(scenarios: Scenarios) ->
 
 
 def test_a_fault_is_told_and_the_rest_counts(scenarios: Scenarios) -> None:
-    found = found_by(
+    found = match_scenarios(
         scenarios, Choices(query="bogus=1; town=Atlantis; length>>3; collision=true"), {}
     )
     assert ["'bogus'" in found.faults[0], "Atlantis" in found.faults[1], len(found.faults)] == [
@@ -186,7 +186,10 @@ def test_a_fault_is_told_and_the_rest_counts(scenarios: Scenarios) -> None:
 
 def test_a_value_that_no_scenario_has_finds_nothing(scenarios: Scenarios) -> None:
     # a field of one value is no facet, but counts
-    assert len(found_by(scenarios, Choices(facets={"velocity_frame": ("lidar",)}), {}).rows) == 0
+    assert (
+        len(match_scenarios(scenarios, Choices(facets={"velocity_frame": ("lidar",)}), {}).rows)
+        == 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -198,7 +201,7 @@ def test_a_value_that_no_scenario_has_finds_nothing(scenarios: Scenarios) -> Non
     ],
 )
 def test_what_is_not_computed_yet_is_said(waiting: Scenarios, choices: Choices) -> None:
-    found = found_by(waiting, choices, {})
+    found = match_scenarios(waiting, choices, {})
     (said,) = found.waiting
     assert (len(found.rows), "is being computed" in said) == (len(waiting), True)
 
@@ -209,7 +212,7 @@ def test_what_cannot_be_computed_is_said(da: DeepAccident, monkeypatch: pytest.M
         Mock(side_effect=MemoryError("too little")),
     )
     scenarios = computed(da)
-    found = found_by(scenarios, Choices(query="min_ttc<2"), {})
+    found = match_scenarios(scenarios, Choices(query="min_ttc<2"), {})
     assert found.waiting == ("min_ttc<2: cannot be computed (MemoryError: too little)",)
     assert tokens(scenarios, query="closing_speed>=0") != []
 

@@ -17,8 +17,8 @@ from deepaccident_devkit.plugins.explore import explorer
 from deepaccident_devkit.plugins.explore.explorer import (
     PICTURE_SIZE,
     Explorer,
-    Kept,
-    KeptFiles,
+    FileStore,
+    ValueCache,
     thumbnail,
 )
 from deepaccident_devkit.release.store import store
@@ -27,7 +27,7 @@ from deepaccident_devkit.support.parallel import Store
 
 
 def test_several_threads_make_it_once() -> None:
-    kept, go, make = Kept[int](10), threading.Event(), Mock(return_value=7)
+    kept, go, make = ValueCache[int](10), threading.Event(), Mock(return_value=7)
     with ThreadPoolExecutor(8) as pool:
         got = [pool.submit(kept.get, "a", lambda: go.wait(60) and make()) for _ in range(8)]
         go.set()
@@ -35,7 +35,7 @@ def test_several_threads_make_it_once() -> None:
 
 
 def test_what_was_not_asked_for_the_longest_goes() -> None:
-    kept, made = Kept[bytes](10, len), []
+    kept, made = ValueCache[bytes](10, len), []
     for name in ("a", "b", "a", "c", "a", "b"):  # with c, b has to go
         kept.get(name, lambda name=name: made.append(name) or b"four")
     assert made == ["a", "b", "c", "b"]
@@ -44,8 +44,8 @@ def test_what_was_not_asked_for_the_longest_goes() -> None:
 def test_files_lie_beside_the_index(da_b: DeepAccident) -> None:
     make = Mock(return_value=b"content")
     for _ in range(2):
-        assert KeptFiles(da_b).get("test of keeping", "thumbnail.jpg", make) == b"content"
-    files = KeptFiles(da_b)
+        assert FileStore(da_b).get("test of keeping", "thumbnail.jpg", make) == b"content"
+    files = FileStore(da_b)
     assert (make.call_count, files.folder.parent) == (1, da_b.tables_folder)
     assert len([*files.folder.rglob("thumbnail.jpg")]) == 1
     assert files.get("another", "thumbnail.jpg", lambda: b"more") == b"more"
@@ -56,7 +56,7 @@ def test_where_the_index_cannot_be_written_the_users_cache_is_taken(
 ) -> None:
     monkeypatch.setattr(explorer, "is_writable_folder", lambda _: False)
     monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path / "cache" / "files"))
-    assert KeptFiles(da_b).get("a", "thumbnail.jpg", lambda: b"1") == b"1"
+    assert FileStore(da_b).get("a", "thumbnail.jpg", lambda: b"1") == b"1"
     assert [path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob("*.jpg")] == [
         ("cache", "thumbnails")
     ]
@@ -66,7 +66,7 @@ def test_a_full_disk_keeps_nobody_from_the_picture(
     da_b: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Store, "keep", Mock(side_effect=OSError(28, "No space left on device")))
-    assert KeptFiles(da_b).get("full", "thumbnail.jpg", lambda: b"made") == b"made"
+    assert FileStore(da_b).get("full", "thumbnail.jpg", lambda: b"made") == b"made"
 
 
 def pixels(jpeg: bytes) -> np.ndarray:

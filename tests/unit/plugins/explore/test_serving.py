@@ -292,7 +292,7 @@ def test_who_sends_no_whole_request_in_time_is_cut_off(
 
 
 def test_half_requests_leave_room_for_whole_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_MOST_CONNECTIONS", 20)
+    monkeypatch.setattr(module, "_MAX_CONNECTIONS", 20)
     app = TinyApp()
     with serving(app, port=0) as served, ExitStack() as stack:
         reader = stack.enter_context(

@@ -200,7 +200,7 @@ def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_pat
 def test_what_cannot_be_exported(
     da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(static_pages, "MOST_SCENARIOS", 3)
+    monkeypatch.setattr(static_pages, "MAX_SCENARIOS", 3)
 
     def export(**chosen: Any) -> Callable[[], object]:
         return lambda: export_pages(da_b, tmp_path / "out", **chosen)

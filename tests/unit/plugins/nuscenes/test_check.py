@@ -142,7 +142,7 @@ def check_of(**changes: Any) -> SourceCheck:
         "boxes": np.zeros(24),
         "lidar": 1.8,
         "looks": np.array([0.0, 55, -55, 180, 110, -110]),
-        "held": np.ones((50, 2)),
+        "occupied": np.ones((50, 2)),
         "contrasts": np.full((24, 6, 6), np.nan),
     }
     return SourceCheck(**{**values, **changes})

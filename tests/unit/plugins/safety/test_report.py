@@ -78,7 +78,7 @@ def test_an_accident_that_cannot_be_replayed_keeps_its_row(
 ) -> None:
     (accident,) = da_motion.find(collision=True)
     dropped = Dropped(Skipped(scenario=accident["token"], reason="2.00 m apart"), 2.0)
-    monkeypatch.setattr(report_module, "looked_into", lambda *_: dropped)
+    monkeypatch.setattr(report_module, "replay_accident", lambda *_: dropped)
     report = safety_report(da_motion, [accident], workers=1)
     (row,) = report.rows
     assert (row.replayed, row.last_moments, row.brakes, row.severity) == (None, {}, [], -1.0)

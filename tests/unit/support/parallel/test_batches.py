@@ -29,8 +29,8 @@ from deepaccident_devkit.support.parallel import (
     run_unordered,
     workers_kept,
 )
-from deepaccident_devkit.support.parallel.batches import Call, marked
-from deepaccident_devkit.support.parallel.executors import signals_put_off
+from deepaccident_devkit.support.parallel.batches import Call, visible_paths
+from deepaccident_devkit.support.parallel.executors import signals_deferred
 
 pytestmark = pytest.mark.slow
 
@@ -113,14 +113,14 @@ def test_a_wrong_number_of_workers() -> None:
 def test_the_folders_are_marked_meanwhile(tmp_path: Path) -> None:
     inside, out = tmp_path / "in", tmp_path / "out"
     inside.mkdir()
-    with marked(Places(reads=(inside,), writes=(out,))) as seen:
+    with visible_paths(Places(reads=(inside,), writes=(out,))) as seen:
         assert all(Path(each).exists() for each in seen)
         assert (Call(workers.following, 1, seen)(), len(list(out.iterdir()))) == (2, 1)
     assert not list(out.iterdir())
 
 
 def test_a_worker_with_another_folder_of_the_same_name(tmp_path: Path) -> None:
-    with marked(Places(writes=(tmp_path,))) as seen:
+    with visible_paths(Places(writes=(tmp_path,))) as seen:
         for mark in tmp_path.iterdir():
             mark.unlink()  # as on a host where the folder is another one
         assert_refused(
@@ -248,7 +248,7 @@ def test_signals_wait_for_the_start_of_processes(number: signal.Signals) -> None
     came: list[int] = []
     before = signal.signal(number, lambda each, _: came.append(each))
     try:
-        with signals_put_off():
+        with signals_deferred():
             os.kill(os.getpid(), number)
             assert not came
         assert came == [number]

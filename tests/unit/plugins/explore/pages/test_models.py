@@ -259,10 +259,10 @@ def test_accident_verdicts_are_those_of_the_evaluator(site: Site) -> None:
             f"{distance:g} m: {count_words(each)}" for distance, each in within.items()
         )
         assert verdict_text("accident", row).split(",")[0] == count_words(within[15.0])
-        assert verdict_text("accident", row, whole=True).startswith(whole)
+        assert verdict_text("accident", row, in_full=True).startswith(whole)
     page = site.page(of("model", "first", "sample", sample_path(a_sample(site))))
     assert verdict_text(
-        "accident", site.rows("first")[a_sample(site)], whole=True
+        "accident", site.rows("first")[a_sample(site)], in_full=True
     ) in html.unescape(page)
 
 
@@ -280,7 +280,7 @@ def test_verdicts_of_a_strange_row_are_no_error(task: str) -> None:
         "tp_.": [1],
     }
     for whole in (False, True):
-        assert {type(verdict_text(task, each, whole=whole)) for each in (row, {})} == {str}
+        assert {type(verdict_text(task, each, in_full=whole)) for each in (row, {})} == {str}
 
 
 # a sample
@@ -520,7 +520,8 @@ def test_two_models_at_the_same_moment(site: Site) -> None:
     address = of("compare", "first", "second", "sample", sample_path(token), better="a")
     page = site.page(address)
     verdicts = [
-        verdict_text("accident", site.rows(name)[token], whole=True) for name in ("first", "second")
+        verdict_text("accident", site.rows(name)[token], in_full=True)
+        for name in ("first", "second")
     ]
     assert not lacking(html.unescape(page), *verdicts)
     pictures = [urlsplit(each).path.rsplit("/", 1)[1] for each in images(page)]

@@ -61,10 +61,10 @@ def status(app: Any, address: str) -> int:
 
 def test_no_page_is_made_in_the_servers_own_thread(app: Any, monkeypatch: Any) -> None:
     """It answers all others meanwhile."""
-    found, threads = release.found_by, []
+    found, threads = release.match_scenarios, []
     monkeypatch.setattr(
         release,
-        "found_by",
+        "match_scenarios",
         lambda *given: threads.append(threading.current_thread()) or found(*given),
     )
     query, whole = "&".join(f"town=T{number}" for number in range(4000)), len(get(app, "/").text)
