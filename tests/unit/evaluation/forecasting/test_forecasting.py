@@ -27,7 +27,8 @@ WRITTEN = {
     "truth.MOVING_SPEED": "0.5",
     "truth.EVERYBODY": "'all'",
     "truth.CLASS_LABELS": (
-        "('class car', 'class truck', 'class van', 'class cyclist', 'class motorcycle', 'class pedestrian')"
+        "('class car', 'class truck', 'class van', 'class cyclist', 'class "
+        "motorcycle', 'class pedestrian')"
     ),
     "truth.ROLES": "('collider', 'other')",
     "truth.VIEWERS": "('seen by ego', 'seen by a partner alone', 'seen by nobody')",

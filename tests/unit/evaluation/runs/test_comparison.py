@@ -488,7 +488,10 @@ def test_clusters_that_are_too_few() -> None:
         == "no decision is possible with 5 clusters; at least 8 are needed"
     )
     few = paired(np.zeros(30), np.eye(30)[0])
-    text = "no decision is possible with 1 of 30 clusters in which the two differ; at least 6 are needed"
+    text = (
+        "no decision is possible with 1 of 30 clusters in which the two differ; "
+        "at least 6 are needed"
+    )
     assert undecided_text(few, 0, 1, 30) == text
 
 
