@@ -33,14 +33,14 @@ TESTS = {
     "parity/test_fiery parity/test_labels parity/test_postprocess "
     "parity/test_trajectories parity/test_visibility "
     "parity/test_warps",
-    "evaluation/results": "unit/evaluation/results",
-    "evaluation/runs": "unit/evaluation/runs test_cli_evaluate",
+    "evaluation/results": "unit/evaluation/results unit/plugins/baselines/test_predict_results",
+    "evaluation/runs": "unit/evaluation/runs test_cli_evaluate unit/test_reprs",
     "evaluation/__init__": "unit/evaluation/runs",
     "evaluation": "unit/evaluation property/test_accident property/test_detection "
     "property/test_motion_metrics "
     "parity/test_accident parity/test_anticipation parity/test_attributes "
-    "parity/test_detection parity/test_motion "
-    "parity/test_trajectories",
+    "parity/test_detection parity/test_motion parity/test_planning parity/test_forecasting "
+    "parity/test_trajectories unit/test_reprs",
     "v2x": "unit/v2x unit/plugins/baselines/test_outlook property/test_v2x "
     "parity/test_poses parity/test_visibility",
     "selection/splits": "unit/selection/test_splits",
