@@ -49,7 +49,7 @@ def _core_verb(name: str) -> click.Command:
 
 
 def _plugin_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
-    """Return the verbs that a plug-in offers, except verbs of groups, such as `check splits`."""
+    """Return the verbs that a plug-in offers, except verbs in a group, such as `check splits`."""
     return {name: verb for name, verb in plugin.verbs.items() if " " not in name}
 
 

@@ -366,7 +366,7 @@ def match_trajectories(prediction: Paths, truth: Paths) -> TrajectoryMatches:
     A pair that is too far apart uses up both paths and counts as unmatched.
 
     Args:
-        prediction: Id → (≥ T, 2) metres, of which the first T points count (see `padded`).
+        prediction: Id → (≥ T, 2) metres; only the first T points count (see `padded`).
         truth: Id → (T, 2) metres.
 
     Raises:

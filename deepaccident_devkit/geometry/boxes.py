@@ -312,7 +312,7 @@ class Boxes(FrozenArrays, Pictured):
         For two boxes without any area the result is 0.
 
         Raises:
-            GeometryError: the frames differ, or are a camera's (whose z points forward).
+            GeometryError: the frames differ, or are those of a camera, where z points forward.
         """
         self._check_ground(other)
         common = box_arrays.intersection_areas(self._footprints(), other._footprints())
@@ -327,7 +327,7 @@ class Boxes(FrozenArrays, Pictured):
         For two boxes without any volume the result is 0.
 
         Raises:
-            GeometryError: the frames differ, or are a camera's (whose z points forward).
+            GeometryError: the frames differ, or are those of a camera, where z points forward.
         """
         self._check_ground(other)
         common_area = box_arrays.intersection_areas(self._footprints(), other._footprints())

@@ -100,7 +100,7 @@ class TownMap(FrozenArrays):
         return np.asarray((2 * surface > total) | (self.hidden == _ROAD))
 
     def classes(self) -> ByteArray:
-        """Return classes, shape (H, W), uint8: 0 if unknown, else 1 + index in `GROUND_CLASSES`.
+        """Return classes, shape (H, W), uint8: 0 if unknown, or 1 + index in `GROUND_CLASSES`.
 
         Drivable cells are road or road line, whichever more pictures saw; others sidewalk or other.
         """

@@ -173,7 +173,7 @@ def find_release(root: ReleasePath, version: str = "v1") -> ReleaseLayout:
 
 
 def _no_scenario_error(root: ReleasePath) -> DatarootError:
-    """Return the error of a folder without scenarios, with hints on its content."""
+    """Return the error for a folder without scenarios, with hints on its content."""
     if isinstance(root, Path) and nuscenes_tables(root):
         return DatarootError(
             f"{root}: is a dataroot of nuScenes; open it with nuscenes.open_nuscenes"

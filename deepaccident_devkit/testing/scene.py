@@ -84,7 +84,7 @@ def _cameras(image_size: tuple[int, int]) -> dict[str, PinholeCamera]:
 
 
 def calib_of(agent: AgentName, world_from_ego: SE3, image_size: tuple[int, int]) -> Calib:
-    """Return an agent's calib of one frame."""
+    """Return an agent's calibration for one frame."""
     lidar_height = 0.0 if agent == INFRASTRUCTURE else _LIDAR_HEIGHT_M
     cameras = _cameras(image_size)
     return Calib(

@@ -56,7 +56,7 @@ class FileCount:
     """Files of one kind of one agent, or `meta` files, in one or several scenarios.
 
     Attributes:
-        agent: Name of the agent; None for `meta`, of which a scenario has one.
+        agent: Name of the agent; None for `meta`, one file for each scenario.
         channel: `calib`, `label`, a sensor's channel, or `meta`.
         expected: Number of expected files, one a frame of every scenario.
         missing: Number of expected files that are absent or empty.

@@ -137,7 +137,7 @@ def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> _Tally:
     """Return the tally of one sample.
 
     Args:
-        sample: Counts of the sample, of which `positive` and `named` are read.
+        sample: Counts of the sample; only `positive` and `named` are read.
         within: For each distance the numbers `tp`, `fp` and `fn`, and lists of the known values of
             each of `ACCIDENT_ERRORS`.
     """
@@ -180,7 +180,8 @@ def tally_result(tally: _Tally, errors_at: float) -> AccidentResult:
 
     Args:
         tally: Joint tally of all samples.
-        errors_at: One of `DISTANCES`, metres; the errors are those of its true positives.
+        errors_at: One of `DISTANCES`, metres; the errors are computed from the true positives at
+            this distance.
     """
     samples, positives, *numbers = tally["numbers"]
     within = {}
@@ -298,7 +299,7 @@ def alarms_tally(sample: Counts, alarms: Sequence[Alarm]) -> _Tally:
     An accident foreseen elsewhere is a false positive and leaves the true one missed.
 
     Args:
-        sample: Counts of the sample, of which `positive` and `named` are read.
+        sample: Counts of the sample; only `positive` and `named` are read.
         alarms: Its alarms, the most important one first.
     """
     within = [_cases_within(sample, alarms, distance) for distance in DISTANCES]

@@ -263,7 +263,7 @@ def _drawn(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator
 
 
 def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> Points:
-    """Return the curve of the nuScenes devkit for one draw."""
+    """Return the precision-recall curve of one draw, as the nuScenes devkit computes it."""
     truths = int(cell.truths.sum())
     levels = np.linspace(0, 1, protocol.points)
     hits = np.cumsum(cell.tp)

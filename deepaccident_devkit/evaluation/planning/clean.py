@@ -34,7 +34,7 @@ _ROUNDING_TOLERANCE: Final = 1e-6
 # Seconds between a sample and the lead that it counts for: lists of samples count back from each
 # recording's own end.
 _LEAD_TOLERANCE_S: Final = 0.2
-# Metres of recorded progress from which on the lost share of it is meaningful.
+# Recorded progress in metres above which the lost share of it is meaningful.
 _MIN_PROGRESS_M: Final = 1.0
 
 

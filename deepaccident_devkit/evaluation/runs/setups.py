@@ -149,7 +149,7 @@ def label_rules(task: str) -> dict[str, str]:
 
 
 def scenario_of(token: str) -> str:
-    """Return the scenario's token of a sample's token."""
+    """Return the token of the scenario of a sample token."""
     return token.rsplit("/", 2)[0]
 
 

@@ -18,7 +18,7 @@ from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 
-# Size from which on an array is a picture or a cloud, and no column of the labels.
+# Smallest size of an array that is a picture or a cloud, not a column of the labels.
 _MIN_PICTURE_SIZE: Final = 20_000
 # Depth of nested values that are examined.
 _MAX_LEVELS: Final = 20

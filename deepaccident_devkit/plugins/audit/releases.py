@@ -24,7 +24,7 @@ MIN_SHARED_ROAD_USERS: Final = 3
 # Size of a cell. Agents agree on the position of an actor within 0.1 mm in the real release, and
 # within 1 cm in synthetic ones.
 _CELL_M: Final = 0.05
-# Speed from which on a road user moves.
+# Smallest speed of a moving road user.
 _MIN_SPEED_MPS: Final = 0.5
 # Number of frames, including the present, for which a road user's position is predicted: one side
 # may continue where the other one ends, or lack some frames in between.

@@ -69,7 +69,7 @@ class TrainConfig:
         agents: The agents that cooperate with each ego (`v2x.cooperating_agents`); None for all
             agents.
         partner_dropout: Probability that a partner is not heard in a step.
-        alone: Probability that no partner is heard.
+        alone: Probability that the ego hears no partner.
         learning_rate: The highest learning rate.
         weight_decay: Weight decay of AdamW.
         warm_up: Share of the steps in which the rate rises.

@@ -1,4 +1,4 @@
-"""Analyses of accidents: who saw the danger first, and what warnings would have prevented."""
+"""Analyses of accidents: which agent saw them first, and what warnings would have prevented."""
 
 from deepaccident_devkit.plugins.safety.avoidability_report import (
     AvoidabilityReport,

@@ -226,7 +226,7 @@ class SafetyReport(Report):
         scenarios: Number of examined scenarios.
         rows: One row for each accident, in the order of the release, also if it cannot be replayed.
         avoidability: Until when braking would have avoided them.
-        ledger: Who observed the colliders first.
+        ledger: Lead times: which agents observed the colliders first.
         twins: Where they part from their normal twins.
         normal: Stories of the scenarios that end without a collision, the most critical first, by
             the smallest time to collision of two moving actors; stories without such a time come

@@ -1,6 +1,6 @@
 """How an accident and its twin part.
 
-Compares who acts differently and from when on, and how near the colliders come in the twin.
+Compares which actors act differently and since when, and how near the colliders come in the twin.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ _MAX_NAMED_ACTORS: Final = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parting:
-    """The differences from which on an actor acts differently in the twin.
+    """The differences above which an actor counts as acting differently in the twin.
 
     Checked when constructed; raises ConfigError.
 
@@ -133,7 +133,7 @@ class TwinDiff(FrozenArrays):
     Attributes:
         accident: Token of the accident.
         twin: Token of its twin.
-        parting: Differences from which on an actor acts differently.
+        parting: Differences above which an actor counts as acting differently.
         actor_ids: CARLA ids in the accident and in the twin, shape (N, 2), int64; −1 in a recording
             without the actor.
         categories: N classes.
@@ -306,7 +306,8 @@ def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None =
     Args:
         dataset: The release.
         scenario: Token or record of the accident or of its twin.
-        parting: Differences from which on an actor acts differently; None for `Parting()`.
+        parting: Differences above which an actor counts as acting differently; None for
+            `Parting()`.
 
     Raises:
         TokenError: There is no such scenario.
@@ -500,7 +501,8 @@ def twin_report(
     Args:
         dataset: The release.
         scenarios: Tokens or records of the accidents, or of their twins; None for all.
-        parting: Differences from which on an actor acts differently; None for `Parting()`.
+        parting: Differences above which an actor counts as acting differently; None for
+            `Parting()`.
         **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:

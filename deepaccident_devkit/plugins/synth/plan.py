@@ -85,7 +85,7 @@ class SynthConfig:
             samples are. With 5 there are all files that the samples of `motion.samples` and their
             pasts need at 2 Hz, on a fifth of the disk. Labels, calib and meta are of all frames,
             and the same for any step.
-        view: `hidden` puts a house on the kerb of the corner between ego and other, who drive a
+        view: `hidden` puts a house on the kerb of the corner between ego and other, which drive a
             little faster than with the view `open`. They see each other only about a second before
             they meet; the infrastructure sees both all the time. With None the scenario files
             decide.

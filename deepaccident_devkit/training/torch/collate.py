@@ -215,7 +215,7 @@ ForkingPickler.register(_WorkersBatch, lambda batch: (dict, (_sent(batch),)))
 
 
 def _check_alike(items: Sequence[dict[str, Any]]) -> None:
-    """Check that there are items, and that all have equal keys; raises ConfigError."""
+    """Check that there is an item, and that all items have the same keys; raises ConfigError."""
     if not items:
         raise ConfigError("batch: expected at least one item, found none")
     for item in items[1:]:

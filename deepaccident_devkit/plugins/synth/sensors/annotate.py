@@ -35,7 +35,7 @@ _RECTANGLE_MARGIN_PIXELS = 1.0
 # Size of the pictures that decide visibility: a sixteenth of the pixels of the real images.
 WIDTH, HEIGHT = 400, 225
 MIN_PIXELS = 2
-"""Number of pixels from which on a road user is visible."""
+"""Smallest number of pixels of a visible road user."""
 # Largest number of rays to a road user, across and also down, and that number in the first attempt.
 _RAYS_ACROSS = 14
 _RAYS_ACROSS_FIRST = 4
