@@ -20,7 +20,7 @@ READ = (
 )
 CODE = re.compile(
     r"^( *)(```|~~~).*?^ *\2 *$|<!--.*?-->"  # blocks, comments
-    r"|(?<=\n\n)(?:(?: {4}.*|)\n)+"  # indented blocks
+    r"|(?<=\n\n)(?:(?: {4}[^\n]*|)\n)+"  # indented blocks
     r"|(`+)(?!`).+?(?<!`)\3(?!`)|\]\([^)\s]*\)|</?[a-z][^>]*>|https?://\S+",  # code, links, HTML
     re.DOTALL | re.MULTILINE,
 )
