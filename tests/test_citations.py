@@ -37,7 +37,7 @@ def repository_files() -> list[str]:
         found += [
             path
             for path in (TOP / folder).rglob("*")
-            if path.is_file() and "__pycache__" not in path.parts
+            if path.is_file() and not {"__pycache__", "node_modules"} & {*path.parts}
         ]
     return [
         path.relative_to(TOP).as_posix() for path in found if path.parent != TOP / "docs" / "api"
