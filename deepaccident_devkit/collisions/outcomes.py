@@ -171,13 +171,13 @@ def outcomes_of(
 ) -> Outcomes:
     """Return the outcomes of an accident if colliders are warned at given times.
 
-    Avoided: they do not touch until 3 s after the recording. Worsened: they touch, and delta-v is
-        more by at least a
-    tenth, as for a leader that stops in front of a striker. Stopped: not worsened, and the braking
-        actors are slower
-    than 0.5 m/s at the contact, but were not in the recording's. Mitigated: delta-v is less by at
-    least a tenth.
-    Unchanged: all other outcomes, and always if no braking begins before the recording ends.
+    - Avoided: the two do not touch until 3 s after the recording.
+    - Worsened: they touch, and delta-v is larger by at least a tenth, as for a leader that stops in
+      front of a striker.
+    - Stopped: not worsened, and the braking actors are slower than 0.5 m/s at the contact, but were
+      not in the recording.
+    - Mitigated: delta-v is smaller by at least a tenth.
+    - Unchanged: all other outcomes, and always if no braking begins before the recording ends.
 
     Args:
         accident: Recorded motion of the two actors.

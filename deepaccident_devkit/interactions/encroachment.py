@@ -52,7 +52,7 @@ def post_encroachment_time(
         window: Time that counts, seconds.
 
     Returns:
-        Delays, shape (…,), seconds: positive if the first box was in the area first, negative if
+        Delays, shape (…,), seconds; positive if the first box was in the area first, negative if
         the second was, 0 if they touch, infinite if their paths do not meet within the window; NaN
         where a velocity is NaN.
     """

@@ -36,7 +36,7 @@ def time_to_collision_1d(
     paths; see `time_to_collision` for them.
 
     Returns:
-        Times, shape (…,), seconds: infinite unless the two overlap sideways now and come closer; 0
+        Times, shape (…,), seconds; infinite unless the two overlap sideways now and come closer; 0
         if they also overlap along the heading.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
@@ -54,7 +54,7 @@ def drac_1d(
     See `time_to_collision_1d`.
 
     Returns:
-        Rates, shape (…,): 0 without a conflict, infinite at contact.
+        Rates, shape (…,); 0 without a conflict, infinite at contact.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -71,7 +71,7 @@ def drac(
     This is the relative speed over twice the time to collision.
 
     Returns:
-        Rates, shape (…,): 0 without a conflict, infinite at contact.
+        Rates, shape (…,); 0 without a conflict, infinite at contact.
     """
     times = time_to_collision(first, second, first_velocity, second_velocity)
     return drac_of(times, relative_speed(first_velocity, second_velocity))
@@ -98,7 +98,7 @@ def modified_ttc_1d(
     `modified_ttc` does not.
 
     Returns:
-        Times, shape (…,), seconds: infinite unless the two overlap sideways now and the gap closes
+        Times, shape (…,), seconds; infinite unless the two overlap sideways now and the gap closes
         at some time; 0 without a gap.
     """
     gap, closing, beside = _along_heading(first, second, first_velocity, second_velocity)
@@ -291,7 +291,7 @@ def modified_ttc(
         second_acceleration: Accelerations of the second boxes along the heading, shape (…,), m/s².
 
     Returns:
-        Times, shape (…,): 0 for boxes that touch now, infinite for boxes that never touch; NaN
+        Times, shape (…,); 0 for boxes that touch now, infinite for boxes that never touch; NaN
         where a speed or an acceleration is NaN.
     """
     motions = (first_speed, second_speed, first_acceleration, second_acceleration)

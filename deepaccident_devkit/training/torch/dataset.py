@@ -54,19 +54,17 @@ class V2XDataset(TorchDataset):
 
     - `token`: str. `agents`: their names, a tuple of A.
     - `agent_valid` (A, P) bool: False if the link lost a message, if the frame is before the
-    recording, or
-      if sensor files are skipped. Then clouds are empty, images are 0 and matrices are the
-      identity.
+      recording, or if sensor files are skipped. Then clouds are empty, images are 0 and matrices
+      are the identity.
     - `ego_from_agent` (A, P, 4, 4) float32: the sender's ego frame at that frame → the present ego
-    frame
-      of the sample's agent, as this agent believes, with pose noise. [0, −1] is the identity, [0,
-      :] the agent's own motion.
+      frame of the sample's agent, as this agent believes, with pose noise. [0, −1] is the identity,
+      [0, :] the agent's own motion.
     - `agent_from_past` (A, P, 4, 4) float32: the sender's ego frame at that frame → its ego frame
-    at its
-      last one, by its own exact poses: with it, senders can join their own frames before they send
-      data.
+      at its last one, by its own exact poses. With it, senders can join their own frames before
+      they send data.
     - `world_from_ego` (4, 4) float64: of the sample's agent at the present; for augmented
-    coordinates. - `augmentation` (4, 4) float32: A.
+      coordinates.
+    - `augmentation` (4, 4) float32: A.
 
     With `on_missing="skip"`: `files_missing` (A, P) int64, the number of requested sensor files
     that are missing.
@@ -78,32 +76,26 @@ class V2XDataset(TorchDataset):
 
     - `images` (A, P, C, 3, h, w), RGB, as described in `ImageConfig`.
     - `intrinsics` (A, P, C, 3, 3) float32, of the resized and cropped image; pixel centres are at
-    0.5,
-      1.5, ….
+      0.5, 1.5, ….
     - `ego_from_camera` (A, P, C, 4, 4) float32: optical camera frame → the sender's augmented ego
-    frame
-      (so neither rigid with a scale nor right-handed with a flip).
+      frame (so neither rigid with a scale nor right-handed with a flip).
     - `image_from_ego` (A, P, C, 4, 4) float32: point of the sender's ego frame → (u · d, v · d, d,
-    1),
-      depth d.
+      1), depth d.
 
     With `boxes`, M of them in the ego frame of the sample's agent at the present:
 
     - `boxes` (M, 9) float32: x y z l w h yaw vx vy; z of the centre. `velocity_known` (M,) bool:
-    False if
-      vx and vy are 0 because they are unknown.
+      False if vx and vy are 0 because they are unknown.
     - `categories` (M,) int64, positions in `taxonomy.CATEGORIES`; −1 must be ignored: a class of
-    another
-      source that we do not have. `actor_ids` (M,) int64, as in the label (−100 is the agent's own
-      row) or, for cooperative boxes, CARLA's ids; −1 is untracked.
+      another source that the devkit does not have. `actor_ids` (M,) int64, as in the label (−100 is
+      the agent's own row) or, for cooperative boxes, CARLA's ids; −1 is untracked.
 
     With `labels`, all at the present or each frame in its own ego frame, depending on `to_present`:
 
     - `segmentation` (T, H, W) int64, `instance` (T, H, W) int64, `centerness` (T, 1, H, W) float32,
       `offset` and `flow` (T, 2, H, W) float32.
     - `future_egomotion` (R, 6) float32: `next_from_this` from the first past frame on, between
-    augmented
-      ego frames.
+      augmented ego frames.
     - `label_valid` (T,) bool: the frames that are in the recording.
 
     With `bev_segmentation`: `bev_segmentation` (5, H, W) bool, classes as `motion.BEV_CLASSES`, and
@@ -405,11 +397,9 @@ class AllEgosDataset(V2XDataset):
 
     - `egos`: tokens of the E samples of this moment, without agents with skipped sensor files.
     - `partners` (E, A) bool: the agents that cooperate with each ego, as configured by `agents`,
-    including
-      itself.
+      including itself.
     - `targets`: E dicts with the boxes, labels and segmentation of a `V2XDataset` item, each in its
-    ego's
-      own frame.
+      ego's own frame.
 
     `collate_all_egos` makes batches of them.
 
