@@ -100,8 +100,8 @@ class Outcomes(FrozenArrays):
     Attributes:
         outcome: Positions in `OUTCOMES`, shape (W, K), int64.
         extrapolated: Whether the actors touch only after the end of the recording, where they go
-            straight on, shape (W, K): if the replay ended there, the accident would count as
-                avoided.
+            straight on, shape (W, K). If the replay ended there, the accident would count as
+            avoided.
         time: Times from the first frame to the contact, shape (W, K), seconds; inf if avoided.
         speeds: Speeds of the two actors at the contact, shape (W, K, 2), m/s; NaN if avoided.
         delta_v: Changes of their speeds by the impact, shape (W, K, 2), m/s, with assumed masses; 0

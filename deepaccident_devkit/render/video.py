@@ -120,9 +120,8 @@ def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
     """
     import av
 
-    with av.open(
-        os.fspath(path), "w", format="mp4", options={"movflags": "+faststart"}
-    ) as container:
+    options = {"movflags": "+faststart"}
+    with av.open(os.fspath(path), "w", format="mp4", options=options) as container:
         stream = None
         for picture in pictures:
             if stream is None:
