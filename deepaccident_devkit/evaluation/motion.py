@@ -400,16 +400,17 @@ def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
 
 def _sums(counts: Collection[Counts]) -> dict[str, Any]:
     """Return the samples' counts in the form of one sample of one frame."""
-    cells = []
     vpq = []
     for index in range(len(RANGES)):
-        case_columns = zip(*(sample["cells"][index] for sample in counts), strict=True)
-        cells.append([sum(column) for column in case_columns] or [0, 0, 0])
         sums = []
         for kind in range(4):
             values = chain.from_iterable(sample["vpq"][index][kind] for sample in counts)
             sums.append([math.fsum(values)])
         vpq.append(sums)
+    cells = []
+    for index in range(len(RANGES)):
+        case_columns = list(zip(*(sample["cells"][index] for sample in counts), strict=True))
+        cells.append([sum(column) for column in case_columns] or [0, 0, 0])
     paths = [sample["paths"] for sample in counts if sample["paths"]]
     return {
         "samples": sum(sample["samples"] for sample in counts),

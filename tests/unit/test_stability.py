@@ -81,7 +81,10 @@ def test_a_change_is_named(script: ModuleType) -> None:
 
 def test_no_public_name_begins_with_an_underscore(script: ModuleType) -> None:
     names = [name for public in script.public_modules().values() for name in public]
-    assert [name for name in names if name.startswith("_")] == ["__version__"]
+    assert (len(names) > 500, [name for name in names if name.startswith("_")]) == (
+        True,
+        ["__version__"],
+    )
 
 
 def test_code_of_pages_imports_public_names_alone(script: ModuleType) -> None:
@@ -95,7 +98,7 @@ def test_code_of_pages_imports_public_names_alone(script: ModuleType) -> None:
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(script.PACKAGE)
         for alias in node.names
     ]
-    assert set(imports) - public == set()
+    assert (len(imports) > 60, set(imports) - public) == (True, set())
 
 
 def test_it_has_the_versions_of_files() -> None:
@@ -119,6 +122,7 @@ def test_every_package_of_the_reference_says_what_is_public() -> None:
         if name.rpartition(".")[2].islower()
     ]
     packages = [import_module(name, "deepaccident_devkit") for name in names]
-    assert [
-        each for each in packages if hasattr(each, "__path__") and not hasattr(each, "__all__")
-    ] == []
+    assert (
+        len(packages) > 20,
+        [each for each in packages if hasattr(each, "__path__") and not hasattr(each, "__all__")],
+    ) == (True, [])

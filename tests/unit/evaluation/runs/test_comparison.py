@@ -51,8 +51,8 @@ Save = Callable[..., Path]
 FEW = Resampling(resamples=40)
 FIRST = "type1_subtype1_accident/Town03_000/ego_vehicle/001"
 COUNT_FAULTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "nothing": (lambda counts: counts[FIRST].clear(), "KeyError: 'cells'"),
-    "a text": (lambda counts: counts[FIRST].update(cells="x"), "TypeError"),
+    "nothing": (lambda counts: counts[FIRST].clear(), "KeyError: 'vpq'"),
+    "a text": (lambda counts: counts[FIRST].update(cells="x"), "ValueError"),
     "a short list": (lambda counts: counts[FIRST].update(cells=[]), "IndexError"),
     "a number": (lambda counts: counts[FIRST].update(paths=1), "TypeError"),
     "giants": (lambda counts: counts[FIRST].update(vpq=[[[10**400]] * 4] * 2), "OverflowError"),
