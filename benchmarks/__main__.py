@@ -1,4 +1,4 @@
-"""`python -m benchmarks [NAME…] [--json]`: all benchmarks, or those named."""
+"""`python -m benchmarks [NAME…] [--json]`: run all benchmarks, or only the named ones."""
 
 import importlib
 import json
@@ -37,14 +37,14 @@ def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click
     """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels,
     evaluation, coverage, safety, render, synth, export, loader, engine, stores, explore, beside.
     """
-    figures = []
+    all_figures = []
     for name in names or NAMES:
-        measured = importlib.import_module(f"benchmarks.{name}").measure()
-        figures += measured
+        figures = importlib.import_module(f"benchmarks.{name}").measure()
+        all_figures += figures
         if not as_json:
-            click.echo(f"{name}\n{table(measured)}\n")
+            click.echo(f"{name}\n{table(figures)}\n")
     if as_json:
-        click.echo(json.dumps({figure.name: figure.value for figure in figures}))
+        click.echo(json.dumps({figure.name: figure.value for figure in all_figures}))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Our part of what `beside_nuscenes.py` does: `python -m benchmarks.beside_devkit FOLDER`.
+"""Measure our part of what `beside_nuscenes.py` does: `python -m benchmarks.beside_devkit FOLDER`.
 
-FOLDER holds `release/`, and in `detections.json` what nuscenes-devkit evaluated. Prints what took
-how long.
+FOLDER holds `release/`, and `detections.json` with what nuscenes-devkit evaluated. The measured
+times and the memory are printed as JSON.
 """
 
 import json
@@ -20,32 +20,34 @@ CLOUDS = 10
 
 
 def main(folder: Path) -> dict[str, float]:
-    before, start = resident(), time.process_time()
+    bytes_before = resident_bytes()
+    start = time.process_time()
     da = DeepAccident(dataroot=folder / "release", verbose=False)
-    keys = {scenario["token"]: set(keyframes(scenario["num_frames"])) for scenario in da.scenario}
-    tokens = [
-        each["token"]
-        for each in da.sample
-        if int(each["token"][-3:]) in keys[each["scenario_token"]]
-    ]
+    keyframe_numbers = {
+        scenario["token"]: set(keyframes(scenario["num_frames"])) for scenario in da.scenario
+    }
+    tokens = []
+    for sample in da.sample:
+        frame = int(sample["token"][-3:])
+        if frame in keyframe_numbers[sample["scenario_token"]]:
+            tokens.append(sample["token"])
     for token in tokens:
         da.get_boxes(token, "lidar")
-    tables, memory = time.process_time() - start, resident() - before
-    read = [(da.boxes(token, "lidar"), da.load_point_cloud(token)) for token in tokens[:CLOUDS]]
+    tables = time.process_time() - start
+    memory = resident_bytes() - bytes_before
+    boxes_and_clouds = [
+        (da.boxes(token, "lidar"), da.load_point_cloud(token)) for token in tokens[:CLOUDS]
+    ]
     start = time.process_time()
-    for boxes, cloud in read:
+    for boxes, cloud in boxes_and_clouds:
         boxes.contains(cloud.points[:, :3])
     points = (time.process_time() - start) / CLOUDS
     results = folder / "results.json"
     if not results.exists():
-        made = [
-            "results",
-            str(folder / "detections.json"),
-            str(folder / "release"),
-            "--out",
-            str(results),
-        ]
-        deepaccident.main(made, standalone_mode=False)
+        detections = str(folder / "detections.json")
+        release = str(folder / "release")
+        arguments = ["results", detections, release, "--out", str(results)]
+        deepaccident.main(arguments, standalone_mode=False)
     setup = EvaluationSetup(task="detection", protocol="paper", switches={"thresholds": THRESHOLDS})
     selection = SampleSelection(split="train", samples="all", scope="all")
     start = time.process_time()
@@ -59,7 +61,8 @@ def main(folder: Path) -> dict[str, float]:
     }
 
 
-def resident() -> int:
+def resident_bytes() -> int:
+    """Return the resident memory of this process, in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 

@@ -1,20 +1,19 @@
-"""Training images of one agent's six cameras, ours and `loader_rivals` by turns, through a
-DataLoader: ms an item.
+"""Load training images of one agent's six cameras, ours and `loader_rivals` by turns, through a
+DataLoader: milliseconds per item.
 
-`full` is beside those that decode whole images, `scaled` beside those that decode them at half of
-their size. Batches are of one item. The clock counts, since workers are other processes.
+`full` is compared with the rivals that decode whole images, `scaled` with the ones that decode them
+at half of their size. Batches are of one item. Elapsed time is measured, since workers are other
+processes.
 """
 
-import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.loader import RELEASE, SCENARIOS, ways
+from benchmarks.loader import RELEASE, SCENARIOS, make_datasets
 from benchmarks.loader_rivals import rivals
-from benchmarks.measure import Figure, has_torch
+from benchmarks.measure import Figure, has_torch, temporary_folder
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.synth import make_release
@@ -26,35 +25,38 @@ EPOCHS = 5
 def measure() -> list[Figure]:
     if not has_torch("beside"):
         return []
-    with tempfile.TemporaryDirectory() as folder:
-        made = make_release(Path(folder) / "made", RELEASE, workers=2)
-        release = copied_release(made, Path(folder) / "release", scenarios=SCENARIOS)
-        items = ways(DeepAccident(dataroot=release, verbose=False), None, AGENTS[:1])
-        return [figure for workers in (0, 1, 2) for figure in compared(items, workers)]
+    with temporary_folder() as folder:
+        original = make_release(folder / "made", RELEASE, workers=2)
+        release = copied_release(original, folder / "release", scenarios=SCENARIOS)
+        dataset = DeepAccident(dataroot=release, verbose=False)
+        datasets = make_datasets(dataset, None, AGENTS[:1])
+        return [figure for workers in (0, 1, 2) for figure in compare(datasets, workers)]
 
 
-def compared(items: dict[str, Any], workers: int) -> Iterator[Figure]:
-    """Each of ours beside each other of its kind."""
+def compare(datasets: dict[str, Any], workers: int) -> Iterator[Figure]:
+    """Compare each of ours with each rival of its kind."""
     from torch.utils.data import DataLoader
 
     loaders = {
-        way: DataLoader(each, num_workers=workers, persistent_workers=workers > 0)
-        for way, each in items.items()
+        name: DataLoader(dataset, num_workers=workers, persistent_workers=workers > 0)
+        for name, dataset in datasets.items()
     }
-    taken: dict[str, list[float]] = {way: [] for way in loaders}
+    milliseconds = {name: [] for name in loaders}
     for epoch in range(EPOCHS + 1):
-        for way, loader in loaders.items():
+        for name, loader in loaders.items():
             start = time.perf_counter()
             for _ in loader:
                 pass
+            seconds = time.perf_counter() - start
             if epoch:  # in the first one workers begin
-                taken[way].append(1e3 * (time.perf_counter() - start) / len(items[way]))
+                milliseconds[name].append(1e3 * seconds / len(datasets[name]))
     for name, rival in rivals().items():
-        for kind in ("", "_normalised"):
-            ours = f"{'scaled' if rival.scaled else 'full'}{kind}"
+        decoding = "scaled" if rival.scaled else "full"
+        for suffix in ("", "_normalised"):
+            ours = f"{decoding}{suffix}"
             yield Figure(
-                name=f"beside_images_{ours}_{workers}_workers_{name}",
-                value=median(taken[ours]),
-                unit="ms",
-                reference=median(taken[f"{name}{kind}"]),
+                f"beside_images_{ours}_{workers}_workers_{name}",
+                median(milliseconds[ours]),
+                "ms",
+                reference=median(milliseconds[f"{name}{suffix}"]),
             )

@@ -1,8 +1,8 @@
-"""nuscenes-devkit's part of `beside`, in an environment without ours: `python beside_nuscenes.py
-FOLDER`.
+"""Measure nuscenes-devkit's part of `beside`, in an environment without ours: `python
+beside_nuscenes.py FOLDER`.
 
-FOLDER holds `export/`. Writes `detections.json` there: true boxes a metre off. Prints what took how
-long.
+FOLDER holds `export/`. `detections.json` is written there, with true boxes about a metre off. The
+measured times and the memory are printed as JSON.
 """
 
 import json
@@ -29,22 +29,22 @@ META = {
 
 
 def main(folder: Path) -> dict[str, float]:
-    before, start = resident(), time.process_time()
+    bytes_before = resident_bytes()
+    start = time.process_time()
     nusc = NuScenes(VERSION, str(folder / "export"), verbose=False)
     for sample in nusc.sample:
         nusc.get_sample_data(sample["data"]["LIDAR_TOP"])
-    tables, memory = time.process_time() - start, resident() - before
+    tables = time.process_time() - start
+    memory = resident_bytes() - bytes_before
     write_detections(nusc, folder / "detections.json")
-    clouds = [sample["data"]["LIDAR_TOP"] for sample in nusc.sample[:CLOUDS]]
-    read = [
-        (
-            nusc.get_sample_data(token)[1],
-            LidarPointCloud.from_file(nusc.get_sample_data_path(token)),
-        )
-        for token in clouds
-    ]
+    boxes_and_clouds = []
+    for sample in nusc.sample[:CLOUDS]:
+        token = sample["data"]["LIDAR_TOP"]
+        _, boxes, _ = nusc.get_sample_data(token)
+        cloud = LidarPointCloud.from_file(nusc.get_sample_data_path(token))
+        boxes_and_clouds.append((boxes, cloud))
     start = time.process_time()
-    for boxes, cloud in read:
+    for boxes, cloud in boxes_and_clouds:
         for box in boxes:
             points_in_box(box, cloud.points[:3])
     points = (time.process_time() - start) / CLOUDS
@@ -62,34 +62,39 @@ def main(folder: Path) -> dict[str, float]:
     }
 
 
-def resident() -> int:
+def resident_bytes() -> int:
+    """Return the resident memory of this process, in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 def write_detections(nusc: NuScenes, path: Path) -> None:
+    """Write the true boxes of the split as detections, about a metre off."""
     source = np.random.default_rng(0)
-    scenes = set(json.loads((Path(nusc.table_root) / "splits.json").read_text())[SPLIT])
+    splits = json.loads((Path(nusc.table_root) / "splits.json").read_text())
+    scenes = set(splits[SPLIT])
     results = {}
     for sample in nusc.sample:
         if nusc.get("scene", sample["scene_token"])["name"] not in scenes:
             continue
         results[sample["token"]] = boxes = []
-        for record in (nusc.get("sample_annotation", token) for token in sample["anns"]):
+        for token in sample["anns"]:
+            record = nusc.get("sample_annotation", token)
             name = category_to_detection_name(record["category_name"])
             if name is None:
                 continue
+            center = np.array(record["translation"]) + source.normal(0, 0.6, 3)
+            velocity = nusc.box_velocity(token)[:2]
+            attribute = nusc.get("attribute", record["attribute_tokens"][0])
             boxes.append(
                 {
                     "sample_token": sample["token"],
-                    "translation": (
-                        np.array(record["translation"]) + source.normal(0, 0.6, 3)
-                    ).tolist(),
+                    "translation": center.tolist(),
                     "size": record["size"],
                     "rotation": record["rotation"],
-                    "velocity": np.nan_to_num(nusc.box_velocity(record["token"])[:2]).tolist(),
+                    "velocity": np.nan_to_num(velocity).tolist(),
                     "detection_name": name,
                     "detection_score": float(source.random()),
-                    "attribute_name": nusc.get("attribute", record["attribute_tokens"][0])["name"],
+                    "attribute_name": attribute["name"],
                 }
             )
     path.write_text(json.dumps({"meta": META, "results": results}))
@@ -97,5 +102,5 @@ def write_detections(nusc: NuScenes, path: Path) -> None:
 
 if __name__ == "__main__":
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        found = main(Path(sys.argv[1]))
-    print(json.dumps(found))
+        measured = main(Path(sys.argv[1]))
+    print(json.dumps(measured))

@@ -1,9 +1,8 @@
-"""The released code's part of `beside`: run from a folder of its repository, or what it took on
-another machine.
+"""Run the released code's part of `beside` from a folder of its repository, or give the times that
+it took on another machine.
 
-Its functions for labels, warps, post-processing and VPQ need nothing but torch, OpenCV,
-scikit-image and scipy; of its packages only the folder of these files is imported. The rest needs
-mmcv and CUDA.
+Its functions for labels, warps, post-processing and VPQ need only torch, OpenCV, scikit-image and
+scipy; of its packages only the folder of these files is imported. The rest needs mmcv and CUDA.
 """
 
 import ast
@@ -18,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.evaluation_motion import label_of
+from benchmarks.evaluation_motion import labels_from_heads
 from benchmarks.labels import RELEASED_MS, make_frames, make_motion
 from benchmarks.labels_postprocess import clear_heads
 from benchmarks.labels_warp import make_labels
@@ -39,41 +38,44 @@ ELSEWHERE: Final = {
     "postprocessing_of_accidents": 499.0,
     "vpq_of_both_ranges": 14.7,
 }
-"""Milliseconds that the released code took, measured once by those who made the goldens."""
+"""Milliseconds that the released code took, measured once when the golden files were made."""
 _PLUGIN = "projects/mmdet3d_plugin"
 _RANGES = (slice(None), slice(70, 130))
 _GRID = {"xbound": [-50.0, 50.0, 0.5], "ybound": [-50.0, 50.0, 0.5], "zbound": [-10.0, 10.0, 20.0]}
 
 
 def released_works() -> dict[str, tuple[Callable[[], object], dict[str, Callable[[], object]]]]:
-    """Name of a work → ours, and the released one where it can run here."""
-    frames, motion = make_frames(np.random.default_rng(0)), make_motion()
-    labels, heads = make_labels(np.random.default_rng(0)), clear_heads()
-    truth, other = label_of(heads), label_of(clear_heads(seed=1))
-    found = instances_of(other.instance, truth.config.grid)
-    ours: dict[str, Callable[[], object]] = {
+    """Return, by the name of the work, ours and the released function where it can run here."""
+    frames = make_frames(np.random.default_rng(0))
+    motion = make_motion()
+    labels = make_labels(np.random.default_rng(0))
+    heads = clear_heads()
+    truth = labels_from_heads(heads)
+    prediction = labels_from_heads(clear_heads(seed=1)).instance
+    instances = instances_of(prediction, truth.config.grid)
+    ours = {
         "labels_from_boxes": lambda: motion_labels_from_boxes(frames, motion, MotionLabelConfig()),
         "labels_to_present": lambda: labels.to_present("bilinear"),
         "postprocessing": lambda: predict_instances(heads),
         "postprocessing_of_accidents": lambda: predict_instances(heads, "accident"),
-        "vpq_of_both_ranges": lambda: motion_counts(found, truth, trajectories=False),
+        "vpq_of_both_ranges": lambda: motion_counts(instances, truth, trajectories=False),
     }
     folder = os.environ.get(FOLDER)
     if folder is None:
-        return {name: (way, {}) for name, way in ours.items()}
+        return {name: (function, {}) for name, function in ours.items()}
     import torch
 
     torch.set_num_threads(1)
     code = Released(Path(folder))
     drawn = motion_labels_from_boxes(frames, motion, MotionLabelConfig())
-    theirs: dict[str, Callable[[], object]] = {
+    theirs = {
         "labels_from_boxes": partial(code.labels, drawn.instance, drawn.label_egomotion),
         "labels_to_present": partial(code.to_present, labels),
-        "postprocessing": partial(code.postprocessed, heads, ""),
-        "postprocessing_of_accidents": partial(code.postprocessed, heads, "_accident"),
-        "vpq_of_both_ranges": partial(code.vpq, other.instance, truth.instance),
+        "postprocessing": partial(code.postprocess, heads, ""),
+        "postprocessing_of_accidents": partial(code.postprocess, heads, "_accident"),
+        "vpq_of_both_ranges": partial(code.vpq, prediction, truth.instance),
     }
-    return {name: (way, {"released": theirs[name]}) for name, way in ours.items()}
+    return {name: (function, {"released": theirs[name]}) for name, function in ours.items()}
 
 
 class Released:
@@ -84,14 +86,13 @@ class Released:
         package.__path__ = [str(folder / _PLUGIN / "datasets/utils")]
         sys.modules[package.__name__] = package
         self._instance = importlib.import_module(f"{package.__name__}.instance")
-        self._warper = importlib.import_module(f"{package.__name__}.warper").FeatureWarper(
-            grid_conf=_GRID
-        )
+        warper = importlib.import_module(f"{package.__name__}.warper")
+        self._warper = warper.FeatureWarper(grid_conf=_GRID)
         metrics = folder / _PLUGIN / "metrics/metrics.py"
-        self._metric = _definition(metrics, "PanopticMetric_separate")
+        self._metric = _load_class(metrics, "PanopticMetric_separate")
 
     def labels(self, instance: Any, egomotion: Any) -> object:
-        """Centres, offsets and flow of instances (T, H, W); the boxes are drawn already."""
+        """Make centres, offsets and flow of instances (T, H, W); the boxes are drawn already."""
         import torch
 
         convert = self._instance.convert_instance_mask_to_center_and_offset_label_with_warper
@@ -100,6 +101,7 @@ class Released:
         return convert(maps, motion, int(instance.max()), warper=self._warper)
 
     def to_present(self, labels: Any) -> object:
+        """Warp all maps of the labels to the present."""
         import torch
 
         maps = {
@@ -110,48 +112,48 @@ class Released:
             "flow": (labels.flow, "nearest"),
         }
         motion = torch.from_numpy(np.array(labels.label_egomotion)[None])
-        return [
-            self._warper.cumulative_warp_features_reverse(
-                torch.from_numpy(each[None].astype(np.float32)), motion, mode
-            )
-            for each, mode in maps.values()
-        ]
+        warped = []
+        for values, mode in maps.values():
+            tensor = torch.from_numpy(values[None].astype(np.float32))
+            warped.append(self._warper.cumulative_warp_features_reverse(tensor, motion, mode))
+        return warped
 
-    def postprocessed(self, heads: MotionHeads, variant: str) -> object:
+    def postprocess(self, heads: MotionHeads, variant: str) -> object:
+        """Read instances and trajectories off the heads."""
         import torch
 
-        names = {
+        heads_by_name = {
             "segmentation": heads.segmentation,
             "instance_center": heads.centerness,
             "instance_offset": heads.offset,
             "instance_flow": heads.flow,
         }
-        output = {
-            name: torch.from_numpy(np.array(each))[None] for name, each in names.items()
-        }  # it writes into them
-        read = getattr(self._instance, f"predict_instance_segmentation_and_trajectories{variant}")
-        return read(output, compute_matched_centers=True)
+        output = {}
+        for name, values in heads_by_name.items():
+            copy = np.array(values)  # the function writes into it
+            output[name] = torch.from_numpy(copy)[None]
+        function = f"predict_instance_segmentation_and_trajectories{variant}"
+        return getattr(self._instance, function)(output, compute_matched_centers=True)
 
     def vpq(self, prediction: Any, truth: Any) -> object:
+        """Count VPQ of instances (T, H, W) in both ranges."""
         import torch
 
         metric = self._metric(n_classes=2)
-        for part in _RANGES:
-            metric.update(
-                *(
-                    torch.from_numpy(each[None, :, part, part].astype(np.int64))
-                    for each in (prediction, truth)
-                )
-            )
+        for cells in _RANGES:
+            cropped = [
+                instance[None, :, cells, cells].astype(np.int64) for instance in (prediction, truth)
+            ]
+            metric.update(*map(torch.from_numpy, cropped))
         return metric
 
 
-def _definition(path: Path, name: str) -> Any:
-    """A class of a file, without what the file imports."""
+def _load_class(path: Path, name: str) -> Any:
+    """Load a class of a file, without what the file imports."""
     import torch
 
     tree = ast.parse(path.read_text(encoding="utf-8"))
     tree.body = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name]
-    names: dict[str, Any] = {"torch": torch}
-    exec(compile(tree, str(path), "exec"), names)  # noqa: S102 - the folder is the caller's
-    return names[name]
+    namespace = {"torch": torch}
+    exec(compile(tree, str(path), "exec"), namespace)  # noqa: S102 - the folder is the caller's
+    return namespace[name]

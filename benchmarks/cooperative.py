@@ -1,12 +1,10 @@
-"""What several agents see at a moment: five agents of some fifty actors, from the tables of a
-synthetic release.
+"""Measure what several agents see at a moment: five agents and about fifty actors, from the tables
+of a synthetic release.
 """
 
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
-from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.measure import Figure, best_of, milliseconds, one_core, temporary_folder
 from benchmarks.releases import labels_only_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.v2x import Link
@@ -16,10 +14,9 @@ BOUND_MS = 2.0
 
 
 def measure() -> list[Figure]:
-    with tempfile.TemporaryDirectory() as folder, one_core():
-        da = DeepAccident(
-            dataroot=labels_only_release(Path(folder), scenarios=1, frames=6), verbose=False
-        )
+    with temporary_folder() as folder, one_core():
+        release = labels_only_release(folder, scenarios=1, frames=6)
+        da = DeepAccident(dataroot=release, verbose=False)
         sample = da.get_sample(da.scenario[0], "ego_vehicle", 5)["token"]
         link = Link(latency=0.2, pose_noise=0.3, packet_loss=0.1)
         works = {
@@ -33,10 +30,14 @@ def measure() -> list[Figure]:
             "visible_instances_ms": lambda: da.visible_instances(sample),
         }
         return [
-            Figure(name=name, value=_milliseconds(work), unit="ms", bound=BOUND_MS)
+            milliseconds(name, _seconds_per_call(work), bound=BOUND_MS)
             for name, work in works.items()
         ]
 
 
-def _milliseconds(work: Callable[[], object]) -> float:
-    return 1000 / CALLS * best_of(REPEATS, lambda: [work() for _ in range(CALLS)])
+def _seconds_per_call(work: Callable[[], object]) -> float:
+    def run_calls() -> None:
+        for _ in range(CALLS):
+            work()
+
+    return best_of(REPEATS, run_calls) / CALLS

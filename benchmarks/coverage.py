@@ -1,5 +1,5 @@
-"""How often intervals hold the truth, and how often `compare` finds a difference, there is one or
-not.
+"""Measure how often intervals hold the truth, and how often `compare` calls a difference real,
+whether there is one or not.
 
 `python -m benchmarks.coverage` prints the tables.
 """
@@ -13,7 +13,7 @@ from benchmarks.coverage_data import (
     Sums,
     differences,
     means,
-    middle,
+    middle_interval,
     old_interval,
     ratios,
     shares,
@@ -26,14 +26,14 @@ from deepaccident_devkit.support.arrays import FloatArray
 
 DRAWS, CONFIDENCE = 4000, 0.95
 CLUSTERS = (8, 16, 52, 104)
-SHOWN = (6, *CLUSTERS)
+TABLE_CLUSTERS = (6, *CLUSTERS)
 KINDS: dict[str, Callable[[int, int, np.random.Generator], Iterator[Sums]]] = {
     "shares": shares,
     "ratios of areas": ratios,
     "means": means,
     "differences of two runs' shares": differences,
 }
-TESTED, CORRELATIONS = (6, 8, 10, 16, 32, 52, 104), (0.5, 0.9)
+TESTED_CLUSTERS, CORRELATIONS = (6, 8, 10, 16, 32, 52, 104), (0.5, 0.9)
 EFFECTS, SHARE = (0.0, 0.05, 0.1), 0.6
 _BATCH = 200
 """Draws that are tested with the same random swaps."""
@@ -41,67 +41,63 @@ _BATCH = 200
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """One simulated setting.
+    """Measured coverage of one simulated setting.
 
     Attributes:
-        name: of it.
-        ends: whether the true share is below 0.1 or above 0.9.
-        new: share of the draws whose interval holds the truth.
-        old: likewise of the percentile bootstrap.
-        without: share of the draws without an interval.
+        name: Name of the setting.
+        is_extreme: Whether the true share is below 0.1 or above 0.9.
+        coverage: Share of the draws in which the interval holds the truth.
+        bootstrap_coverage: The same share for the percentile bootstrap that was used before.
     """
 
     name: str
-    ends: bool
-    new: float
-    old: float
-    without: float
+    is_extreme: bool
+    coverage: float
+    bootstrap_coverage: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tested:
-    """How often a difference is called real.
+class TestRate:
+    """How often a difference of two runs is called real.
 
     Attributes:
-        clusters: of both runs.
-        correlation: of samples in a cluster.
-        effect: the true difference of the shares.
-        new: share of the draws.
-        old: likewise of the paired bootstrap that was before.
+        clusters: Number of clusters of both runs.
+        correlation: Correlation of the samples in a cluster.
+        effect: True difference of the shares.
+        rate: Share of the draws in which the test calls the difference real.
+        bootstrap_rate: The same share for the paired bootstrap that was used before.
     """
 
     clusters: int
     correlation: float
     effect: float
-    new: float
-    old: float
+    rate: float
+    bootstrap_rate: float
 
 
 def measure(draws: int = DRAWS) -> list[Figure]:
-    """The figures; few draws for a quick look."""
+    """Return the figures; few draws give a quick look."""
     figures = []
     for kind in KINDS:
         for clusters in CLUSTERS:
-            cells = list(coverage(kind, clusters, draws))
-            name, least = f"coverage_{kind.split()[0]}_{clusters}", 0.88 if clusters == 8 else 0.9
+            coverages = [cell.coverage for cell in simulate_coverage(kind, clusters, draws)]
+            name = f"coverage_{kind.split()[0]}_{clusters}"
             figures += [
-                Figure(name=f"{name}_mean", value=mean([each.new for each in cells])),
+                Figure(f"{name}_mean", mean(coverages)),
                 Figure(
-                    name=f"{name}_lowest",
-                    value=min(each.new for each in cells),
-                    bound=least,
+                    f"{name}_lowest",
+                    min(coverages),
+                    bound=0.88 if clusters == 8 else 0.9,
                     higher_is_better=True,
                 ),
             ]
-    tested = [each for each in power(draws) if not each.effect]
-    return [
-        *figures,
-        Figure(name="compare_false_real_most", value=max(each.new for each in tested), bound=0.05),
-    ]
+    false_rates = [test.rate for test in simulate_tests(draws) if not test.effect]
+    highest = Figure("compare_false_real_most", max(false_rates), bound=0.05)
+    return [*figures, highest]
 
 
 def coverage_table(draws: int = DRAWS) -> str:
-    """Of each kind and number of clusters: mean and lowest coverage, and what was before."""
+    """Return the mean and lowest coverage of each kind and number of clusters, now and before."""
     head = (
         "numbers",
         "clusters",
@@ -115,53 +111,59 @@ def coverage_table(draws: int = DRAWS) -> str:
     )
     rows = [f"| {' | '.join(head)} |", "|---|---:|---:|---:|---:|---:|---|---:|---:|"]
     for kind in KINDS:
-        for clusters in SHOWN:
-            cells = list(coverage(kind, clusters, draws))
-            low, ends = (
-                min(cells, key=lambda cell: cell.new),
-                [cell.new for cell in cells if cell.ends],
-            )
-            inner, old = [cell.new for cell in cells if not cell.ends], [cell.old for cell in cells]
-            words = (
+        for clusters in TABLE_CLUSTERS:
+            cells = list(simulate_coverage(kind, clusters, draws))
+            lowest = min(cells, key=lambda cell: cell.coverage)
+            extreme = [cell.coverage for cell in cells if cell.is_extreme]
+            inner = [cell.coverage for cell in cells if not cell.is_extreme]
+            bootstrap = [cell.bootstrap_coverage for cell in cells]
+            texts = (
                 kind,
                 str(clusters),
                 str(len(cells)),
                 percent(mean(inner)),
-                percent(mean(ends)) if ends else "",
-                percent(low.new),
-                low.name,
-                percent(mean(old)),
-                percent(min(old)),
+                percent(mean(extreme)) if extreme else "",
+                percent(lowest.coverage),
+                lowest.name,
+                percent(mean(bootstrap)),
+                percent(min(bootstrap)),
             )
-            rows.append(f"| {' | '.join(words)} |")
+            rows.append(f"| {' | '.join(texts)} |")
     return "\n".join(rows)
 
 
 def power_table(draws: int = DRAWS) -> str:
-    """How often differences are called real, now and before."""
-    shown = [
-        f"{effect:+.2f} | before" if effect else "0 (falsely real) | before" for effect in EFFECTS
-    ]
+    """Return how often differences are called real, now and before."""
+    headings = []
+    for effect in EFFECTS:
+        heading = f"{effect:+.2f}" if effect else "0 (falsely real)"
+        headings.append(f"{heading} | before")
     rows = [
-        f"| clusters | correlation | {' | '.join(shown)} |",
+        f"| clusters | correlation | {' | '.join(headings)} |",
         f"|---:|---:|{'---:|---:|' * len(EFFECTS)}",
     ]
-    made = list(power(draws))
-    for at in range(0, len(made), len(EFFECTS)):
-        first, *others = made[at : at + len(EFFECTS)]
-        words = [f"{percent(each.new)} | {percent(each.old)}" for each in (first, *others)]
-        rows.append(f"| {first.clusters} | {first.correlation} | {' | '.join(words)} |")
+    tests = list(simulate_tests(draws))
+    for start in range(0, len(tests), len(EFFECTS)):
+        row = tests[start : start + len(EFFECTS)]
+        texts = [f"{percent(test.rate)} | {percent(test.bootstrap_rate)}" for test in row]
+        rows.append(f"| {row[0].clusters} | {row[0].correlation} | {' | '.join(texts)} |")
     return "\n".join(rows)
 
 
 def alike(draws: int = DRAWS, seed: int = 0) -> float:
-    """The most that are falsely called real if all clusters differ by the same amount: of 8 to 24
-    clusters.
+    """Return the largest share that is falsely called real, for 8 to 24 clusters that all differ by
+    the same amount.
     """
-    source, shares = np.random.default_rng(seed), []
+    source = np.random.default_rng(seed)
+    shares = []
     for clusters in range(8, 25):
-        apart = source.choice([-1.0, 1.0], (clusters, draws))
-        shares.append(float(real(np.zeros_like(apart), apart, np.ones_like(apart)).mean()))
+        cluster_differences = source.choice([-1.0, 1.0], (clusters, draws))
+        is_real = is_called_real(
+            np.zeros_like(cluster_differences),
+            cluster_differences,
+            np.ones_like(cluster_differences),
+        )
+        shares.append(float(is_real.mean()))
     return max(shares)
 
 
@@ -169,83 +171,93 @@ def percent(share: float) -> str:
     return f"{share:.1%}"
 
 
-def coverage(
+def simulate_coverage(
     kind: str, clusters: int, draws: int = DRAWS, *, confidence: float = CONFIDENCE, seed: int = 0
 ) -> Iterator[Cell]:
-    """How often intervals hold the truth, cell by cell.
+    """Yield how often intervals hold the truth, setting by setting.
 
     Args:
-        kind: of `KINDS`.
-        clusters: how many.
-        draws: of each cell.
-        confidence: of the intervals.
-        seed: equal ones draw equally.
+        kind: Kind of number, a key of `KINDS`.
+        clusters: Number of clusters.
+        draws: Number of draws of each setting.
+        confidence: Confidence of the intervals.
+        seed: Seed of the random numbers.
     """
     source = np.random.default_rng([seed, clusters, *map(ord, kind)])
     for sums in KINDS[kind](clusters, draws, source):
-        new, old = new_interval(sums, confidence), old_interval(sums, source)
-        made = np.isfinite(new[0])
+        interval = new_interval(sums, confidence)
+        bootstrap = old_interval(sums, source)
+        is_finite = np.isfinite(interval[0])
+        holds_truth = holds(interval, sums.truth)[is_finite]
         yield Cell(
             name=sums.name,
-            ends=sums.limit == 1 and not 0.1 <= sums.truth <= 0.9,
-            new=float(holds(new, sums.truth)[made].mean()) if made.any() else 1.0,
-            old=float(holds(old, sums.truth).mean()),
-            without=float(1 - made.mean()),
+            is_extreme=sums.limit == 1 and not 0.1 <= sums.truth <= 0.9,
+            coverage=float(holds_truth.mean()) if len(holds_truth) else 1.0,
+            bootstrap_coverage=float(holds(bootstrap, sums.truth).mean()),
         )
 
 
 def new_interval(sums: Sums, confidence: float) -> tuple[FloatArray, FloatArray]:
-    """The library's: each draw is one number."""
+    """Return the interval of the library for each draw, as (D,) lower and upper ends."""
+    above = sums.above.sum(axis=0)
+    below = sums.below.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        whole = sums.above.sum(axis=0) / sums.below.sum(axis=0)
-        left_out = (sums.above.sum(axis=0) - sums.above) / (sums.below.sum(axis=0) - sums.below)
-    having = np.count_nonzero(sums.below, axis=0)
-    ranges = np.broadcast_to((sums.least, sums.limit), (len(whole), 2))
-    return interval_ends(whole, left_out, ranges, confidence, having)
+        values = above / below
+        left_out = (above - sums.above) / (below - sums.below)
+    filled_clusters = np.count_nonzero(sums.below, axis=0)
+    ranges = np.broadcast_to((sums.minimum, sums.limit), (len(values), 2))
+    return interval_ends(values, left_out, ranges, confidence, filled_clusters)
 
 
-def holds(ends: tuple[FloatArray, FloatArray], truth: float) -> np.ndarray:
-    return (ends[0] <= truth + 1e-12) & (truth - 1e-12 <= ends[1])
+def holds(interval: tuple[FloatArray, FloatArray], truth: float) -> np.ndarray:
+    """Return (D,) whether the interval of each draw holds the truth, up to rounding."""
+    low, high = interval
+    return (low <= truth + 1e-12) & (truth - 1e-12 <= high)
 
 
-def power(draws: int = DRAWS, seed: int = 0) -> Iterator[Tested]:
-    """How often a difference of two runs' shares is called real at 5 %."""
+def simulate_tests(draws: int = DRAWS, seed: int = 0) -> Iterator[TestRate]:
+    """Yield how often a difference of two runs' shares is called real at 5 %."""
     source = np.random.default_rng(seed)
-    for clusters in TESTED:
+    for clusters in TESTED_CLUSTERS:
         for correlation in CORRELATIONS:
             for effect in EFFECTS:
                 runs = two_runs("5 to 20", correlation, SHARE, effect, (clusters, draws), source)
                 batches = [
-                    [each[:, at : at + _BATCH] for each in runs] for at in range(0, draws, _BATCH)
+                    [array[:, start : start + _BATCH] for array in runs]
+                    for start in range(0, draws, _BATCH)
                 ]
-                new = [real(*batch, seed=number) for number, batch in enumerate(batches)]
-                old = [old_real(*batch, source) for batch in batches]
-                yield Tested(
+                is_real = [is_called_real(*batch, seed=i) for i, batch in enumerate(batches)]
+                is_old_real = [is_called_real_by_bootstrap(*batch, source) for batch in batches]
+                yield TestRate(
                     clusters=clusters,
                     correlation=correlation,
                     effect=effect,
-                    new=float(np.concatenate(new).mean()),
-                    old=float(np.concatenate(old).mean()),
+                    rate=float(np.concatenate(is_real).mean()),
+                    bootstrap_rate=float(np.concatenate(is_old_real).mean()),
                 )
 
 
-def real(
+def is_called_real(
     first: FloatArray, second: FloatArray, samples: FloatArray, *, seed: int = 0
 ) -> np.ndarray:
-    """(D,) whether the library's test calls the difference of each draw real."""
+    """Return (D,) whether the library's test calls the difference of each draw real."""
     swaps = swaps_of(len(first), Resampling(seed=seed))
     signs = 1.0 - 2.0 * swaps.swapped
-    apart, below = second - first, samples.sum(axis=0)
-    return p_values(apart.sum(axis=0) / below, signs @ apart / below, swaps) <= 1 - CONFIDENCE
+    difference = second - first
+    count = samples.sum(axis=0)
+    observed = difference.sum(axis=0) / count
+    swapped = signs @ difference / count
+    return p_values(observed, swapped, swaps) <= 1 - CONFIDENCE
 
 
-def old_real(
+def is_called_real_by_bootstrap(
     first: FloatArray, second: FloatArray, samples: FloatArray, source: np.random.Generator
 ) -> np.ndarray:
-    """(D,) whether the middle 95 % of 1,000 paired resamples lie on one side of 0."""
+    """Return (D,) whether the middle 95 % of 1,000 paired resamples lie on one side of 0."""
     count = len(first)
     times = source.multinomial(count, np.full(count, 1 / count), 1000).astype(float)
-    low, high = middle(times, Sums(name="", truth=0, above=second - first, below=samples))
+    sums = Sums(name="", truth=0, above=second - first, below=samples)
+    low, high = middle_interval(times, sums)
     return (low > 0) | (high < 0)
 
 
@@ -254,7 +266,7 @@ def mean(values: list[float]) -> float:
 
 
 def main() -> None:
-    """Print both tables, and how often differences that are alike in all clusters are called
+    """Print both tables, and how often differences that are the same in all clusters are called
     real.
     """
     print(f"Intervals of 95 %, {DRAWS:,} draws for each setting:\n\n{coverage_table()}\n")

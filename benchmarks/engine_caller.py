@@ -1,6 +1,6 @@
-"""What a caller of bulk work sees of one engine: a program of its own, which prints it as JSON.
+"""Measure what a caller of bulk work sees of one engine, and print it as JSON.
 
-Its argument is a `Task` as JSON. With MPI it is started by `mpiexec`, as its users start theirs.
+The program's argument is a `Task` as JSON. With MPI it is started by `mpiexec`, as users do.
 """
 
 import json
@@ -23,20 +23,20 @@ from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.support.parallel import cluster_executor, run_batch, store
 from deepaccident_devkit.support.parallel.executors import own_workers
 
-WARMING_S = 0.5
+WARM_UP_S = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What to measure, and on what.
+    """What to measure, and on which release.
 
     Attributes:
-        dataroot: of a release that is indexed.
-        workers: of the engine.
-        address: of a cluster, or None for own workers; one own worker is this process.
-        items: of no work, as large as those of an export.
-        batches: of no work, with nothing to open; for memory.
-        repeats: how often the export runs; the fastest counts.
+        dataroot: Folder of a release that is indexed.
+        workers: Number of workers of the engine.
+        address: Address of a cluster, or None for own workers; one own worker is this process.
+        items: Number of items of no work, as large as the items of an export.
+        batches: Number of batches of no work, with nothing to open; for memory.
+        repeats: Number of exports; the fastest counts.
     """
 
     dataroot: str
@@ -48,21 +48,21 @@ class Task:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen:
-    """What was measured.
+class Measurement:
+    """What was measured of one engine.
 
     Attributes:
-        samples: of the export.
-        export_s: the whole call, with warm workers.
-        outside_s: of these, outside of `run_batch`: before, between and after the work on
+        samples: Number of samples of the export.
+        export_s: Seconds of the whole call, with warm workers.
+        outside_s: Seconds of the call outside of `run_batch`: before, between and after the work on
             scenarios.
-        handed: items that the call handed to `run_batch`.
-        item_s: an item of no work as large as that of an export, in a row of many: its dataset is
-            opened for it.
-        batch_s: a batch of no work, in a row of many.
-        batch_busy_s: for that, processor time of this process and of a dask scheduler, which
-            workers do not share.
-        growth_mb: of this process's memory at its highest, by all those batches.
+        handed: Number of items that the call handed to `run_batch`.
+        item_s: Seconds of an item of no work as large as that of an export, in a row of many: its
+            dataset is opened for it.
+        batch_s: Seconds of a batch of no work, in a row of many.
+        batch_busy_s: Processor time of this process and of a dask scheduler, which workers do not
+            share, for such a batch.
+        growth_mb: Growth of this process's peak memory by all these batches.
     """
 
     samples: int
@@ -78,88 +78,94 @@ class Seen:
 def main() -> None:
     task = Task(**json.loads(sys.argv[1]))
     with engine(task) as executor, one_core() if executor is None else nullcontext():
-        print(json.dumps(asdict(seen(task, executor))))
+        print(json.dumps(asdict(run_task(task, executor))))
 
 
 @contextmanager
 def engine(task: Task) -> Iterator[Executor | None]:
-    alone = task.address is None and task.workers == 1
-    with (
-        own_workers(task.workers)
-        if task.address is None
-        else cluster_executor(task.address) as executor
-    ):
-        yield None if alone else executor
+    """Start the engine of a task; None if the task runs in this process."""
+    if task.address is not None:
+        engine_context = cluster_executor(task.address)
+    else:
+        engine_context = own_workers(task.workers)
+    with engine_context as executor:
+        yield None if task.address is None and task.workers == 1 else executor
 
 
-def seen(task: Task, executor: Executor | None) -> Seen:
+def run_task(task: Task, executor: Executor | None) -> Measurement:
+    """Measure an engine by a task."""
     dataset = DeepAccident(dataroot=task.dataroot, verbose=False)
     run_all = partial(run_batch, workers=1, executor=executor)
-    run_all(asleep, [WARMING_S] * 4 * task.workers)
+    run_all(sleep_for, [WARM_UP_S] * 4 * task.workers)
     token = dataset.scenario[0]["token"]
-    highest, busy = highest_mb(), busy_seconds(executor)
-    batch_s = best_of(1, lambda: run_all(nothing, [token] * task.batches)) / task.batches
-    batch_busy_s = (busy_seconds(executor) - busy) / task.batches
-    growth_mb = highest_mb() - highest
-    item_s = best_of(1, lambda: run_all(nothing, [(dataset, token)] * task.items)) / task.items
-    export_s, outside_s, handed = min(exported(dataset, executor) for _ in range(task.repeats))
-    return Seen(
+    batch = [token] * task.batches
+    items = [(dataset, token)] * task.items
+    peak_mb = peak_memory_mb()
+    busy_s = busy_seconds(executor)
+    batch_s = best_of(1, lambda: run_all(do_nothing, batch))
+    batch_busy_s = busy_seconds(executor) - busy_s
+    growth_mb = peak_memory_mb() - peak_mb
+    item_s = best_of(1, lambda: run_all(do_nothing, items))
+    exports = [time_export(dataset, executor) for _ in range(task.repeats)]
+    export_s, outside_s, handed = min(exports)
+    return Measurement(
         samples=len(dataset.sample),
         export_s=export_s,
         outside_s=outside_s,
         handed=handed,
-        item_s=item_s,
-        batch_s=batch_s,
-        batch_busy_s=batch_busy_s,
+        item_s=item_s / task.items,
+        batch_s=batch_s / task.batches,
+        batch_busy_s=batch_busy_s / task.batches,
         growth_mb=growth_mb,
     )
 
 
-def exported(dataset: DeepAccident, executor: Executor | None) -> tuple[float, float, int]:
-    """Seconds of an export, those outside of `run_batch`, and the items that it got."""
-    batches: list[tuple[float, int]] = []
+def time_export(dataset: DeepAccident, executor: Executor | None) -> tuple[float, float, int]:
+    """Return the seconds of an export, its seconds outside of `run_batch`, and the number of items
+    that `run_batch` got.
+    """
+    batch_seconds: list[float] = []
+    batch_sizes: list[int] = []
 
     def timed(work: Callable[[Any], Any], items: list[Any], **options: Any) -> list[Any]:
         results: list[list[Any]] = []
         seconds = best_of(1, lambda: results.append(run_batch(work, items, **options)))
-        batches.append((seconds, len(items)))
+        batch_seconds.append(seconds)
+        batch_sizes.append(len(items))
         return results[0]
 
-    form = OpenCood(without_clouds=True)  # the release has labels alone
+    form = OpenCood(without_clouds=True)  # the release has only labels
     with (
         TemporaryDirectory(dir=dataset.dataroot.parent) as folder,
         mock.patch.object(store, "run_batch", timed),
     ):
-        seconds = best_of(
-            1,
-            lambda: bulk.export_release(
-                dataset, Path(folder) / "out", form, workers=1, executor=executor
-            ),
-        )
-    inside, handed = map(sum, zip(*batches, strict=True))
-    return seconds, seconds - inside, handed
+        out = Path(folder) / "out"
+        export = partial(bulk.export_release, dataset, out, form, workers=1, executor=executor)
+        seconds = best_of(1, export)
+    return seconds, seconds - sum(batch_seconds), sum(batch_sizes)
 
 
 def busy_seconds(executor: Executor | None) -> float:
-    """Processor time of this process so far, and of the scheduler's if there is one."""
+    """Return the processor time of this process so far, and of a dask scheduler if there is one."""
     client = getattr(executor, "_client", None)  # of a dask executor
-    return time.process_time() + (
-        client.run_on_scheduler(time.process_time) if client is not None else 0.0
-    )
+    if client is None:
+        return time.process_time()
+    return time.process_time() + client.run_on_scheduler(time.process_time)
 
 
-def highest_mb() -> float:
-    """The most memory that this process has had; not `ru_maxrss`, which begins with that of its
+def peak_memory_mb() -> float:
+    """Return the peak memory of this process in MB; not `ru_maxrss`, which begins with that of its
     parent.
     """
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    lines = Path("/proc/self/status").read_text().splitlines()
+    status = dict(line.split(":", 1) for line in lines)
     return int(status["VmHWM"].split()[0]) / 1024
 
 
-def nothing(item: object) -> None:
-    """No work."""
+def do_nothing(item: object) -> None:
+    """Do no work."""
 
 
-def asleep(seconds: float) -> None:
-    """Long enough that every worker begins one."""
+def sleep_for(seconds: float) -> None:
+    """Sleep so long that every worker begins an item."""
     time.sleep(seconds)

@@ -1,4 +1,4 @@
-"""What evaluating a sample costs: motion, accidents, detection."""
+"""Measure the evaluation of a sample: motion, accidents, detection."""
 
 from benchmarks import evaluation_accident, evaluation_detection, evaluation_motion
 from benchmarks.measure import Figure

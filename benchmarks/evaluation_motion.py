@@ -1,11 +1,11 @@
-"""Motion metrics of a sample: 5 frames, 30 objects, 200 × 200 cells, both ranges; the released
-code's times beside.
+"""Measure the motion metrics of a sample: 5 frames, 30 objects, 200 × 200 cells, both ranges; the
+references are the released code's times.
 """
 
 import numpy as np
 
 from benchmarks.labels_postprocess import FRAMES, clear_heads
-from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.measure import Figure, best_of, milliseconds, one_core
 from deepaccident_devkit.evaluation.motion import motion_counts
 from deepaccident_devkit.evaluation.predictions import MotionOutput, instances_of
 from deepaccident_devkit.motion import (
@@ -20,36 +20,28 @@ REPEATS, SLOW_REPEATS = 60, 5
 
 
 def measure() -> list[Figure]:
-    """`motion_update_ms` is IoU and VPQ of instances, which is what the released 14.7 ms are."""
-    label, other = label_of(clear_heads(seed=0)), label_of(clear_heads(seed=1))
+    """Return the figures; `motion_update_ms` is IoU and VPQ of instances, as are the released
+    14.7 ms.
+    """
+    label = labels_from_heads(clear_heads(seed=0))
+    prediction = labels_from_heads(clear_heads(seed=1)).instance
     grid = label.config.grid
-    maps = instances_of(other.instance, grid)
-    heads = MotionOutput(grid=grid, heads=tuple(clear_heads(seed) for seed in range(PREDICTIONS)))
+    instances = instances_of(prediction, grid)
+    heads = tuple(clear_heads(seed) for seed in range(PREDICTIONS))
+    output = MotionOutput(grid=grid, heads=heads)
     with one_core():
-        return [
-            Figure(
-                name="motion_update_ms",
-                value=1e3
-                * best_of(REPEATS, lambda: motion_counts(maps, label, trajectories=False)),
-                unit="ms",
-                bound=1.0,
-                reference=14.7,
-            ),
-            Figure(
-                name="motion_update_with_paths_ms",
-                value=1e3 * best_of(REPEATS, lambda: motion_counts(maps, label)),
-                unit="ms",
-            ),
-            Figure(
-                name="motion_update_of_heads_ms",
-                value=1e3 * best_of(SLOW_REPEATS, lambda: motion_counts(heads, label)),
-                unit="ms",
-            ),
-        ]
+        instances_s = best_of(REPEATS, lambda: motion_counts(instances, label, trajectories=False))
+        paths_s = best_of(REPEATS, lambda: motion_counts(instances, label))
+        heads_s = best_of(SLOW_REPEATS, lambda: motion_counts(output, label))
+    return [
+        milliseconds("motion_update_ms", instances_s, bound=1.0, reference=14.7),
+        milliseconds("motion_update_with_paths_ms", paths_s),
+        milliseconds("motion_update_of_heads_ms", heads_s),
+    ]
 
 
-def label_of(heads: MotionHeads) -> MotionLabels:
-    """Heads taken for labels at the present."""
+def labels_from_heads(heads: MotionHeads) -> MotionLabels:
+    """Return the labels at the present that the heads would be right for."""
     config = MotionLabelConfig(future_frames=FRAMES - 1)
     instance = predict_instances(heads).instance
     return MotionLabels(

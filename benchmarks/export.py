@@ -1,18 +1,17 @@
-"""Exports of scenarios with images and clouds in each format: samples a second and bytes a sample,
-on one core.
+"""Measure exports of scenarios with images and clouds in each format: samples per second and bytes
+per sample, on one core.
 
-The bound is a plain copy of the very files, in which linked ones are linked: what the system takes
-    for them.
+The bound is a plain copy of the same files, in which linked files are linked: the time that the
+system needs for them.
 """
 
 import os
 import shutil
-import tempfile
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.measure import Figure, best_of, one_core, temporary_folder
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import Format, export_release
@@ -36,68 +35,73 @@ FORMATS: tuple[Format, ...] = (
     *(OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset()),
     *(QUESTIONS, CACHE),
 )
-"""One of each; a format that lies in another's folder comes after it."""
+"""One format of each kind; a format that lies in another's folder comes after it."""
 RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7, designed=True)
 SCENARIOS = 3
 REPEATS = 3
 
 
 def measure() -> list[Figure]:
-    with tempfile.TemporaryDirectory() as folder:
-        made = make_release(Path(folder) / "made", RELEASE, workers=2)
-        root = copied_release(made, Path(folder) / "release", scenarios=SCENARIOS)
+    with temporary_folder() as folder:
+        original = make_release(folder / "made", RELEASE, workers=2)
+        root = copied_release(original, folder / "release", scenarios=SCENARIOS)
         lines = [scenario.token.replace("/", " ") for scenario in find_release(root).scenarios]
         (root / "train.txt").write_text("\n".join(lines))
         dataset = DeepAccident(dataroot=root, verbose=False)
-        return [
-            figure
-            for form in FORMATS
-            for each in ways(dataset, form)
-            for figure in exported(dataset, each)
-        ]
+        figures = []
+        for form in FORMATS:
+            for variant in variants(dataset, form):
+                figures += measure_export(dataset, variant)
+        return figures
 
 
-def ways(dataset: DeepAccident, form: Format) -> list[Format]:
-    """The format with links, and if it has any, with copies."""
-    told = export_release(dataset, dataset.dataroot.parent / "none", form, dry_run=True).tally
-    return [form, replace(form, link="copy")] if told.linked else [form]
+def variants(dataset: DeepAccident, form: Format) -> list[Format]:
+    """Return the format with links, and also with copies if it has any links."""
+    out = dataset.dataroot.parent / "none"
+    report = export_release(dataset, out, form, dry_run=True)
+    return [form, replace(form, link="copy")] if report.tally.linked else [form]
 
 
-def exported(dataset: DeepAccident, form: Format) -> list[Figure]:
-    with tempfile.TemporaryDirectory(dir=dataset.dataroot.parent) as folder, one_core():
-        places = [Path(folder) / str(number) for number in range(REPEATS)]
-        for place in places:
+def measure_export(dataset: DeepAccident, form: Format) -> list[Figure]:
+    with temporary_folder("export") as folder, one_core():
+        targets = [folder / str(number) for number in range(REPEATS)]
+        for target in targets:
             for other in FORMATS:
-                if other.name in form.beside:
-                    export_release(dataset, place, other, workers=1)
-        before, left = files_in(places[0]), iter(places)
-        seconds = best_of(REPEATS, lambda: export_release(dataset, next(left), form, workers=1))
-        files = files_in(places[0]) - before
-        left = iter([Path(folder) / f"plain {number}" for number in range(REPEATS)])
-        plain_seconds = best_of(REPEATS, lambda: copy_plainly(places[0], next(left), files))
-        size = sum(path.stat().st_size for path in files if path.stat().st_nlink == 1)
+                if other.name in form.compatible_formats:
+                    export_release(dataset, target, other, workers=1)
+        files_before = files_in(targets[0])
+        unused = iter(targets)
+        seconds = best_of(REPEATS, lambda: export_release(dataset, next(unused), form, workers=1))
+        files = files_in(targets[0]) - files_before
+        unused_copies = iter([folder / f"plain {number}" for number in range(REPEATS)])
+        plain_seconds = best_of(
+            REPEATS, lambda: copy_plainly(targets[0], next(unused_copies), files)
+        )
+        stats = [path.stat() for path in files]
+        size = sum(stat.st_size for stat in stats if stat.st_nlink == 1)
     samples = len(dataset.sample)
     name = f"export_{form.name}{'_copies' * (form.link == 'copy')}"
     return [
         Figure(
-            name=f"{name}_samples_per_s",
-            value=samples / seconds,
-            unit="samples/s",
+            f"{name}_samples_per_s",
+            samples / seconds,
+            "samples/s",
             bound=samples / plain_seconds,
             higher_is_better=True,
         ),
-        Figure(name=f"{name}_kb_per_sample", value=size / samples / 1e3, unit="kB"),
+        Figure(f"{name}_kb_per_sample", size / samples / 1e3, "kB"),
     ]
 
 
 def copy_plainly(source: Path, target: Path, files: Collection[Path]) -> None:
+    """Copy files to another folder; a file with several links is linked."""
     for path in files:
-        place = target / path.relative_to(source)
-        place.parent.mkdir(parents=True, exist_ok=True)
+        copy = target / path.relative_to(source)
+        copy.parent.mkdir(parents=True, exist_ok=True)
         if path.stat().st_nlink > 1:
-            os.link(path, place)
+            os.link(path, copy)
         else:
-            shutil.copyfile(path, place)
+            shutil.copyfile(path, copy)
 
 
 def files_in(folder: Path) -> set[Path]:

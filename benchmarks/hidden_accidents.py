@@ -1,16 +1,17 @@
-"""`python -m benchmarks.hidden_accidents RELEASE SPLIT`: the table of what there is to gain, on
-docs/model.md.
+"""Write the table on docs/model.md of what there is to gain: `python -m benchmarks.hidden_accidents
+RELEASE SPLIT`.
 
-Three ways to foresee accidents from labels, each alone and with all agents: constant velocity of
-    whom they see; a weak
-sight that finds a share of these, at wrong places and speeds, three seeds pooled; and a guess
-without any sight: an alarm wherever ego arrives within 2 s at the place where its pair collides.
-    Protocol `boxes`; intervals over pairs.
+Accidents are foreseen from labels in three ways, by ego only and by all agents: constant velocity
+of the actors that they see; a weak perception that finds a share of these actors, at wrong places
+and speeds, three seeds pooled; and a guess without any perception, which is an alarm wherever ego
+arrives within 2 s at the place where its pair collides. Protocol `boxes`; intervals over pairs.
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 
@@ -25,113 +26,123 @@ from deepaccident_devkit.plugins.baselines import Outlook, outlook
 from deepaccident_devkit.plugins.baselines.predict import accidents_ahead
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
-SEEDS, FOUND, OFF, SPEED_OFF = (1, 2, 3), 0.5, 0.7, 1.5
-"""Of the weak sight: seeds, the share of actors found, metres and m/s of its errors."""
-WAYS = {
-    "velocity": "constant velocity of whom they see",
-    "weak": "the same of half of these, at wrong places",
+SEEDS = (1, 2, 3)
+FOUND_SHARE = 0.5
+"""Share of the actors that the weak perception finds."""
+POSITION_ERROR_M, SPEED_ERROR_MPS = 0.7, 1.5
+"""Standard deviations of the weak perception."""
+PREDICTORS = {
+    "velocity": "constant velocity of the actors in view",
+    "weak": "the same for half of these actors, with errors",
 }
-HEAD = ("who foresees", "ego alone", "all agents", "difference", "decided from")
-BEFORE = 1.5
+HEAD = ("prediction", "only ego", "all agents", "difference", "smallest decided")
+AGENTS = ("single", "all")
+HORIZON_S = 2.0
+SAMPLED_S = 1.5
 """Seconds before the end from which samples are taken, as in the recipes."""
-SURE = 1.96 + 0.84
+DECIDED_ERRORS = 1.96 + 0.84
 """Standard errors of a difference that is decided at 5 % with a chance of 80 %."""
 
 
-def weak(whole: Outlook, source: np.random.Generator) -> Outlook:
-    """What is left of an outlook."""
-    boxes = whole.seen.boxes
-    own = boxes.actor_id == OWN_ACTOR_ID
-    kept = np.flatnonzero(own | (source.random(len(boxes)) < FOUND))
-    errors = source.normal(size=(2, len(kept), 3)) * (1, 1, 0) * ~own[kept, None]
-    boxes = boxes.select(kept)
+def weaken(full: Outlook, source: np.random.Generator) -> Outlook:
+    """Return the part of an outlook that a weak perception finds, with errors."""
+    boxes = full.seen.boxes
+    is_own = boxes.actor_id == OWN_ACTOR_ID
+    is_found = source.random(len(boxes)) < FOUND_SHARE
+    rows = np.flatnonzero(is_own | is_found)
+    errors = source.normal(size=(2, len(rows), 3)) * (1, 1, 0) * ~is_own[rows, None]
+    boxes = boxes.select(rows)
     boxes = replace(
         boxes,
-        center=boxes.center + OFF * errors[0],
-        velocity=boxes.velocity + SPEED_OFF * errors[1],
+        center=boxes.center + POSITION_ERROR_M * errors[0],
+        velocity=boxes.velocity + SPEED_ERROR_MPS * errors[1],
     )
-    seen = replace(whole.seen, boxes=boxes, seen_by=whole.seen.seen_by[kept])
-    return Outlook(seen=seen, turn_rate=whole.turn_rate[kept])
+    seen = replace(full.seen, boxes=boxes, seen_by=full.seen.seen_by[rows])
+    return Outlook(seen=seen, turn_rate=full.turn_rate[rows])
 
 
-def guess(dataset: DeepAccident, token: str, place: np.ndarray) -> list[Accident]:
-    """An alarm if ego drives towards a place in world (3,) and is there within 2 s."""
-    x, y, _ = dataset.world_from(token, "ego").inverse().apply(place[None])[0]
+def guess(dataset: DeepAccident, token: str, point: np.ndarray) -> list[Accident]:
+    """Return an alarm if ego drives towards a point in world (3,) and is there within 2 s."""
+    x, y, _ = dataset.world_from(token, "ego").inverse().apply(point[None])[0]
     boxes = dataset.boxes(token, "ego")
-    speed = float(np.linalg.norm(boxes.velocity[boxes.actor_id == OWN_ACTOR_ID][0, :2]))
+    own_velocity = boxes.velocity[boxes.actor_id == OWN_ACTOR_ID][0, :2]
+    speed = float(np.linalg.norm(own_velocity))
     seconds = (x - 2) / max(speed, 0.5)  # its front is there
-    near = abs(y) < 6 and 0 < seconds <= 2.05
-    return (
-        [Accident(positions=np.array([[x - 1, y], [x + 1, y]]), time=min(seconds, 2.0))]
-        if near
-        else []
-    )
+    if abs(y) >= 6 or not 0 < seconds <= 2.05:
+        return []
+    positions = np.array([[x - 1, y], [x + 1, y]])
+    return [Accident(positions=positions, time=min(seconds, HORIZON_S))]
 
 
 def main(root: str, split: str) -> None:
-    """Write it."""
-    dataset, setup = (
-        DeepAccident("v1", root, verbose=False),
-        EvaluationSetup(task="accident", protocol="boxes"),
+    """Write the table."""
+    dataset = DeepAccident("v1", root, verbose=False)
+    setup = EvaluationSetup(task="accident", protocol="boxes")
+    hidden = [record["token"] for record in dataset.find(hidden_collider=True)]
+    cluster_by_scenario = {scenario: cluster_of(scenario) for scenario in hidden}
+    points = {}
+    for scenario, cluster in cluster_by_scenario.items():
+        contact = dataset.collision(scenario)
+        if contact is not None:
+            points[cluster] = contact.point
+    selection = SampleSelection(
+        split=split, scope="all", agents=("ego_vehicle",), horizon=SAMPLED_S
     )
-    hidden = {
-        record["token"]: cluster_of(record["token"])
-        for record in dataset.find(hidden_collider=True)
-    }
-    places = {
-        hidden[each]: found.point
-        for each in hidden
-        if (found := dataset.collision(each)) is not None
-    }
-    listed = SampleSelection(
-        split=split, scope="all", agents=("ego_vehicle",), horizon=BEFORE
-    ).tokens(dataset)
     clusters: dict[str, list[str]] = {}
-    for token in listed:
-        if scenario_of(token) in hidden:
-            clusters.setdefault(hidden[scenario_of(token)], []).append(token)
-    rows = {
-        (way, agents): [setup.evaluator() for _ in SEEDS]
-        for way in WAYS
-        for agents in ("single", "all")
+    for token in selection.tokens(dataset):
+        cluster = cluster_by_scenario.get(scenario_of(token))
+        if cluster is not None:
+            clusters.setdefault(cluster, []).append(token)
+    evaluators = {
+        (predictor, agents): [setup.evaluator() for _ in SEEDS]
+        for predictor in PREDICTORS
+        for agents in AGENTS
     }
     guessed = setup.evaluator()
-    for token in chain(*clusters.values()):
-        context = accident_context(dataset, token, 2.0)
-        guessed.update(
-            token, guess(dataset, token, places[hidden[scenario_of(token)]]), None, context
-        )
-        for (way, agents), evaluators in rows.items():
-            whole = outlook(dataset, token, agents=agents)
-            for seed, evaluator in zip(SEEDS, evaluators, strict=True):
-                source = np.random.default_rng([seed, agents == "all", len(evaluator.tokens)])
-                evaluator.update(
-                    token,
-                    accidents_ahead(weak(whole, source) if way == "weak" else whole, 2.0),
-                    None,
-                    context,
-                )
+    for cluster, tokens in clusters.items():
+        for token in tokens:
+            context = accident_context(dataset, token, HORIZON_S)
+            guessed.update(token, guess(dataset, token, points[cluster]), None, context)
+            for (predictor, agents), seeded in evaluators.items():
+                full = outlook(dataset, token, agents=agents)
+                for seed, evaluator in zip(SEEDS, seeded, strict=True):
+                    source = np.random.default_rng([seed, agents == "all", len(evaluator.tokens)])
+                    seen = weaken(full, source) if predictor == "weak" else full
+                    accidents = accidents_ahead(seen, HORIZON_S)
+                    evaluator.update(token, accidents, None, context)
     lines = []
-    for way, said in WAYS.items():
-        pair = [
-            [
-                [each.counts[token] for token in tokens for each in rows[way, agents]]
-                for tokens in clusters.values()
-            ]
-            for agents in ("single", "all")
-        ]
-        alone, both = (guessed.result_of([*chain(*counts)]).apa for counts in pair)
-        low, high, error = difference_intervals(
-            guessed, (pair[0], pair[1]), {"apa": both - alone}, Resampling()
+    for predictor, description in PREDICTORS.items():
+        single, cooperative = (
+            [counts_of(evaluators[predictor, agents], tokens) for tokens in clusters.values()]
+            for agents in AGENTS
         )
-        more = f"{both - alone:+.2f} [{low[0]:.2f}, {high[0]:.2f}]"
-        lines.append((said, f"{alone:.2f}", f"{both:.2f}", more, f"{SURE * error[0]:.2f}"))
-    lines.append(("a guess without sight", *[f"{guessed.compute().apa:.2f}"] * 2, "0", "–"))
-    told = (
-        f"Of {len(guessed.tokens):,} samples of {len(clusters):,} pairs with a "
-        f"hidden collider, APA by `boxes`:"
+        single_apa = guessed.result_of([*chain(*single)]).apa
+        cooperative_apa = guessed.result_of([*chain(*cooperative)]).apa
+        gain = cooperative_apa - single_apa
+        low, high, error = difference_intervals(
+            guessed, (single, cooperative), {"apa": gain}, Resampling()
+        )
+        lines.append(
+            (
+                description,
+                f"{single_apa:.2f}",
+                f"{cooperative_apa:.2f}",
+                f"{gain:+.2f} [{low[0]:.2f}, {high[0]:.2f}]",
+                f"{DECIDED_ERRORS * error[0]:.2f}",
+            )
+        )
+    guessed_apa = f"{guessed.compute().apa:.2f}"
+    lines.append(("guess without perception", guessed_apa, guessed_apa, "0", "–"))
+    caption = (
+        f"APA by `boxes` over {len(guessed.tokens):,} samples of {len(clusters):,} pairs with a "
+        f"hidden collider:"
     )
-    put("gain", f"{told}\n\n{table(HEAD, lines)}")
+    put("gain", f"{caption}\n\n{table(HEAD, lines)}")
+
+
+def counts_of(evaluators: Sequence[Any], tokens: Sequence[str]) -> list[Any]:
+    """Return the counts of samples by all evaluators."""
+    return [evaluator.counts[token] for token in tokens for evaluator in evaluators]
 
 
 if __name__ == "__main__":

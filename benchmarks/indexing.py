@@ -1,14 +1,13 @@
-"""Making an index from labels, calib and meta, and its size on disk against the raw data's; how
-commands start.
+"""Measure making an index from labels, calib and meta, its size on disk against the raw data's, and
+the start of commands.
 """
 
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
-from benchmarks.measure import Figure, best_of
+from benchmarks.measure import Figure, best_of, temporary_folder
 from benchmarks.releases import WHOLE_SAMPLES, index_share_of_raw, labels_only_release
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.tables import open_index
@@ -20,69 +19,54 @@ STARTS = 12
 
 def measure() -> list[Figure]:
     samples = SCENARIOS * FRAMES * AGENTS
-    with tempfile.TemporaryDirectory() as folder:
-        layout = find_release(labels_only_release(Path(folder), scenarios=SCENARIOS, frames=FRAMES))
-        rates = {}
+    rates = {}
+    with temporary_folder() as folder:
+        layout = find_release(labels_only_release(folder, scenarios=SCENARIOS, frames=FRAMES))
         for workers in (1, 2):
-            rounds = iter(range(100))
-            rates[workers] = samples / best_of(
+            index_dirs = iter([folder / f"index {workers} {number}" for number in range(2)])
+            seconds = best_of(
                 2,
-                lambda workers=workers, rounds=rounds: open_index(
-                    layout,
-                    index_dir=Path(folder) / f"index {workers} {next(rounds)}",
-                    workers=workers,
+                lambda workers=workers, index_dirs=index_dirs: open_index(
+                    layout, index_dir=next(index_dirs), workers=workers
                 ),
             )
-        (size,) = {size_of(index) for index in Path(folder).glob("index *")}
+            rates[workers] = samples / seconds
+        (size,) = {size_of(index) for index in folder.glob("index *")}
     return [
-        Figure(name="indexing_samples", value=samples),
-        Figure(name="indexing_samples_per_s_1_worker", value=rates[1], unit="samples/s"),
-        Figure(name="indexing_samples_per_s_2_workers", value=rates[2], unit="samples/s"),
+        Figure("indexing_samples", samples),
+        Figure("indexing_samples_per_s_1_worker", rates[1], "samples/s"),
+        Figure("indexing_samples_per_s_2_workers", rates[2], "samples/s"),
         Figure(
-            name="indexing_whole_release_s_2_workers",
-            value=WHOLE_SAMPLES / rates[2],
-            unit="s (extrapolated)",
+            "indexing_whole_release_s_2_workers",
+            WHOLE_SAMPLES / rates[2],
+            "s (extrapolated)",
         ),
-        Figure(name="indexing_index_kb_per_sample", value=size / samples / 1e3, unit="kB"),
-        Figure(
-            name="indexing_index_share_of_raw", value=index_share_of_raw(size, samples), bound=0.01
-        ),
+        Figure("indexing_index_kb_per_sample", size / samples / 1e3, "kB"),
+        Figure("indexing_index_share_of_raw", index_share_of_raw(size, samples), bound=0.01),
         *commands(),
     ]
 
 
 def commands() -> list[Figure]:
-    """Whole commands, the start of their process included: the clock's time of `index`, else
-    processor time.
+    """Measure whole commands, the start of their process included: elapsed time of `index`,
+    otherwise processor time.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        release = labels_only_release(
-            Path(folder), scenarios=STARTED_SCENARIOS, frames=STARTED_FRAMES
-        )
+    with temporary_folder() as folder:
+        release = labels_only_release(folder, scenarios=STARTED_SCENARIOS, frames=STARTED_FRAMES)
         files = sum(path.is_file() for path in release.rglob("*"))
-        rounds = iter(range(100))
-        indexing = best_of(
-            3, lambda: run("index", str(release), "--index-dir", f"{folder}/index {next(rounds)}")
-        )
+        index_dirs = iter([f"{folder}/index {number}" for number in range(3)])
+        indexing = best_of(3, lambda: run("index", str(release), "--index-dir", next(index_dirs)))
         info = ("info", str(release), "--index-dir", f"{folder}/index 0")
         return [
             Figure(
-                name="indexing_files_per_s_command",
-                value=files / indexing,
-                unit="files/s",
+                "indexing_files_per_s_command",
+                files / indexing,
+                "files/s",
                 bound=6000,
                 higher_is_better=True,
             ),
-            Figure(
-                name="start_help_s",
-                value=min(processor_seconds("--help") for _ in range(STARTS)),
-                bound=0.15,
-            ),
-            Figure(
-                name="start_info_s",
-                value=min(processor_seconds(*info) for _ in range(STARTS)),
-                bound=0.25,
-            ),
+            Figure("start_help_s", start_seconds("--help"), bound=0.15),
+            Figure("start_info_s", start_seconds(*info), bound=0.25),
         ]
 
 
@@ -92,15 +76,21 @@ def run(*arguments: str) -> None:
     )
 
 
+def start_seconds(*arguments: str) -> float:
+    """Return the least processor time of a command and its children."""
+    return min(processor_seconds(*arguments) for _ in range(STARTS))
+
+
 def processor_seconds(*arguments: str) -> float:
-    """Of a command and its children."""
+    """Return the processor time of a command and its children."""
     before = os.times()
     run(*arguments)
     after = os.times()
-    return (
-        after.children_user - before.children_user + after.children_system - before.children_system
-    )
+    user = after.children_user - before.children_user
+    return user + after.children_system - before.children_system
 
 
 def size_of(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    """Return the bytes of all files below a folder."""
+    files = filter(Path.is_file, folder.rglob("*"))
+    return sum(file.stat().st_size for file in files)

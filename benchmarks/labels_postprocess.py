@@ -1,10 +1,10 @@
-"""Instances read off a prediction of 5 frames, 30 objects, 200 × 200 cells; and off noise, the
-worst that can come.
+"""Measure reading instances off a prediction of 5 frames, 30 objects, 200 × 200 cells; and off
+noise, the worst case.
 """
 
 import numpy as np
 
-from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.measure import Figure, best_of, milliseconds, one_core
 from deepaccident_devkit.motion.grouping import MotionHeads
 from deepaccident_devkit.motion.instances import predict_instances
 from deepaccident_devkit.motion.reference_arithmetic.polygon_fill import filled_cells
@@ -33,27 +33,29 @@ def figure(
     reference: float | None = None,
 ) -> Figure:
     seconds = best_of(repeats, lambda: predict_instances(heads, settings))
-    return Figure(name=name, value=1e3 * seconds, unit="ms", bound=bound, reference=reference)
+    return milliseconds(name, seconds, bound, reference)
 
 
 def clear_heads(seed: int = 0) -> MotionHeads:
-    """What a good model says: cars that drive on, their outlines and vectors a little off."""
+    """Return what a good model predicts: cars that drive on, with outlines and vectors a little
+    off.
+    """
     source = np.random.default_rng(seed)
-    row, column = np.indices((CELLS, CELLS), dtype=np.float32)
-    start, heading = (
-        source.uniform(10, CELLS - 10, (OBJECTS, 2)),
-        source.uniform(-np.pi, np.pi, OBJECTS),
-    )
-    along = np.stack([np.sin(heading), np.cos(heading)], axis=1)
-    half = np.stack([source.uniform(3, 6, OBJECTS), source.uniform(1.5, 2.5, OBJECTS)], axis=1)
-    step = along * source.uniform(0, 8, (OBJECTS, 1))
+    rows, columns = np.indices((CELLS, CELLS), dtype=np.float32)
+    start = source.uniform(10, CELLS - 10, (OBJECTS, 2))
+    heading = source.uniform(-np.pi, np.pi, OBJECTS)
+    axes = np.stack([np.sin(heading), np.cos(heading)], axis=1)
+    half_length = source.uniform(3, 6, OBJECTS)
+    half_width = source.uniform(1.5, 2.5, OBJECTS)
+    half_size = np.stack([half_length, half_width], axis=1)
+    steps = axes * source.uniform(0, 8, (OBJECTS, 1))
     logit = np.full((FRAMES, CELLS, CELLS), -3, dtype=np.float32)
     centerness = np.zeros_like(logit)
     vectors = np.zeros((2, FRAMES, 2, CELLS, CELLS), dtype=np.float32)
     for frame in range(FRAMES):
-        middle = start + frame * step
-        for center, axis, (long, wide), move in zip(middle, along, half, step, strict=True):
-            peak = np.exp(-((row - center[0]) ** 2 + (column - center[1]) ** 2) / 9)
+        centers = start + frame * steps
+        for center, axis, (long, wide), step in zip(centers, axes, half_size, steps, strict=True):
+            peak = np.exp(-((rows - center[0]) ** 2 + (columns - center[1]) ** 2) / 9)
             np.maximum(centerness[frame], peak, out=centerness[frame])
             across = np.array([axis[1], -axis[0]])
             corners = [
@@ -61,10 +63,10 @@ def clear_heads(seed: int = 0) -> MotionHeads:
                 for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
             ]
             cells, _ = filled_cells(np.rint([corners])[..., ::-1], (CELLS, CELLS))
-            at = np.unravel_index(cells, (CELLS, CELLS))
-            logit[frame][at] = 3
-            vectors[0, frame][:, at[0], at[1]] = [center[0] - at[0], center[1] - at[1]]
-            vectors[1, frame][:, at[0], at[1]] = move[:, None]
+            row, column = np.unravel_index(cells, (CELLS, CELLS))
+            logit[frame][row, column] = 3
+            vectors[0, frame][:, row, column] = [center[0] - row, center[1] - column]
+            vectors[1, frame][:, row, column] = step[:, None]
     vectors += source.normal(0, 0.3, vectors.shape).astype(np.float32)
     logit += source.normal(0, 0.8, logit.shape).astype(np.float32)
     return MotionHeads(
@@ -76,7 +78,9 @@ def clear_heads(seed: int = 0) -> MotionHeads:
 
 
 def noisy_heads(seed: int = 0) -> MotionHeads:
-    """What an untrained model says: thousands of centres a frame, half of all cells foreground."""
+    """Return what an untrained model predicts: thousands of centres in a frame, half of all cells
+    foreground.
+    """
     source = np.random.default_rng(seed)
 
     def maps(channels: int, scale: float) -> np.ndarray:

@@ -1,12 +1,11 @@
-"""Items a second of `V2XDataset` with images of 704 × 256 alone, whole, scaled and cached, beside
-what else loads them.
+"""Measure items per second of `V2XDataset` with only images of 704 × 256: decoded whole, scaled and
+cached, and with other loaders.
 
-The others (`loader_rivals`) load images alone, without poses. The milliseconds of an item are
-processor time on one core, the fastest of some items; images are in the page cache. `normalised`
+The others (`loader_rivals`) load only images, without poses. The milliseconds of an item are
+processor time on one core, the fastest of several items; images are in the page cache. `normalised`
 items are float32, as for ImageNet.
 """
 
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.loader_rivals import CROP, MEAN, SIZE, STD, Rival, rivals
-from benchmarks.measure import Figure, best_of, has_torch, one_core
+from benchmarks.measure import Figure, best_of, has_torch, milliseconds, one_core, temporary_folder
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
@@ -44,10 +43,14 @@ REPEATS = 2
 
 
 class PlainItems:
-    """What one writes without the devkit, by a rival: an agent's paths to (cameras, 3, h, w)."""
+    """Items as one writes them without the devkit, by a rival: an agent's images, (cameras, 3, h,
+    w).
+    """
 
     def __init__(self, rival: Rival, paths: list[list[Path]], *, normalised: bool) -> None:
-        self._rival, self._paths, self._normalised = rival, paths, normalised
+        self._rival = rival
+        self._paths = paths
+        self._normalised = normalised
 
     def __len__(self) -> int:
         return len(self._paths)
@@ -59,128 +62,117 @@ class PlainItems:
 def measure() -> list[Figure]:
     if not has_torch("loader"):
         return []
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
-        made = make_release(root / "made", RELEASE, workers=2)
-        dataset = DeepAccident(
-            dataroot=copied_release(made, root / "release", scenarios=SCENARIOS), verbose=False
-        )
+    with temporary_folder() as root:
+        original = make_release(root / "made", RELEASE, workers=2)
+        release = copied_release(original, root / "release", scenarios=SCENARIOS)
+        dataset = DeepAccident(dataroot=release, verbose=False)
         for codec in CODECS:
             form = CachedImages(images=SCALED, codec=codec, where=("length>=1",))  # type: ignore[arg-type]
             export_release(dataset, root / codec, form, workers=2)
         figures = [*differences(dataset), *sizes(dataset, root)]
         for team, agents in TEAMS.items():
-            for way, items in ways(dataset, root, agents).items():
-                figures += speeds(way, team, items)
+            for name, items in make_datasets(dataset, root, agents).items():
+                figures += measure_items(name, team, items)
         return figures
 
 
-def ways(dataset: DeepAccident, caches: Path | None, agents: tuple[str, ...]) -> dict[str, Any]:
-    """Each way to make the items, of the first agent's samples; out of caches only if there are
-    any.
+def make_datasets(
+    dataset: DeepAccident, caches: Path | None, agents: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return each way to make the items of the first agent's samples, by its name; caches are used
+    only if there are any.
     """
     from deepaccident_devkit.training.torch import V2XConfig, V2XDataset
 
     tokens = [record["token"] for record in dataset.sample if record["agent"] == agents[0]]
     base = V2XConfig(agents=agents, points=False, boxes=None, images=SCALED)
-    configs = {
-        "full": replace(base, images=IMAGES),
-        "scaled": base,
-        **(
-            {}
-            if caches is None
-            else {f"cached_{each}": replace(base, images_cache=caches / each) for each in CODECS}
-        ),
-    }
-    found: dict[str, Any] = {
-        way: V2XDataset(dataset, tokens, config) for way, config in configs.items()
-    }
+    configs = {"full": replace(base, images=IMAGES), "scaled": base}
+    if caches is not None:
+        for codec in CODECS:
+            configs[f"cached_{codec}"] = replace(base, images_cache=caches / codec)
+    if len(agents) == 1:
+        for name, images in (("full", IMAGES), ("scaled", SCALED)):
+            normalised = replace(images, **NORMALISED)
+            configs[f"{name}_normalised"] = replace(base, images=normalised)
+    datasets = {name: V2XDataset(dataset, tokens, config) for name, config in configs.items()}
     if len(agents) == 1:
         paths = [
             [dataset.get_sample_data_path(token, camera) for camera in IMAGES.cameras]
             for token in tokens
         ]
-        for way, images in (("full", IMAGES), ("scaled", SCALED)):
-            config = replace(base, images=replace(images, **NORMALISED))
-            found[f"{way}_normalised"] = V2XDataset(dataset, tokens, config)
         for name, rival in rivals().items():
-            found[name] = PlainItems(rival, paths, normalised=False)
-            found[f"{name}_normalised"] = PlainItems(rival, paths, normalised=True)
-    return found
+            datasets[name] = PlainItems(rival, paths, normalised=False)
+            datasets[f"{name}_normalised"] = PlainItems(rival, paths, normalised=True)
+    return datasets
 
 
-def speeds(way: str, team: str, items: Any) -> list[Figure]:
-    """The processor time of an item, and items a second of a loader with no worker, one and two."""
-    name, count = f"loader_{way}_{team}", len(items)
+def measure_items(kind: str, team: str, items: Any) -> list[Figure]:
+    """Return the processor time of an item, and items per second of a loader with no worker, one
+    and two.
+    """
+    name = f"loader_{kind}_{team}"
+    count = len(items)
+    indices = [index % count for index in range(max(count, REPEATS))]
     with one_core():
-        seconds = min(
-            processor_seconds(items, index % count) for index in range(max(count, REPEATS))
-        )
-    figures = [
-        Figure(name=f"{name}_ms", value=seconds * 1e3, unit="ms", bound=BOUNDS.get((way, team)))
-    ]
+        seconds = min(processor_seconds(items, index) for index in indices)
+    bound = BOUNDS.get((kind, team))
+    figures = [milliseconds(f"{name}_ms", seconds, bound)]
     for workers in (0, 1, 2):
-        value = count / loading_seconds(items, workers)
-        figures.append(
-            Figure(name=f"{name}_items_per_s_{workers}_workers", value=value, unit="items/s")
-        )
+        speed = count / loading_seconds(items, workers)
+        figures.append(Figure(f"{name}_items_per_s_{workers}_workers", speed, "items/s"))
     return figures
 
 
 def processor_seconds(items: Any, index: int) -> float:
-    """Of an item: where other programs work too, the clock's would be theirs as well."""
+    """Return the processor time of an item, which unlike elapsed time is not affected by other
+    programs.
+    """
     start = time.process_time()
     items[index]
     return time.process_time() - start
 
 
 def loading_seconds(items: Any, workers: int) -> float:
-    """Of the fastest epoch; the workers are started before."""
+    """Return the seconds of the fastest epoch; the workers are started before."""
     from torch.utils.data import DataLoader
 
-    loader: Any = DataLoader(items, num_workers=workers, persistent_workers=workers > 0)
+    loader = DataLoader(items, num_workers=workers, persistent_workers=workers > 0)
     epoch: Callable[[], object] = lambda: [None for _ in loader]  # noqa: E731 - what is timed
     epoch()
     return best_of(REPEATS, epoch)
 
 
 def differences(dataset: DeepAccident) -> list[Figure]:
-    """How far `scaled` and JPEG of quality 95 are from `full`, in steps of 255."""
-    frames = [
-        f"{record['token']}/{camera}" for record in dataset.sample[:10] for camera in IMAGES.cameras
-    ]
-    found = np.concatenate(
-        [
-            np.abs(
-                SCALED.load(dataset, each)[0].astype(np.int16) - IMAGES.load(dataset, each)[0]
-            ).ravel()
-            for each in frames
-        ]
-    )
+    """Return how far `scaled` is from `full`, in steps of 255."""
+    batches = []
+    for record in dataset.sample[:10]:
+        for camera in IMAGES.cameras:
+            image = f"{record['token']}/{camera}"
+            scaled = SCALED.load(dataset, image)[0].astype(np.int16)
+            batches.append(np.abs(scaled - IMAGES.load(dataset, image)[0]).ravel())
+    steps = np.concatenate(batches)
+    summary = {
+        "mean": float(steps.mean()),
+        "99_percent": float(np.percentile(steps, 99)),
+        "max": float(steps.max()),
+    }
     return [
-        Figure(name="loader_scaled_difference_mean", value=float(found.mean()), unit="of 255"),
-        Figure(
-            name="loader_scaled_difference_99_percent",
-            value=float(np.percentile(found, 99)),
-            unit="of 255",
-        ),
-        Figure(name="loader_scaled_difference_max", value=float(found.max()), unit="of 255"),
+        Figure(f"loader_scaled_difference_{name}", value, "of 255")
+        for name, value in summary.items()
     ]
 
 
 def sizes(dataset: DeepAccident, root: Path) -> list[Figure]:
-    """Bytes of an image: stored, and in the caches."""
+    """Return the bytes of an image: stored, and in the caches."""
     count = len(dataset.sample) * len(IMAGES.cameras)
     folders = {
         "stored": (dataset.dataroot, "*.jpg"),
         "raw": (root / "raw", "*.images"),
         "jpeg": (root / "jpeg", "*.images"),
     }
-    return [
-        Figure(
-            name=f"loader_{name}_kb_per_image",
-            value=sum(path.stat().st_size for path in folder.rglob(pattern)) / count / 1e3,
-            unit="kB",
-        )
-        for name, (folder, pattern) in folders.items()
-    ]
+    figures = []
+    for name, (folder, pattern) in folders.items():
+        size = sum(path.stat().st_size for path in folder.rglob(pattern))
+        kilobytes = size / count / 1e3
+        figures.append(Figure(f"loader_{name}_kb_per_image", kilobytes, "kB"))
+    return figures

@@ -1,13 +1,13 @@
-"""What one would load training images with in place of the devkit: six cameras at 704 × 256 of 1600
+"""Load training images with other libraries instead of the devkit: six cameras at 704 × 256 of 1600
 × 900.
 
     from benchmarks.loader_rivals import rivals
     images = rivals()["simplejpeg"].load(paths, normalised=False)    # paths of six JPEG files to
     (6, 3, 256, 704)
 
-Each is what a person writes who knows that library. `resize` smooths where it shrinks (it is
-antialiased) or not, which takes less time and makes other pixels; a rival is compared with what
-does the same.
+Each rival is what a person writes who knows that library. `resize` smooths where it shrinks (it is
+antialiased), or it does not, which takes less time and gives other pixels; a rival is compared with
+the implementation that does the same.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Rival:
     """A way to load six images.
 
     Attributes:
-        image: a file's path → (256, 704, 3) uint8, RGB; of torchvision (3, 256, 704).
-        needs: what it takes from PyPI; a module of the same name, but for the two that have another
-            one.
-        smooth: whether it smooths where it shrinks.
-        scaled: whether it decodes JPEG at half of its size.
+        image: Function from a file's path to (256, 704, 3) uint8, RGB; for torchvision (3, 256,
+            704).
+        needs: Packages on PyPI; the module has the same name, except for two packages.
+        smooth: Whether it smooths where it shrinks.
+        scaled: Whether it decodes JPEG at half of its size.
     """
 
     image: Callable[[Path], Any]
@@ -45,34 +45,34 @@ class Rival:
     scaled: bool = False
 
     def load(self, paths: Sequence[Path], *, normalised: bool) -> Any:
-        """(6, 3, 256, 704), uint8 or, normalised as for ImageNet, float32: an array or a tensor."""
+        """Return six images, (6, 3, 256, 704), as an array or a tensor: uint8, or float32 if
+        normalised as for ImageNet.
+        """
         images = [self.image(path) for path in paths]
         if "torchvision" in self.needs:
             return _stacked_tensors(images, normalised=normalised)
         if not normalised:
             return np.stack([image.transpose(2, 0, 1) for image in images])
-        mean, std = (
-            np.float32(255) * np.float32(MEAN),
-            np.float32(1) / (np.float32(255) * np.float32(STD)),
-        )
-        return np.stack(
-            [((image.astype(np.float32) - mean) * std).transpose(2, 0, 1) for image in images]
-        )
+        mean = np.float32(255) * np.float32(MEAN)
+        factor = np.float32(1) / (np.float32(255) * np.float32(STD))
+        normalised_images = [(image.astype(np.float32) - mean) * factor for image in images]
+        return np.stack([image.transpose(2, 0, 1) for image in normalised_images])
 
 
 def rivals() -> dict[str, Rival]:
-    """Name → those whose libraries are here, and run: torchvision needs the very torch that it was
-    made for.
+    """Return, by name, the rivals that run here: torchvision needs the exact torch that it was
+    built for.
     """
-    modules = {"pillow": "PIL", "opencv-python-headless": "cv2"}
-    return {
-        name: rival
-        for name, rival in _RIVALS.items()
-        if all(_runs(modules.get(need, need)) for need in rival.needs)
-    }
+    module_names = {"pillow": "PIL", "opencv-python-headless": "cv2"}
+    usable = {}
+    for name, rival in _RIVALS.items():
+        modules = [module_names.get(package, package) for package in rival.needs]
+        if all(map(_can_import, modules)):
+            usable[name] = rival
+    return usable
 
 
-def _runs(module: str) -> bool:
+def _can_import(module: str) -> bool:
     try:
         import_module(module)
     except (ImportError, OSError, RuntimeError):
@@ -81,8 +81,8 @@ def _runs(module: str) -> bool:
 
 
 def _pillow(path: Path) -> Any:
-    """As BEVDet's loader: resized whole, cropped, then an array. Its own resize is bicubic, which
-    takes longer.
+    """Load as BEVDet does: resize the whole image, crop, then make an array. Its own resize is
+    bicubic, which takes longer.
     """
     from PIL import Image
 
@@ -94,7 +94,7 @@ def _pillow(path: Path) -> Any:
 def _cv2(path: Path, interpolation: str) -> Any:
     import cv2
 
-    read: Any = cv2.imread(str(path))
+    read = cv2.imread(str(path))
     image = cv2.resize(read, SIZE[::-1], interpolation=getattr(cv2, interpolation))
     return cv2.cvtColor(image[_ROWS], cv2.COLOR_BGR2RGB)
 
@@ -103,18 +103,18 @@ def _simplejpeg(path: Path, interpolation: str, *, scaled: bool = False) -> Any:
     import cv2
     import simplejpeg
 
-    least = {"min_height": SIZE[0], "min_width": SIZE[1]} if scaled else {}
-    image = simplejpeg.decode_jpeg(path.read_bytes(), **least)
-    return cv2.resize(image, SIZE[::-1], interpolation=getattr(cv2, interpolation))[_ROWS]
+    minimum = {"min_height": SIZE[0], "min_width": SIZE[1]} if scaled else {}
+    image = simplejpeg.decode_jpeg(path.read_bytes(), **minimum)
+    resized = cv2.resize(image, SIZE[::-1], interpolation=getattr(cv2, interpolation))
+    return resized[_ROWS]
 
 
 def _torchvision(path: Path) -> Any:
     from torchvision.io import decode_jpeg, read_file
     from torchvision.transforms.v2 import functional
 
-    return functional.resize(decode_jpeg(read_file(str(path))), list(SIZE), antialias=True)[
-        :, _ROWS
-    ]
+    image = decode_jpeg(read_file(str(path)))
+    return functional.resize(image, list(SIZE), antialias=True)[:, _ROWS]
 
 
 def _stacked_tensors(images: Sequence[Any], *, normalised: bool) -> Any:
@@ -124,12 +124,12 @@ def _stacked_tensors(images: Sequence[Any], *, normalised: bool) -> Any:
     stacked = torch.stack(list(images))
     if not normalised:
         return stacked
-    return functional.normalize(
-        functional.to_dtype(stacked, torch.float32, scale=True), list(MEAN), list(STD)
-    )
+    scaled = functional.to_dtype(stacked, torch.float32, scale=True)
+    return functional.normalize(scaled, list(MEAN), list(STD))
 
 
-_CV2, _SIMPLEJPEG = ("opencv-python-headless",), ("simplejpeg", "opencv-python-headless")
+_CV2 = ("opencv-python-headless",)
+_SIMPLEJPEG = ("simplejpeg", "opencv-python-headless")
 _RIVALS = {
     "pillow": Rival(_pillow, ("pillow",), smooth=True),
     "torchvision": Rival(_torchvision, ("torch", "torchvision"), smooth=True),

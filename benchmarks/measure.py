@@ -1,47 +1,57 @@
-"""A measured figure, its bound, and the table of them."""
+"""Define a measured figure with its bound, and print a table of figures."""
 
 import os
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
 
 import click
 
 from deepaccident_devkit.errors import MissingExtraError
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Figure:
     """One measured number.
 
     Attributes:
-        name: as in the JSON output.
-        value: measured.
-        unit: of value and bound.
-        bound: what it should not be worse than, None for a figure that only informs.
-        higher_is_better: whether the bound is a lower one.
-        reference: what the released code takes, or in `beside` the other way, in the same unit;
-            None without such.
+        name: Name in the JSON output.
+        value: Measured value.
+        unit: Unit of value and bound.
+        bound: Worst acceptable value, or None for a figure that only informs.
+        higher_is_better: Whether the bound is a lower one.
+        reference: Value of the released code, or in `beside` of the other implementation, in the
+            same unit; None if there is none.
     """
 
     name: str
     value: float
     unit: str = ""
+    _: KW_ONLY
     bound: float | None = None
     higher_is_better: bool = False
     reference: float | None = None
 
     @property
     def ratio(self) -> float | None:
-        """How many times better than the bound; below 1 the bound is missed."""
+        """How many times the value is better than the bound; below 1 the bound is missed."""
         if self.bound is None:
             return None
         return self.value / self.bound if self.higher_is_better else self.bound / self.value
 
 
+def milliseconds(
+    name: str, seconds: float, bound: float | None = None, reference: float | None = None
+) -> Figure:
+    """Return the figure of a time; bound and reference are milliseconds."""
+    return Figure(name, 1e3 * seconds, "ms", bound=bound, reference=reference)
+
+
 def has_torch(benchmark: str) -> bool:
-    """Whether what needs PyTorch can be measured; else says that it is not."""
+    """Return whether figures that need PyTorch can be measured; report on stderr if they cannot."""
     try:
         import deepaccident_devkit.training.torch  # noqa: F401
     except MissingExtraError as error:
@@ -51,8 +61,15 @@ def has_torch(benchmark: str) -> bool:
 
 
 def best_of(repeats: int, work: Callable[[], object]) -> float:
-    """Seconds of the fastest of some runs."""
+    """Return the seconds of the fastest of several runs."""
     return min(_seconds(work) for _ in range(repeats))
+
+
+@contextmanager
+def temporary_folder(purpose: str = "benchmark") -> Iterator[Path]:
+    """Yield a new folder that is removed at the end of the block."""
+    with tempfile.TemporaryDirectory(prefix=f"deepaccident_{purpose}_") as folder:
+        yield Path(folder)
 
 
 @contextmanager
@@ -70,24 +87,27 @@ def one_core() -> Iterator[None]:
 
 
 def table(figures: Sequence[Figure]) -> str:
-    """The figures as aligned text."""
+    """Return the figures as aligned text."""
     rows = [["figure", "measured", "bound", "times better", "the other", "times faster"]]
     for figure in figures:
-        row = [figure.name, f"{_number(figure.value)} {figure.unit}".strip(), "", "", "", ""]
+        measured = f"{_number(figure.value)} {figure.unit}".strip()
+        bound = ""
+        ratio = ""
+        reference = ""
+        speed_up = ""
         if figure.bound is not None:
-            row[2:4] = f"{_number(figure.bound)} {figure.unit}", f"{figure.ratio:.2f}"
+            bound = f"{_number(figure.bound)} {figure.unit}"
+            ratio = f"{figure.ratio:.2f}"
         if figure.reference is not None:
-            row[4:6] = (
-                f"{_number(figure.reference)} {figure.unit}",
-                f"{figure.reference / figure.value:.3g}",
-            )
-        rows.append(row)
+            reference = f"{_number(figure.reference)} {figure.unit}"
+            speed_up = f"{figure.reference / figure.value:.3g}"
+        rows.append([figure.name, measured, bound, ratio, reference, speed_up])
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     widths = [max(map(len, column)) for column in columns]
     lines = []
-    for name, *words in zip(*columns, strict=True):
-        aligned = (f"{word:>{width}}" for word, width in zip(words, widths[1:], strict=True))
-        lines.append("  ".join([f"{name:<{widths[0]}}", *aligned]).rstrip())
+    for name, *cells in zip(*columns, strict=True):
+        aligned = [name.ljust(widths[0]), *map(str.rjust, cells, widths[1:])]
+        lines.append("  ".join(aligned).rstrip())
     return "\n".join(lines)
 
 

@@ -1,48 +1,45 @@
-"""Label files to columns, against a reader that splits lines and calls float()."""
+"""Measure reading label files to columns, against a reader that splits lines and calls float()."""
 
 import random
-import tempfile
 from pathlib import Path
 
-from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.measure import Figure, best_of, one_core, temporary_folder
 from deepaccident_devkit.release import read_labels
 
 FILES, LINES = 2000, 30
 
 
 def measure() -> list[Figure]:
-    with tempfile.TemporaryDirectory() as folder:
-        paths = write_labels(Path(folder))
+    with temporary_folder() as folder:
+        paths = write_labels(folder)
         ours = FILES / best_of(7, lambda: read_labels(paths))
         with one_core():
-            alone = FILES / best_of(7, lambda: read_labels(paths))
+            one_core_rate = FILES / best_of(7, lambda: read_labels(paths))
         plain = FILES / best_of(3, lambda: [read_plainly(path) for path in paths])
-        expected = [
-            value for path in paths[:50] for row in read_plainly(path)[1] for value in row[1:4]
-        ]
-        read = read_labels(paths[:50], raw=True).center.reshape(-1).tolist()
-        if read != expected:
+        expected = [row[1:4] for path in paths[:50] for row in read_plainly(path)[1]]
+        centers = read_labels(paths[:50], raw=True).center.tolist()
+        if list(map(tuple, centers)) != expected:
             raise AssertionError("the two readers disagree")
     return [
         Figure(
-            name="parsing_files_per_s",
-            value=ours,
-            unit="files/s",
+            "parsing_files_per_s",
+            ours,
+            "files/s",
             bound=30_000,
             higher_is_better=True,
         ),
         Figure(
-            name="parsing_files_per_s_one_core",
-            value=alone,
-            unit="files/s",
+            "parsing_files_per_s_one_core",
+            one_core_rate,
+            "files/s",
             bound=30_000,
             higher_is_better=True,
         ),
-        Figure(name="parsing_plain_files_per_s", value=plain, unit="files/s"),
+        Figure("parsing_plain_files_per_s", plain, "files/s"),
         Figure(
-            name="parsing_ratio",
-            value=ours / plain,
-            unit="times plain",
+            "parsing_ratio",
+            ours / plain,
+            "times plain",
             bound=5,
             higher_is_better=True,
         ),
@@ -50,8 +47,8 @@ def measure() -> list[Figure]:
 
 
 def write_labels(folder: Path) -> list[Path]:
-    """Files of 30 boxes; half of the numbers with three decimals, half with seventeen digits, as
-    real files mix.
+    """Write files of 30 boxes; half of the numbers have three decimals, half have seventeen digits,
+    as real files mix.
     """
     source = random.Random(0)  # noqa: S311
 
@@ -64,7 +61,8 @@ def write_labels(folder: Path) -> list[Path]:
         lines = ["0.0034441 -5.6166797"]
         for line in range(LINES):
             numbers = " ".join(number(line + column) for column in range(9))
-            lines.append(f"car {numbers} {1000 + line} {source.randrange(300)} {line % 3 > 0}")
+            points = source.randrange(300)
+            lines.append(f"car {numbers} {1000 + line} {points} {line % 3 > 0}")
         path = folder / f"label_{file:04d}.txt"
         path.write_text("\n".join(lines) + "\n")
         paths.append(path)
@@ -72,7 +70,7 @@ def write_labels(folder: Path) -> list[Path]:
 
 
 def read_plainly(path: Path) -> tuple[tuple[float, ...], list[tuple[object, ...]]]:
-    """What one writes first: a loop over lines, `split`, `float`."""
+    """Read a label file as one writes it first: a loop over lines, `split`, `float`."""
     with path.open() as file:
         speed = tuple(map(float, file.readline().split()))
         rows = []
@@ -80,7 +78,6 @@ def read_plainly(path: Path) -> tuple[tuple[float, ...], list[tuple[object, ...]
             words = line.split()
             if len(words) > 1:
                 numbers = map(float, words[1:10])
-                rows.append(
-                    (words[0], *numbers, int(words[10]), int(words[11]), words[12] == "True")
-                )
+                counts = map(int, words[10:12])
+                rows.append((words[0], *numbers, *counts, words[12] == "True"))
     return speed, rows

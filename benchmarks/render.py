@@ -1,10 +1,9 @@
-"""Pictures and videos of a synthetic scenario with five agents, at 1280×720."""
+"""Measure pictures and videos of a synthetic scenario with five agents, at 1280×720."""
 
-import tempfile
 from functools import partial
 from pathlib import Path
 
-from benchmarks.measure import Figure, best_of, one_core
+from benchmarks.measure import Figure, best_of, one_core, temporary_folder
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.render.video import VideoScene, views_of
@@ -16,11 +15,10 @@ PICTURES = ("frame", "sample", "accident", "bev", "visibility")
 
 
 def measure() -> list[Figure]:
-    with tempfile.TemporaryDirectory() as folder:
-        dataset = DeepAccident(
-            dataroot=make_release(Path(folder) / "release", RELEASE, workers=2), verbose=False
-        )
-        return [*pictures_s(dataset), *video_s(dataset, Path(folder))]
+    with temporary_folder() as folder:
+        release = make_release(folder / "release", RELEASE, workers=2)
+        dataset = DeepAccident(dataroot=release, verbose=False)
+        return [*pictures_s(dataset), *video_s(dataset, folder)]
 
 
 def pictures_s(dataset: DeepAccident) -> list[Figure]:
@@ -37,7 +35,7 @@ def pictures_s(dataset: DeepAccident) -> list[Figure]:
             )
             seconds = best_of(REPEATS, partial(scene.picture, token))
             bound = 1.0 if name == "frame" else None
-            figures.append(Figure(name=f"render_{name}_s", value=seconds, unit="s", bound=bound))
+            figures.append(Figure(f"render_{name}_s", seconds, "s", bound=bound))
     return figures
 
 
@@ -54,7 +52,6 @@ def video_s(dataset: DeepAccident, folder: Path) -> list[Figure]:
             workers=2,
             progress=False,
         )
-        figures.append(
-            Figure(name=f"render_video_{name}_s", value=best_of(1, write), unit="s", bound=bound)
-        )
+        seconds = best_of(1, write)
+        figures.append(Figure(f"render_video_{name}_s", seconds, "s", bound=bound))
     return figures

@@ -1,20 +1,19 @@
-"""The whole release's size: 285k samples and 8.6 M annotations, opened in a new process.
+"""Measure opening the whole release's size, 285k samples and 8.6 M annotations, in a new process.
 
 Only tables are written (no label is parsed for them), by the code that joins an index from its
-scenarios; the folders and meta files that opening looks at are there, so that the check for changes
-is part of the time.
+scenarios. The folders and meta files that opening looks at exist, so that the check for changes is
+part of the time.
 """
 
 import json
 import os
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import Figure
+from benchmarks.measure import Figure, temporary_folder
 from benchmarks.releases import index_share_of_raw
 from deepaccident_devkit.geometry.se3 import SE3
 from deepaccident_devkit.release import (
@@ -97,15 +96,13 @@ print(json.dumps(figures))
 
 
 def measure() -> list[Figure]:
-    with tempfile.TemporaryDirectory(prefix="deepaccident_scale_") as folder:
-        root = write_whole_release(Path(folder))
-        tables, kept = (
-            sum(path.stat().st_size for path in root.glob(f"{INDEX_FOLDER}/v1/{files}"))
-            for files in ("tables-*/*", "kept/*")
-        )
-        runs = [probe(root) for _ in range(PROCESSES + 1)][
-            1:
-        ]  # the first compiles and fills the file cache
+    with temporary_folder("scale") as folder:
+        root = write_whole_release(folder)
+        index = root / INDEX_FOLDER / "v1"
+        table_bytes = sum(path.stat().st_size for path in index.glob("tables-*/*"))
+        rows_bytes = sum(path.stat().st_size for path in index.glob("kept/*"))
+        probe(root)  # compiles the package and fills the file cache
+        runs = [probe(root) for _ in range(PROCESSES)]
     best = {name: min(run[name] for run in runs) for name in runs[0]}
     bounds = {"open_s": 0.2, "rss_mb": 100, "get_us": 20, "boxes_us": 20}
     units = {
@@ -116,42 +113,41 @@ def measure() -> list[Figure]:
         "boxes_world_us": "µs",
     }
     figures = [
-        Figure(name=name, value=value, unit=units.get(name, ""), bound=bounds.get(name))
+        Figure(name, value, units.get(name, ""), bound=bounds.get(name))
         for name, value in best.items()
     ]
-    share = index_share_of_raw(tables + kept, int(best["samples"]))
+    index_bytes = table_bytes + rows_bytes
+    share = index_share_of_raw(index_bytes, int(best["samples"]))
     return [
         *figures,
-        Figure(name="tables_mb", value=tables / 1e6, unit="MB"),
-        Figure(name="index_mb", value=(tables + kept) / 1e6, unit="MB"),
-        Figure(name="index_share_of_raw", value=share, bound=0.01),
+        Figure("tables_mb", table_bytes / 1e6, "MB"),
+        Figure("index_mb", index_bytes / 1e6, "MB"),
+        Figure("index_share_of_raw", share, bound=0.01),
     ]
 
 
 def probe(root: Path) -> dict[str, float]:
-    """Open the release in a new process, as a user does whose installation is compiled."""
+    """Open the release in a new process, as a user does with a compiled installation."""
     environment = {
         name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
     }
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", _PROBE, str(root)],
         capture_output=True,
         text=True,
         check=True,
         env=environment,
     )
-    figures: dict[str, float] = json.loads(done.stdout)
-    return figures
+    return json.loads(process.stdout)
 
 
 def write_whole_release(root: Path) -> Path:
-    """Folders, meta files and tables of 691 scenarios."""
+    """Write the folders, meta files and tables of 691 scenarios."""
     index = root / INDEX_FOLDER / "v1"
     index.mkdir(parents=True)
-    kept = index / "kept"
-    kept.mkdir()
-    files = one_scenario()
-    tables = scenario_rows(files)
+    rows_folder = index / "kept"
+    rows_folder.mkdir()
+    tables = scenario_rows(one_scenario())
     for number in range(SCENARIOS):
         town = TOWNS[number % len(TOWNS)]
         name = f"{town}_type001_subtype0001_scenario{number:05d}"
@@ -160,15 +156,13 @@ def write_whole_release(root: Path) -> Path:
             for kind in ("calib", "label"):
                 scenario.kind_folder(agent, kind).mkdir(parents=True)
         write_meta(scenario.meta_path, META)
-        story = {**tables["scenario"], "name": [name], "town": [town], **told(number)}
-        (kept / f"{number:03d}").write_bytes(rows_to_keep({**tables, "scenario": story}, ""))
+        record = {**tables["scenario"], "name": [name], "town": [town], **varied_meta(number)}
+        rows = rows_to_keep({**tables, "scenario": record}, "")
+        (rows_folder / f"{number:03d}").write_bytes(rows)
     folder = index / "tables-scale"
     folder.mkdir()
-    join_tables(
-        folder,
-        sorted(kept.iterdir()),
-        [SPLITS[number % len(SPLITS)] for number in range(SCENARIOS)],
-    )
+    splits = [SPLITS[number % len(SPLITS)] for number in range(SCENARIOS)]
+    join_tables(folder, sorted(rows_folder.iterdir()), splits)
     layout = find_release(root)
     fingerprint = folder_digest(layout.scenarios, layout.split_files.values())
     Index(
@@ -177,9 +171,9 @@ def write_whole_release(root: Path) -> Path:
     return root
 
 
-def told(number: int) -> dict[str, list[object]]:
-    """What the meta of a scenario tells, as varied as a real release."""
-    values = {
+def varied_meta(number: int) -> dict[str, list[object]]:
+    """Return meta values of a scenario that are as varied as in a real release."""
+    choices = {
         "weather": WEATHERS,
         "road_type": ROAD_TYPES,
         "spawn_side": SPAWN_SIDES,
@@ -189,24 +183,24 @@ def told(number: int) -> dict[str, list[object]]:
         "signalized": (True, False),
         "accident_type": range(1, 13),
     }
-    return {
-        name: [possible[number // (place + 1) % len(possible)]]
-        for place, (name, possible) in enumerate(values.items())
-    }
+    meta: dict[str, list[object]] = {}
+    for position, (name, values) in enumerate(choices.items(), start=1):
+        meta[name] = [values[number // position % len(values)]]
+    return meta
 
 
 def one_scenario() -> ScenarioFiles:
-    """The contents of one scenario's files: 83 frames, 30 boxes a sample that drive straight on,
-    random values.
+    """Return the contents of one scenario's files: 83 frames, 30 boxes a sample that drive straight
+    on, random values.
     """
     source = np.random.default_rng(0)
     samples = len(AGENTS) * FRAMES
-    poses = [SE3.from_yaw(0.01 * n, (n, 2.0, 0.0)) for n in range(FRAMES)]
-    start, speed = (
-        source.normal(size=(BOXES, 3)) * (40, 40, 0.1),
-        source.normal(size=(BOXES, 3)) * (5, 5, 0),
-    )
-    driven = [pose.inverse().apply(start + speed * frame / 10) for frame, pose in enumerate(poses)]
+    poses = [SE3.from_yaw(0.01 * frame, (frame, 2.0, 0.0)) for frame in range(FRAMES)]
+    start = source.normal(size=(BOXES, 3)) * (40, 40, 0.1)
+    velocity = source.normal(size=(BOXES, 3)) * (5, 5, 0)
+    centers = []
+    for frame, pose in enumerate(poses):
+        centers.append(pose.inverse().apply(start + velocity * frame / 10))
     count = samples * BOXES
     agent_of_box = np.repeat(np.arange(len(AGENTS)), FRAMES * BOXES)
     actor = np.tile(np.arange(BOXES), samples)
@@ -215,7 +209,7 @@ def one_scenario() -> ScenarioFiles:
         num_boxes=np.full(samples, BOXES),
         agent_velocity=source.normal(size=(samples, 2)),
         category=source.integers(0, 6, count).astype(np.int8),
-        center=np.tile(np.concatenate(driven), (len(AGENTS), 1)),
+        center=np.tile(np.concatenate(centers), (len(AGENTS), 1)),
         size=source.uniform(0.3, 5, size=(count, 3)),
         yaw=source.uniform(-3, 3, count),
         velocity=source.normal(size=(count, 2)),

@@ -1,12 +1,13 @@
-"""All statistics over tables of the whole release's size: 8.6 M annotations, in a new process."""
+"""Measure all statistics over tables of the whole release's size, 8.6 M annotations, in a new
+process.
+"""
 
 import json
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
-from benchmarks.measure import Figure
+from benchmarks.measure import Figure, temporary_folder
 from benchmarks.scale import write_whole_release
 
 BOUND_S = 10.0
@@ -28,20 +29,19 @@ print(json.dumps({
 
 
 def measure() -> list[Figure]:
-    with tempfile.TemporaryDirectory(prefix="deepaccident_statistics_") as folder:
-        root = write_whole_release(Path(folder))
+    with temporary_folder("statistics") as folder:
+        root = write_whole_release(folder)
         runs = [probe(root) for _ in range(PROCESSES)]
     best = {name: min(run[name] for run in runs) for name in runs[0]}
     return [
-        Figure(name="statistics_annotations", value=best["statistics_annotations"]),
-        Figure(name="statistics_s", value=best["statistics_s"], unit="s", bound=BOUND_S),
+        Figure("statistics_annotations", best["statistics_annotations"]),
+        Figure("statistics_s", best["statistics_s"], "s", bound=BOUND_S),
     ]
 
 
 def probe(root: Path) -> dict[str, float]:
-    """Compute the statistics in a new process: files cached, nothing else."""
-    done = subprocess.run(
+    """Compute the statistics in a new process; only the files are cached."""
+    process = subprocess.run(
         [sys.executable, "-c", _PROBE, str(root)], capture_output=True, text=True, check=True
     )
-    figures: dict[str, float] = json.loads(done.stdout)
-    return figures
+    return json.loads(process.stdout)

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import DeepAccidentError
-from deepaccident_devkit.support.text import Pictured
+from deepaccident_devkit.support.text import PictureRepr
 from deepaccident_devkit.support.version import __version__
 
 if TYPE_CHECKING:
@@ -13,7 +13,7 @@ __all__ = ["DeepAccident", "DeepAccidentError", "__version__"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import the facade at its first use: the test kit's plugin, which pytest loads, needs none."""
+    """Import the facade at its first use: pytest loads the test kit's plugin, which needs none."""
     if name != "DeepAccident":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from deepaccident_devkit.deepaccident import DeepAccident
@@ -22,13 +22,13 @@ def __getattr__(name: str) -> Any:
 
 
 def _png_of(subject: object) -> bytes:
-    """Return the picture that `Pictured` shows, rendered by a package that is imported for it."""
+    """Render the picture that `PictureRepr` shows; the renderer is only imported here."""
     from deepaccident_devkit.render.notebook import png_of
 
     return png_of(subject)
 
 
-Pictured.png_of = staticmethod(_png_of)
+PictureRepr.png_of = staticmethod(_png_of)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""`python -m deepaccident_devkit`: the same as `deepaccident`."""
+"""Run `deepaccident` as `python -m deepaccident_devkit`."""
 
 from deepaccident_devkit.cli import main
 

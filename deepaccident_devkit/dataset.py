@@ -27,7 +27,7 @@ from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.support import nuscenes_names
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
-from deepaccident_devkit.support.text import choice, spelled
+from deepaccident_devkit.support.text import choice, match_spelling
 from deepaccident_devkit.tables import (
     OpenTables,
     RowArgument,
@@ -54,10 +54,20 @@ __all__ = ["VISIBLE", "Dataset", "RowArgument", "VelocitySource", "Visible"]
 
 Visible = Literal["camera", "released"]
 VelocitySource = Literal["decoded", "derived", "label"]
-# Name of a frame for callers → its canonical name.
-_FRAMES: Final[Mapping[str, str]] = {name: name for name in (*get_args(Frame), *CHANNELS)} | {
+# Frame name that a caller may pass → canonical name.
+_FRAMES: Mapping[str, str] = {name: name for name in (*get_args(Frame), *CHANNELS)} | {
     LIDAR: "lidar"
 }
+# Annotation columns that have the same name as a field of `Boxes`.
+_BOX_COLUMNS = (
+    "size",
+    "rotation",
+    "velocity",
+    "category",
+    "actor_id",
+    "num_lidar_pts",
+    "camera_visible",
+)
 VISIBLE: Final = (None, *get_args(Visible))
 """Values of `visible=`."""
 
@@ -65,10 +75,10 @@ VISIBLE: Final = (None, *get_args(Visible))
 class Dataset(OpenTables):
     """One release: its tables (`OpenTables`), poses, boxes and sensor files."""
 
-    if not TYPE_CHECKING:  # Type checkers would take every name for a known one.
+    if not TYPE_CHECKING:  # type checkers would accept any name
 
         def __getattr__(self, name: str) -> Any:
-            """Name the replacement for a name of the nuScenes devkit; raises MissingNameError."""
+            """Raise MissingNameError with the replacement for a name of the nuScenes devkit."""
             if name in nuscenes_names.DATASET:
                 raise nuscenes_names.missing_name(type(self), name, nuscenes_names.DATASET[name])
             # This raises the usual AttributeError.
@@ -76,48 +86,49 @@ class Dataset(OpenTables):
 
     @property
     def with_ignored(self) -> Dataset:
-        """This release with the boxes of unknown classes, too, which count nowhere else.
+        """This release with the boxes of unknown classes, which are otherwise left out.
 
-        A release of DeepAccident has none, and is returned itself. Such boxes have ids from
-        `taxonomy.IGNORED_ID` on.
+        The ids of these boxes start at `taxonomy.IGNORED_ID`. A DeepAccident release has none, so
+        the same object is returned.
         """
         return self
 
     # Poses.
 
     def world_from(self, sample: RowArgument, frame: str) -> SE3:
-        """Return the transform to world from a frame of a sample.
+        """Return the transform from a frame of a sample to world.
 
         Args:
             sample: Token or record.
-            frame: `world`, `ego`, `lidar` or a channel (cameras optical).
+            frame: `world`, `ego`, `lidar` or a channel (cameras have optical axes).
 
         Raises:
-            TokenError: The sample is unknown.
-            ChoiceError: The frame is unknown.
+            TokenError: If the sample is unknown.
+            ChoiceError: If the frame is unknown.
         """
-        return self._world_from(self._sample_row(sample), self.frame_name(frame))
+        row = self._find_sample_row(sample)
+        return self._compute_world_from(row, self.frame_name(frame))
 
     def ego_from(self, sample: RowArgument, channel: str) -> SE3:
-        """Return the transform to a sample's ego frame from a sensor's frame.
+        """Return the transform from a sensor's frame to its sample's ego frame.
 
-        It has the exact numbers of the sample's calib file. The row of `calibrated_sensor` is the
-        intended value; the files of a scenario differ from it by rounding.
+        The numbers equal the sample's calib file exactly. The table `calibrated_sensor` has
+        the nominal values, from which the calib files of a scenario differ by rounding errors.
 
         Raises:
-            TokenError: The sample or sensor is unknown.
+            TokenError: If the sample or sensor is unknown.
         """
         row = self.getind("sample_data", f"{token_of(sample)}/{channel}")
         matrix = self.columns("sample_data")["matrix"][row]
         return trusted_se3(stored_transforms(matrix))
 
     def frame_name(self, frame: str) -> str:
-        """Return the canonical name of a frame of samples, which results carry.
+        """Return the canonical name of a coordinate frame, which is the `frame` of all results.
 
-        It is `lidar` for the channel `lidar01`, and the frame's own name for all others.
+        The channel `lidar01` becomes `lidar`; all other names stay as they are.
 
         Raises:
-            ChoiceError: The frame is unknown.
+            ChoiceError: If the frame is unknown.
         """
         name: str = choice("frame", frame, _FRAMES)
         return _FRAMES[name]
@@ -131,37 +142,39 @@ class Dataset(OpenTables):
         visible: Visible | None = None,
         velocity: VelocitySource = "decoded",
     ) -> Boxes:
-        """Return the annotated boxes of a sample as arrays; 0 rows if it has no label.
+        """Return the annotated boxes of a sample as arrays, which are empty if it is not labelled.
 
         Args:
             sample: Token or record.
             frame: Frame of the result: `world`, `ego`, `lidar` or a camera channel (then optical
                 axes).
             visible: None for all boxes; `camera` for boxes that a camera of this agent sees;
-                `released` for boxes that any agent at this moment sees by the released rule
-                (docs/released_code.md, Visibility and attributes), without the agent itself.
+                `released` for boxes that any agent sees at this moment under the released code's
+                rule (docs/released_code.md, Visibility and attributes), without the agent's own
+                box.
             velocity: `decoded` for the label's velocity (the column `velocity`; see
-                docs/conventions.md); `derived` from this agent's world positions of the actor at
-                10 Hz, NaN without any; `label` for the raw pair of the label, as if it were in the
-                LiDAR frame (the agent's own in world).
+                docs/conventions.md); `derived` for finite differences, at 10 Hz, of the actor's
+                world positions in this agent's labels (NaN if there is no neighbouring frame);
+                `label` for the label's two raw numbers, interpreted in the LiDAR frame (in the
+                world frame for the agent's own box).
 
         Raises:
-            TokenError: The sample is unknown.
-            ChoiceError: The frame, visibility or velocity is unknown.
+            TokenError: If the sample is unknown.
+            ChoiceError: If the frame, visibility or velocity is unknown.
         """
         token = token_of(sample)
         frame = self.frame_name(frame)
         row = self._tables.resolver.row("sample", token)
         source = choice("velocity", velocity, get_args(VelocitySource))
-        lidar_boxes = self._lidar_boxes(row, source, token)
+        lidar_boxes = self._make_lidar_boxes(row, source, token)
         visibility = choice("visible", visible, VISIBLE)
         if visibility is not None:
-            lidar_boxes = lidar_boxes.select(self._visible(row, lidar_boxes, visibility))
+            lidar_boxes = lidar_boxes.select(self._mark_visible(row, lidar_boxes, visibility))
         if frame == "lidar":
             return lidar_boxes
-        target_from_lidar = self._world_from(row, "lidar")
+        target_from_lidar = self._compute_world_from(row, "lidar")
         if frame != "world":
-            target_from_lidar = self._world_from(row, frame).inverse() @ target_from_lidar
+            target_from_lidar = self._compute_world_from(row, frame).inverse() @ target_from_lidar
         return lidar_boxes.transform(target_from_lidar, frame)
 
     @nuscenes_names.with_keywords_named
@@ -172,50 +185,51 @@ class Dataset(OpenTables):
         visible: Visible | None = None,
         velocity: VelocitySource = "decoded",
     ) -> list[Box]:
-        """Return the annotated boxes of a sample, one object each, with their tokens.
+        """Return the annotated boxes of a sample as a list of objects with tokens.
 
-        Arguments are as in `boxes`. Boxes of `boxes(sample)[i]` are the same except
-        `instance_token`, which only these have.
+        The arguments are as in `boxes`. Item i equals `boxes(sample)[i]`, but also has an
+        `instance_token`.
         """
-        row = self._sample_row(sample)
+        row = self._find_sample_row(sample)
         boxes = self.boxes(sample, frame, visible, velocity)
         instance_rows = self._tables.views["annotation"]["instance_row"]
-        instances = instance_rows[self._annotation_slice(row)][boxes.row].tolist()
+        instances = instance_rows[self._find_annotation_slice(row)][boxes.row].tolist()
         token_of_instance = self._tables.resolver.token_makers["instance"]
-        result = list(boxes)
-        for box, instance in zip(result, instances, strict=True):
+        box_objects = list(boxes)
+        for box, instance in zip(box_objects, instances, strict=True):
             box.instance_token = token_of_instance(instance) if instance >= 0 else None
-        return result
+        return box_objects
 
     def actor_ids(self, sample: RowArgument) -> IntArray:
         """Return the CARLA ids (N,) of the actors of a sample's boxes, in the order of its label.
 
-        Unlike in `Boxes.actor_id`, the agent's own row has the agent's id. Untracked rows are −1,
-        and so is an own row if meta does not identify the agent.
+        Unlike in `Boxes.actor_id`, the agent's own row has the agent's CARLA id, or −1 if meta does
+        not identify the agent. Untracked actors are −1.
 
         Raises:
-            TokenError: The sample is unknown.
+            TokenError: If the sample is unknown.
         """
-        rows = self._annotation_slice(self._sample_row(sample))
-        instances = self._tables.views["annotation"]["instance_row"][rows]
-        actors = self._tables.views["instance"]["actor_id"]
-        known = instances >= 0
-        result = np.full(len(instances), UNTRACKED_ID, dtype=np.int64)
-        result[known] = actors[instances[known]]
-        return result
+        rows = self.annotation_rows(sample)
+        instance_rows = self._tables.views["annotation"]["instance_row"][rows]
+        ids_of_instances = self._tables.views["instance"]["actor_id"]
+        is_known = instance_rows >= 0
+        actor_ids = np.full(len(instance_rows), UNTRACKED_ID, dtype=np.int64)
+        actor_ids[is_known] = ids_of_instances[instance_rows[is_known]]
+        return actor_ids
 
     def annotation_rows(self, sample: RowArgument) -> slice:
-        """Return the rows of a sample's boxes in the annotation table; empty without a label.
+        """Return the rows of a sample's boxes in the annotation table; empty if it is not labelled.
 
-        Raises TokenError.
+        Raises:
+            TokenError: If the sample is unknown.
         """
-        return self._annotation_slice(self._sample_row(sample))
+        return self._find_annotation_slice(self._find_sample_row(sample))
 
     def recordings(self, scenarios: Iterable[str]) -> dict[str, str]:
-        """Return scenario token → a hash of ego's number of boxes at each moment, if it has labels.
+        """Return scenario token → hash of the ego's box counts by frame, for labelled scenarios.
 
-        It distinguishes recordings of one name: recordings of the mini release differ from the
-        complete one's.
+        The hash distinguishes recordings with the same name: the mini release and the complete
+        release have different recordings under one name.
         """
         samples = self.columns("sample")
         hashes = {}
@@ -233,58 +247,61 @@ class Dataset(OpenTables):
 
     @nuscenes_names.with_keywords_named
     def get_sample_data_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
-        """Return the path of a sensor file, which need not exist; see `get_sample_data`.
+        """Return the path where a sensor file should be, whether or not it exists.
+
+        The arguments are as in `get_sample_data`.
 
         Raises:
-            TokenError: The sensor file is unknown.
-            NotAvailableError: The release lies in archives or at a URL, so that there is no path;
+            TokenError: If the sensor file is unknown.
+            NotAvailableError: If the release is in archives or at a URL, so that there is no path;
                 `local_path` returns one.
         """
         path = self.sensor_path(sample_data, channel)
         if isinstance(path, Path):
             return path
         raise NotAvailableError(
-            f"{path}: lies in an archive or at a URL; da.local_path(token) gives a real path"
+            f"{path}: is in an archive or at a URL; da.local_path(token) returns a real path"
         )
 
     def local_path(self, sample_data: RowArgument, channel: str | None = None) -> Path:
-        """Return a real path with the content of a sensor file, for other programs.
+        """Return the path of a real file with a sensor file's content, for other programs.
 
-        Arguments are as in `get_sample_data`. A file in an archive or at a URL is copied into the
-        user's cache, which has a limited size, so that a copy may disappear later
+        The arguments are as in `get_sample_data`. A file in an archive or at a URL is copied
+        into the user's cache. The cache has a limited size, so a copy may be deleted later
         (docs/reading.md).
 
         Raises:
-            TokenError: The sensor file is unknown.
-            MissingFileError: It was not downloaded.
-            SensorFileError: It cannot be read, or there is no space in the cache.
+            TokenError: If the sensor file is unknown.
+            MissingFileError: If the file was not downloaded.
+            SensorFileError: If the file cannot be read, or the cache has no space left.
         """
         path = self.sensor_path(sample_data, channel)
         if isinstance(path, StorePath):
             return path.local_path()
         if not path.exists():
-            raise MissingFileError(f"{path}: no such file; unpack the archive that holds it")
+            raise MissingFileError(f"{path}: no such file; unpack the archive that contains it")
         return path
 
     def sensor_path(self, sample_data: RowArgument, channel: str | None = None) -> ReleasePath:
-        """Return where the devkit's readers find a sensor file, which need not exist.
+        """Return where the devkit's readers look for a sensor file, whether or not it exists.
 
-        Arguments are as in `get_sample_data`.
+        The arguments are as in `get_sample_data`.
 
         Raises:
-            TokenError: The sensor file is unknown.
+            TokenError: If the sensor file is unknown.
         """
-        return self._path(self._sensor(sample_data, channel)[0])
+        row, _ = self._find_sensor_file(sample_data, channel)
+        return self._join_sensor_path(row)
 
     def sensor_frames(self, scenario: RowArgument) -> dict[tuple[str, str], tuple[int, ...]]:
-        """Return which files of a scenario exist, without opening any.
+        """Return which sensor files of a scenario exist: agent and channel → frame numbers.
 
-        The result is agent and channel → frame numbers, ascending. A folder is listed for each
-        agent of the scenario and each of `taxonomy.CHANNELS`: `sensor_path` of every file is
-        slower. A folder that does not exist, or cannot be listed, has no frames.
+        Frame numbers ascend. No file is opened: the folder of each agent and channel
+        (`taxonomy.CHANNELS`) is listed once, which is faster than calling `sensor_path` for every
+        file. A folder that does not exist, or cannot be listed, counts as empty.
 
         Raises:
-            TokenError: The scenario is unknown.
+            TokenError: If the scenario is unknown.
         """
         row = self.getind("scenario", scenario)
         record = self.scenario[row]
@@ -305,12 +322,12 @@ class Dataset(OpenTables):
     def get_sample_data(
         self, sample_data: RowArgument, channel: str | None = None
     ) -> tuple[Path, list[Box], FloatArray | None]:
-        """Return a sensor file's path, all boxes of its sample, and K (3, 3) of a camera.
+        """Return a sensor file's path, its sample's boxes, and a camera's K (3, 3), otherwise None.
 
-        The path is that of `get_sample_data_path` or, without one, that of `local_path`. Boxes are
-        in the sensor's frame, and not tested against the image: boxes behind a camera are among
-        them (`camera` finds visible ones). K is from calib, for an image of the size that `camera`
-        has: `camera(…).resized(width, height)` has it for another size.
+        The path is as from `get_sample_data_path` or, for a release in archives or at a URL, as
+        from `local_path`. Boxes are in the sensor's frame, and include boxes outside the image or
+        behind the camera (`camera` finds the visible ones). K is from the calib file, for the image
+        size of `camera`; `camera(…).resized(width, height)` has K for another size.
 
         Args:
             sample_data: Token or record of a sensor file; with `channel`, of a sample.
@@ -318,36 +335,41 @@ class Dataset(OpenTables):
                 it.
 
         Raises:
-            TokenError: The sensor file is unknown.
-            MissingFileError, SensorFileError: As in `local_path`, if the release lies in archives
-                or at a URL.
+            TokenError: If the sensor file is unknown.
+            MissingFileError, SensorFileError: If the release is in archives or at a URL, as
+                described in `local_path`.
         """
-        row, name = self._sensor(sample_data, channel)
-        intrinsic = self._intrinsic(row) if name in CAMERAS else None
-        boxes = self.get_boxes(self._tables.resolver.token("sample", row // len(CHANNELS)), name)
-        path = self._path(row)
-        return path if isinstance(path, Path) else path.local_path(), boxes, intrinsic
+        row, name = self._find_sensor_file(sample_data, channel)
+        intrinsic = None
+        if name in CAMERAS:
+            intrinsic = self._copy_intrinsic(row)
+        sample = self._tables.resolver.token("sample", row // len(CHANNELS))
+        boxes = self.get_boxes(sample, name)
+        path = self._join_sensor_path(row)
+        if not isinstance(path, Path):
+            path = path.local_path()
+        return path, boxes, intrinsic
 
     def camera(self, sample_data: RowArgument, channel: str | None = None) -> PinholeCamera:
-        """Return a camera with K and image size from its calib file.
+        """Return a camera with K and the image size from its calib file.
 
-        It projects points and finds visible boxes.
+        The camera projects points and finds visible boxes.
 
         Args:
             sample_data: Token or record of a camera's sensor file; with `channel`, of a sample.
             channel: The camera, such as `Camera_Front`; None if `sample_data` names it.
 
         Raises:
-            TokenError: The sensor file is unknown.
-            ChoiceError: The sensor is no camera.
+            TokenError: If the sensor file is unknown.
+            ChoiceError: If the sensor is not a camera.
         """
-        row, name = self._sensor(sample_data, channel)
+        row, name = self._find_sensor_file(sample_data, channel)
         if name not in CAMERAS:
             raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {name}")
         view = self._tables.views["sample_data"]
         width = view["width"].item(row)
         height = view["height"].item(row)
-        return PinholeCamera(self._intrinsic(row), width, height)
+        return PinholeCamera(self._copy_intrinsic(row), width, height)
 
     def load_image(
         self,
@@ -362,75 +384,75 @@ class Dataset(OpenTables):
         Args:
             sample_data: Token or record of a camera's sensor file; with `channel`, of a sample.
             channel: The camera, such as `Camera_Front`; None if `sample_data` names it.
-            min_size: A (height, width) that suffices, for speed: a JPEG is decoded at 1/2, 1/4 or
-                1/8 of its size if that is no smaller. None decodes all of it.
-            size: The (height, width), as of arrays, to which it is resized by Pillow's bilinear
-                filter; None keeps its own. Videos (`render_scenario_video`) have the other order:
-                (width, height).
+            min_size: Smallest acceptable height and width, for speed: a JPEG is decoded at 1/2, 1/4
+                or 1/8 of its size if the result is at least this large. None decodes the full size.
+            size: Height and width (in array order) to which the image is resized with Pillow's
+                bilinear filter; None keeps the decoded size. Videos (`render_scenario_video`) use
+                the opposite order, width and height.
 
         Raises:
-            TokenError: The sensor file is unknown.
-            ChoiceError: The sensor is no camera.
-            MissingFileError: The image was not downloaded.
-            SensorFileError: It cannot be read.
+            TokenError: If the sensor file is unknown.
+            ChoiceError: If the sensor is not a camera.
+            MissingFileError: If the image was not downloaded.
+            SensorFileError: If the file cannot be read.
         """
-        _, name = self._sensor(sample_data, channel)
+        _, name = self._find_sensor_file(sample_data, channel)
         if name not in CAMERAS:
-            raise ChoiceError(f"{name} holds no images; the cameras are {', '.join(CAMERAS)}")
+            raise ChoiceError(f"{name} has no images; the cameras are {', '.join(CAMERAS)}")
         return read_image(self.sensor_path(sample_data, channel), min_size=min_size, size=size)
 
     def load_point_cloud(self, sample: RowArgument, frame: Frame = "world") -> LidarPointCloud:
-        """Return a sample's LiDAR points in `world`, `ego` or `lidar`.
+        """Return a sample's LiDAR points in the frame `world`, `ego` or `lidar`.
 
         Raises:
-            TokenError: The sample is unknown.
-            ChoiceError: The frame is unknown.
-            MissingFileError: The file was not downloaded.
-            SensorFileError: It cannot be read.
+            TokenError: If the sample is unknown.
+            ChoiceError: If the frame is unknown.
+            MissingFileError: If the file was not downloaded.
+            SensorFileError: If the file cannot be read.
         """
-        row = self._sample_row(sample)
+        row = self._find_sample_row(sample)
         name = choice("frame", self.frame_name(frame), get_args(Frame))
         cloud = self._lidar_cloud(row)
         if name == "lidar":
             return cloud
-        target_from_world = self._world_from(row, name).inverse()
-        return cloud.transform(target_from_world @ self._world_from(row, "lidar"), name)
+        target_from_world = self._compute_world_from(row, name).inverse()
+        return cloud.transform(target_from_world @ self._compute_world_from(row, "lidar"), name)
 
     def _lidar_cloud(self, row: int) -> LidarPointCloud:
-        """Read the points of a row of `sample` in its LiDAR frame."""
+        """Read the points of the sample at index `row`, in its LiDAR frame."""
         return read_lidar(self._channel_path(row, LIDAR))
 
     def load_bev(self, sample: RowArgument) -> BevImage:
-        """Return the BEV camera's arrays of a sample; forward is up (see `BevImage`).
+        """Return the image of a sample's BEV camera; forward is up (see `BevImage`).
 
         Raises:
-            TokenError: The sample is unknown.
-            MissingFileError: The file was not downloaded.
-            SensorFileError: It cannot be read.
+            TokenError: If the sample is unknown.
+            MissingFileError: If the file was not downloaded.
+            SensorFileError: If the file cannot be read.
         """
-        return read_bev(self._channel_path(self._sample_row(sample), BEV_CAMERA))
+        return read_bev(self._channel_path(self._find_sample_row(sample), BEV_CAMERA))
 
     # Underlying rows and columns.
 
-    def _sample_row(self, sample: RowArgument) -> int:
+    def _find_sample_row(self, sample: RowArgument) -> int:
         return self._tables.resolver.row("sample", token_of(sample))
 
-    def _sensor(self, sample_data: RowArgument, channel: str | None) -> tuple[int, str]:
-        """Return the row and the channel of a sensor file; see `get_sample_data`.
+    def _find_sensor_file(self, sample_data: RowArgument, channel: str | None) -> tuple[int, str]:
+        """Return the row and the channel of a sensor file; raise TokenError if it is unknown.
 
-        Raises TokenError.
+        The arguments are as in `get_sample_data`.
         """
         token = token_of(sample_data)
         if channel is not None:
-            token = f"{token}/{spelled(channel, CHANNELS)}"
+            token = f"{token}/{match_spelling(channel, CHANNELS)}"
         row = self.sample_data.row(token)
         return row, CHANNELS[row % len(CHANNELS)]
 
-    def _path(self, sample_data_row: int) -> ReleasePath:
+    def _join_sensor_path(self, sample_data_row: int) -> ReleasePath:
         return self.dataroot / self._tables.resolver.filename(sample_data_row)
 
-    def _intrinsic(self, sample_data_row: int) -> FloatArray:
-        """Return K (3, 3) of a camera, which belongs to the caller."""
+    def _copy_intrinsic(self, sample_data_row: int) -> FloatArray:
+        """Return a copy of a camera's K (3, 3), which the caller may change."""
         views = self._tables.views
         sensor_row = views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
         intrinsic: FloatArray = views["calibrated_sensor"]["camera_intrinsic"][sensor_row]
@@ -438,9 +460,9 @@ class Dataset(OpenTables):
 
     def _channel_path(self, sample_row: int, channel: str) -> ReleasePath:
         first_row = sample_row * len(CHANNELS)
-        return self._path(first_row + CHANNELS.index(channel))
+        return self._join_sensor_path(first_row + CHANNELS.index(channel))
 
-    def _annotation_slice(self, sample_row: int) -> slice:
+    def _find_annotation_slice(self, sample_row: int) -> slice:
         view = self._tables.views["sample"]
         first_row = view["first_annotation_row"].item(sample_row)
         count = view["num_annotations"].item(sample_row)
@@ -450,32 +472,23 @@ class Dataset(OpenTables):
             raise damaged_value("sample")
         return rows
 
-    def _lidar_boxes(
+    def _make_lidar_boxes(
         self, sample_row: int, velocity: VelocitySource, token: str | None = None
     ) -> Boxes:
         view = self._tables.views["annotation"]
-        rows = self._annotation_slice(sample_row)
-        columns: dict[str, AnyArray] = {
-            "center": view["translation"][rows],
-            "size": view["size"][rows],
-            "rotation": view["rotation"][rows],
-            "velocity": view["velocity"][rows],
-            "category": view["category"][rows],
-            "actor_id": view["actor_id"][rows],
-            "num_lidar_pts": view["num_lidar_pts"][rows],
-            "camera_visible": view["camera_visible"][rows],
-            "row": np.arange(rows.stop - rows.start),
-        }
+        rows = self._find_annotation_slice(sample_row)
+        columns: dict[str, AnyArray] = {name: view[name][rows] for name in _BOX_COLUMNS}
+        columns["center"] = view["translation"][rows]
+        columns["row"] = np.arange(rows.stop - rows.start)
         if velocity == "label":
-            raw_velocity = view["velocity_label"][rows]
-            columns["velocity"] = self._label_velocity(
-                sample_row, columns["actor_id"], raw_velocity
+            columns["velocity"] = self._convert_label_velocity(
+                sample_row, columns["actor_id"], view["velocity_label"][rows]
             )
         elif velocity == "derived":
-            columns["velocity"] = self._derived_velocity(sample_row)
+            columns["velocity"] = self._derive_velocity(sample_row)
         return trusted_boxes("lidar", columns, token)
 
-    def _derived_velocity(self, sample_row: int) -> FloatArray:
+    def _derive_velocity(self, sample_row: int) -> FloatArray:
         """Return velocities (N, 3) in the sample's LiDAR frame, m/s, from neighbouring samples."""
         samples = self._tables.views["sample"]
         boxes = self._tables.views["annotation"]
@@ -486,8 +499,8 @@ class Dataset(OpenTables):
         actor_ids = []
         for row in (previous, sample_row, following):
             if row >= 0:
-                rows = self._annotation_slice(row)
-                world_from_lidar = self._world_from(row, "lidar")
+                rows = self._find_annotation_slice(row)
+                world_from_lidar = self._compute_world_from(row, "lidar")
                 frames.append(np.full(rows.stop - rows.start, row))
                 centers.append(world_from_lidar.apply(boxes["translation"][rows]))
                 actor_ids.append(boxes["actor_id"][rows])
@@ -496,24 +509,26 @@ class Dataset(OpenTables):
         velocity = displacement_velocities(
             np.concatenate(centers), agent, np.concatenate(actor_ids), frame
         )
-        lidar_from_world = self._world_from(sample_row, "lidar").inverse()
+        lidar_from_world = self._compute_world_from(sample_row, "lidar").inverse()
         return lidar_from_world.rotate(velocity[frame == sample_row])
 
-    def _label_velocity(
+    def _convert_label_velocity(
         self, sample_row: int, actor_id: IntArray, velocity_label: FloatArray
     ) -> FloatArray:
+        """Return raw label velocities (N, 3), m/s; the agent's own is rotated to LiDAR axes."""
         velocity = np.column_stack([velocity_label, np.zeros(len(velocity_label))])
-        own = actor_id == OWN_ACTOR_ID
-        velocity[own] = self._world_from(sample_row, "lidar").inverse().rotate(velocity[own])
+        is_own = actor_id == OWN_ACTOR_ID
+        lidar_from_world = self._compute_world_from(sample_row, "lidar").inverse()
+        velocity[is_own] = lidar_from_world.rotate(velocity[is_own])
         return velocity
 
-    def _visible(self, sample_row: int, boxes: Boxes, visible: Visible) -> BoolArray:
+    def _mark_visible(self, sample_row: int, boxes: Boxes, visible: Visible) -> BoolArray:
         if visible == "camera":
             return boxes.camera_visible
         masks = []
         ids = []
-        for row in self._samples_at_once(sample_row):
-            agent_boxes = self._lidar_boxes(row, "decoded")
+        for row in self._find_simultaneous_samples(sample_row):
+            agent_boxes = self._make_lidar_boxes(row, "decoded")
             agent = AGENTS[self._tables.views["sample"]["agent"].item(row)]
             mask = visible_mask(
                 agent_boxes.center[:, :2],
@@ -526,15 +541,17 @@ class Dataset(OpenTables):
             ids.append(agent_boxes.actor_id)
         return np.isin(boxes.actor_id, visible_ids(masks, ids))
 
-    def _samples_at_once(self, sample_row: int) -> list[int]:
+    def _find_simultaneous_samples(self, sample_row: int) -> list[int]:
+        """Return the sample rows of all agents in the same frame of the scenario."""
         view = self._tables.views["sample"]
         resolver = self._tables.resolver
-        scenario = view["scenario_row"].item(sample_row)
-        index = sample_row - resolver.sample_at(view["agent_row"].item(sample_row), 1) + 1
-        return [resolver.sample_at(agent, index) for agent in resolver.agents_of(scenario).values()]
+        first_row = resolver.sample_at(view["agent_row"].item(sample_row), 1)
+        index = sample_row - first_row + 1
+        agents = resolver.agents_of(view["scenario_row"].item(sample_row))
+        return [resolver.sample_at(agent, index) for agent in agents.values()]
 
-    def _world_from(self, sample_row: int, frame: str) -> SE3:
-        """Return `world_from` of a frame, by its canonical name."""
+    def _compute_world_from(self, sample_row: int, frame: str) -> SE3:
+        """Return the transform to world from a frame (canonical name) of a sample."""
         if frame == "world":
             return SE3.identity()
         views = self._tables.views

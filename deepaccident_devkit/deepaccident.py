@@ -1,4 +1,4 @@
-"""`DeepAccident`: the facade that binds the functions of lower layers to one release."""
+"""`DeepAccident`: the facade that binds functions of all lower layers to one release."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from deepaccident_devkit.errors import IndexStoreError, escaped
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
-from deepaccident_devkit.support.text import counted, path_of
+from deepaccident_devkit.support.text import PathType, counted, path_of
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 
@@ -21,8 +21,8 @@ from deepaccident_devkit.taxonomy import OnError
 class _LazyMethod:
     """A function of a package that is slow to import, imported and stored at its first use.
 
-    `DeepAccident` binds functions of all layers, and reading tables should not wait for the import
-    of rendering.
+    `DeepAccident` binds functions of all layers, and a user who only reads tables should not wait
+    until rendering is imported.
     """
 
     def __init__(self, load: Callable[[], Any]) -> None:
@@ -39,17 +39,16 @@ class _LazyMethod:
 
 
 class _LazyPackage:
-    """Stands for a slow package at run time; its attributes are resolved at their first use.
+    """A run-time stand-in for a slow package, whose attributes are resolved at their first use.
 
-    So each function is named only once: type checkers see the package itself, and with it every
-    signature.
+    Type checkers see the real package, and so every signature; no function has to be named twice.
     """
 
     def __init__(self, name: str) -> None:
         self._name = f"{__package__}.{name}"
 
     def __getattr__(self, name: str) -> _LazyMethod:
-        # Tools look for private names on any object.
+        # Tools probe any object for private names.
         if name.startswith("_"):
             raise AttributeError(name)
         return _LazyMethod(lambda: getattr(import_module(self._name), name))
@@ -71,11 +70,11 @@ else:
 
 
 class DeepAccident(Dataset):
-    """A DeepAccident release: tables, sensor data, boxes and transforms.
+    """A DeepAccident release with its tables, sensor data, boxes and transforms.
 
     The first call reads all label, calib and meta files and stores an index of them; later calls
-    open that in milliseconds. Sensor files are only needed when they are read. An instance is cheap
-    to pickle, so every worker of a torch DataLoader may hold one.
+    open the index in milliseconds. Sensor files are only needed when they are read. An instance is
+    cheap to pickle, so each worker of a PyTorch DataLoader can have one.
 
     Examples:
         >>> da = DeepAccident(version="v1", dataroot="data/DeepAccident")  # doctest: +SKIP
@@ -87,34 +86,35 @@ class DeepAccident(Dataset):
         self,
         version: str = "v1",
         dataroot: Dataroot = "data/DeepAccident",
-        index_dir: str | os.PathLike[str] | None = None,
+        index_dir: PathType | None = None,
         workers: int | None = None,
         on_error: OnError = "raise",
         verbose: bool = True,  # noqa: FBT001, FBT002 - the nuScenes devkit's signature
         *,
         executor: Executor | None = None,
     ) -> None:
-        """Open a release, and index it before if necessary.
+        """Open a release; index it first if necessary.
 
         Args:
             version: `v1` (train, val and test, or the flat layout) or `v1-mini`.
             dataroot: Folder that the release was unpacked into; or a zip, a folder of zips, or a
                 URL that fsspec can list, such as `s3://bucket/DeepAccident` (docs/reading.md).
             index_dir: Folder for the index of this release only; by default
-                `<dataroot>/.deepaccident`, or the user's cache folder if that cannot be written.
+                `<dataroot>/.deepaccident`, or the user's cache folder if that folder cannot be
+                written.
             workers: Number of processes for indexing; None chooses by the amount of work.
-            on_error: `raise` lists every broken scenario, or every unreadable archive, and raises;
-                `skip` leaves them out and logs it.
+            on_error: What to do about broken scenarios and unreadable archives: `raise` an error
+                that lists all of them, or `skip` and log them.
             verbose: Whether to show a progress bar while indexing.
-            executor: Executor of `concurrent.futures` for indexing, instead of own processes.
+            executor: A `concurrent.futures` executor that indexes; None starts worker processes.
 
         Raises:
-            DatarootError: The folder is missing or holds no release; or an archive or a URL cannot
-                be read.
-            VersionError: The version is unknown or not under this folder.
-            BrokenReleaseError: Scenarios are broken; the message lists them all.
-            IndexStoreError: The index cannot be written.
-            MissingExtraError: The dataroot is a URL, and the extra `cloud` is not installed.
+            DatarootError: If the folder does not exist or contains no release, or if an archive or
+                a URL cannot be read.
+            VersionError: If the version is unknown, or is not under this folder.
+            BrokenReleaseError: If scenarios are broken; the message lists them all.
+            IndexStoreError: If the index cannot be written.
+            MissingExtraError: If the dataroot is a URL, and the extra `cloud` is not installed.
         """
         engine: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
         index_path: Path | None = None
@@ -136,7 +136,7 @@ class DeepAccident(Dataset):
                 )
                 break
             except IndexStoreError:
-                # Another process may just have replaced the tables by newer ones: try once more.
+                # Another process may have just replaced the tables with newer ones: try once more.
                 if is_last_attempt or index.tables_folder.is_dir():
                     raise
 
@@ -182,26 +182,26 @@ class DeepAccident(Dataset):
         """Print a line for each scenario."""
         from deepaccident_devkit.statistics.overview import scenario_lines
 
-        _print(scenario_lines(self.scenario))
+        _print_lines(scenario_lines(self.scenario))
 
     def list_agents(self) -> None:
-        """Print the number of scenarios of each agent."""
+        """Print the number of scenarios that each agent recorded."""
         from deepaccident_devkit.statistics.overview import agent_lines
 
-        _print(agent_lines(self))
+        _print_lines(agent_lines(self))
 
     def list_categories(self) -> None:
         """Print each category's index, name and counts."""
         from deepaccident_devkit.statistics.overview import category_lines
 
-        _print(category_lines(self))
+        _print_lines(category_lines(self))
 
     @with_keywords_named
     def list_sample(self, sample: RowArgument) -> None:
-        """Print the files and boxes of a sample; raises TokenError."""
+        """Print the files and boxes of a sample; raise TokenError if it is unknown."""
         from deepaccident_devkit.statistics.overview import sample_lines
 
-        _print(sample_lines(self, sample))
+        _print_lines(sample_lines(self, sample))
 
     def __repr__(self) -> str:
         """Return version, dataroot and size."""
@@ -212,5 +212,5 @@ class DeepAccident(Dataset):
         )
 
 
-def _print(lines: Sequence[str]) -> None:
+def _print_lines(lines: Sequence[str]) -> None:
     print(escaped("\n".join(lines)))  # noqa: T201 - the `list_*` methods print

@@ -1,32 +1,31 @@
 """The devkit's own exceptions: every error that a caller can fix derives from `DeepAccidentError`.
 
-There are three kinds: `ArgumentError`, `FileError` and `UnavailableError`. Each error is also the
-built-in kind that a caller would expect (`ValueError`, `KeyError`, …) and is built from one
-sentence with the file, the line and the remedy. It has one argument only: an exception with more
-does not survive the pickling on its way out of a worker process.
+There are three kinds: `ArgumentError`, `FileError` and `UnavailableError`. Each error also derives
+from the built-in class that a caller would expect (`ValueError`, `KeyError`, …). Its message is one
+sentence that names the file, the line and the remedy. That is its only argument: an exception with
+several does not survive pickling when it leaves a worker process.
 
-Text from foreign files appears in these sentences too. So sentences have a maximum length, and
-nothing in them moves a terminal's cursor, rings or turns the direction of letters.
+Messages may quote text from untrusted files. So they have a maximum length, and control characters,
+which could move a terminal's cursor, ring its bell or reverse the writing direction, are escaped.
 """
 
 import re
 from typing import ClassVar, Final
 
-MOST_SAID: Final = 2000
-"""Characters of a message."""
-MOST_QUOTED: Final = 100
-"""Characters of foreign text in a message."""
-MOST_TOLD: Final = 300
-"""Characters of a fault's description by a library: numbers, a remedy, perhaps foreign text."""
-# Control characters except new line and tab, marks that turn the direction of letters, and lone
-# surrogates.
-_INVISIBLE: Final = re.compile(
+MAX_MESSAGE_LENGTH: Final = 2000
+"""Maximum number of characters of a message."""
+MAX_QUOTE_LENGTH: Final = 100
+"""Maximum number of characters that a message quotes from a file."""
+MAX_REASON_LENGTH: Final = 300
+"""Maximum number of characters of a library's own error message, which may quote a file."""
+# Control characters except newline and tab, bidirectional marks, and lone surrogates.
+_INVISIBLE = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
 )
 
 
-def shortened(text: str, max_length: int = MOST_QUOTED) -> str:
-    """Return foreign text for a message, without the middle if it is long."""
+def shortened(text: str, max_length: int = MAX_QUOTE_LENGTH) -> str:
+    """Return text for a message, with its middle left out if it exceeds `max_length` characters."""
     if len(text) <= max_length:
         return text
     half = (max_length - 3) // 2
@@ -34,53 +33,61 @@ def shortened(text: str, max_length: int = MOST_QUOTED) -> str:
 
 
 def escaped(text: str) -> str:
-    r"""Return foreign text for a terminal, with invisible characters as in JSON: `\u001b`."""
-    return _INVISIBLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+    r"""Return text for a terminal, with invisible characters escaped as in JSON: `\u001b`."""
+    return _INVISIBLE.sub(_escape_character, text)
+
+
+def _escape_character(match: re.Match[str]) -> str:
+    code = ord(match[0])
+    return f"\\u{code:04x}"
 
 
 class DeepAccidentError(Exception):
-    """Base of all errors raised on purpose by the devkit."""
+    """Base of all errors that the devkit raises deliberately."""
 
-    # In a list, each line may be as long as another error's message.
+    # Whether the message is a list, each line of which may have the maximum length of a message.
     _is_list: ClassVar[bool] = False
 
     def __init__(self, *message: object) -> None:
-        """Store the sentence, shortened in the middle, with visible control characters."""
+        """Store the message, shortened in the middle, with control characters escaped."""
         super().__init__(*map(self._sanitize, message))
 
     def _sanitize(self, message: object) -> str:
-        parts = str(message).split("\n") if self._is_list else [str(message)]
-        return "\n".join(shortened(escaped(part), MOST_SAID) for part in parts)
+        """Escape control characters, and shorten the message (a list: each of its lines)."""
+        lines = [str(message)]
+        if self._is_list:
+            lines = lines[0].split("\n")
+        return "\n".join([shortened(escaped(line), MAX_MESSAGE_LENGTH) for line in lines])
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle as the sentence: dask cannot copy errors that are OSError and ValueError."""
+        """Pickle only the message: dask cannot copy errors that are OSError and ValueError."""
         return type(self), self.args
 
     def __str__(self) -> str:
-        """Return the sentence itself (`KeyError` would show its repr)."""
+        """Return the message itself (`KeyError` would show its repr)."""
         if self.args:
             return str(self.args[0])
         return ""
 
 
 class ArgumentError(DeepAccidentError):
-    """Your argument cannot be used: change the call."""
+    """An argument is invalid: change the call."""
 
 
 class FileError(DeepAccidentError):
-    """This file or folder cannot be read, used or written: mend it, or give another."""
+    """A file or folder cannot be read, used or written: repair it, or choose another."""
 
 
 class UnavailableError(DeepAccidentError):
-    """Something that the call needs is missing, or does not run, here."""
+    """Something that the call needs is missing or does not run on this machine."""
 
 
 class ReleaseError(FileError, ValueError):
-    """Something in the release on disk does not keep to its format."""
+    """Something in the release on disk does not follow the release's format."""
 
 
 class DatarootError(ReleaseError, FileNotFoundError):
-    """The dataroot does not exist, holds no release, or has unreadable archives; lists them."""
+    """The dataroot does not exist, contains no release, or has unreadable archives (all listed)."""
 
     _is_list = True
 
@@ -102,7 +109,7 @@ class MetaError(ReleaseError):
 
 
 class CalibError(ReleaseError):
-    """A calibration file cannot be read, or holds something else."""
+    """A calibration file cannot be read, or is not a calibration."""
 
 
 class SensorFileError(ReleaseError):
@@ -128,19 +135,19 @@ class IndexStoreError(FileError, OSError):
 
 
 class LabelFilesError(FileError, OSError):
-    """A folder of written motion labels is missing, damaged or something else."""
+    """A folder of written motion labels is missing or damaged, or contains something else."""
 
 
 class ExportError(FileError, OSError):
-    """A folder of an export cannot be made, written to or read, or it holds something else."""
+    """An export's folder cannot be created, written to or read, or contains something else."""
 
 
 class OutputFolderError(FileError, OSError):
-    """An output would leave its folder, or would replace a device, a pipe or a folder."""
+    """An output would lie outside its folder, or replace a device, a pipe or a folder."""
 
 
 class ResultsError(FileError, ValueError):
-    """A results file, or a bundle of an evaluation, cannot be used as it is."""
+    """A results file, or an evaluation's bundle, is damaged or unsuitable."""
 
 
 class LookupFailedError(ArgumentError, KeyError):
@@ -160,11 +167,11 @@ class FieldError(LookupFailedError):
 
 
 class MissingNameError(ArgumentError, AttributeError):
-    """An object has no attribute of this name; the nuScenes devkit's has."""
+    """An object lacks an attribute that the nuScenes devkit's counterpart has."""
 
 
 class KeywordError(ArgumentError, TypeError):
-    """A function has no argument of this name; the nuScenes devkit's has."""
+    """A function lacks an argument that the nuScenes devkit's counterpart has."""
 
 
 class ChoiceError(ArgumentError, ValueError):
@@ -172,11 +179,11 @@ class ChoiceError(ArgumentError, ValueError):
 
 
 class GeometryError(ArgumentError, ValueError):
-    """An array is no valid transform, box or point set."""
+    """An array is not a valid transform, box or point set."""
 
 
 class ConfigError(ArgumentError, ValueError):
-    """A configuration cannot be carried out."""
+    """A configuration is invalid or contradicts itself."""
 
 
 class EvaluationError(ArgumentError, ValueError):
@@ -192,14 +199,14 @@ class WorkerError(UnavailableError, RuntimeError):
 
 
 class SomeFailedError(UnavailableError, RuntimeError):
-    """Some items of bulk work failed, and the others are done; the message lists every failure."""
+    """Some items of a batch failed and all others are done; the message lists every failure."""
 
     _is_list = True
 
 
 class MissingExtraError(UnavailableError, ImportError):
-    """An optional dependency is needed and not installed."""
+    """An optional dependency that the call needs is not installed."""
 
 
 class MissingPluginError(UnavailableError, ImportError):
-    """A plug-in is needed that this installation lacks."""
+    """A plug-in that the call needs is not installed."""

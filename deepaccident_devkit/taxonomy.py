@@ -17,7 +17,7 @@ ModelFusion = Literal["mean", "max", "released", "disconet", "cobevt", "v2xvit"]
 SHIPPED_WEIGHTS: Final = ("tiny", "tiny_lidar")
 """Presets with weights that ship with the devkit.
 
-These three names belong to `model`; they are here, so that they can be listed without torch.
+These three names belong to `model`; they are defined here so that listing them needs no torch.
 """
 
 AGENTS: Final[tuple[AgentName, ...]] = (
@@ -80,7 +80,7 @@ See docs/released_code.md, Visibility and attributes.
 OWN_ACTOR_ID: Final = -100
 """Label id of the recording agent itself."""
 UNTRACKED_ID: Final = -1
-"""Label id of an actor that is too far away to be tracked, and meta's word for "nobody"."""
+"""Label id of an actor that is too far away to be tracked; in meta, "no actor"."""
 UNKNOWN_ID: Final = 0
 """Meta's id of a collision partner that no label names."""
 STATIC_ACTOR_ID: Final = 20000
@@ -90,14 +90,15 @@ IGNORED_ID: Final = 1_000_000_000
 
 VELOCITY_FRAMES: Final[dict[str, str]] = {
     "released": (
-        "the release's own: the world's, turned once more by the box's yaw in the LiDAR frame"
+        "the release's own encoding (world velocities rotated once more by the box's "
+        "yaw in the LiDAR frame)"
     ),
     "lidar": "the recording agent's LiDAR frame",
     "world": "the world frame",
-    "turned-wrong": "the world frame turned by the agent's yaw with the wrong sign",
+    "turned-wrong": "the world frame rotated by the agent's yaw with the wrong sign",
     "box": "the box's own frame, x along its length",
 }
-"""Possible frames of the labels' velocities: the release's own, then foreign."""
+"""Possible frames of the labels' velocities: first the release's, then other sources'."""
 RELEASED_VELOCITY_FRAME: Final = "released"
 
 FRAME_PERIOD: Final = 0.1
@@ -106,15 +107,15 @@ WARM_UP_FRAMES: Final = 10
 """Simulated frames before the recorded ones, which meta counts as well."""
 
 POLE_HEIGHT: Final = 4.0
-"""Height of the origin of the infrastructure's `ego` frame above the road, metres.
+"""Height of the infrastructure's `ego` origin above the road, metres.
 
-The origin is its LiDAR on a pole, in the release 3 to 5 m high. A vehicle's `ego` frame has its
-origin on the road.
+This origin is its LiDAR, on a pole that is 3 to 5 m high in the release. A vehicle's `ego` origin
+is on the road.
 """
 
 BEV_SHAPE: Final = (1200, 1200)
 BEV_RESOLUTION: Final = 0.1
-"""Metres a pixel of the BEV instance camera, which covers ±60 m."""
+"""Metres per pixel of the BEV instance camera, which covers ±60 m."""
 
 VERSIONS: Final = ("v1", "v1-mini")
 SPLITS: Final = ("train", "val", "test")
@@ -133,7 +134,7 @@ SPAWN_SIDES: Final = ("left", "right", "opposite")
 DIRECTIONS: Final = ("straight", "left", "right")
 SPAWN_RELATIONS: Final = ("same", "opposite")
 CONTACT_SIDES: Final = ("front", "front_side", "rear", "rear_side")
-"""The known words of the complete release; others may occur, so no reader insists on them."""
+"""The values that occur in the complete release; readers accept others too."""
 
 SCENARIO_ATTRIBUTES: Final = (
     "scenario_type",
@@ -152,5 +153,5 @@ def short_name(agent: str) -> str:
 
 
 def frame_timestamp(frame_index: int) -> float:
-    """Return seconds since the first recorded frame of a frame number (from 1)."""
+    """Return the time of a frame in seconds since the first recorded one, which has number 1."""
     return (frame_index - 1) / 10

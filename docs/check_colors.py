@@ -4,7 +4,7 @@ Distances are CIELAB ΔE (1976, D65); colour blindness is simulated with the mat
 others (2009), severity 1; contrast is WCAG's ratio of luminances.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -36,7 +36,7 @@ EYES = {
         ]
     ),
 }
-"""What each kind of eye makes of linear RGB."""
+"""Linear RGB as each kind of eye sees it, as a matrix that is applied to linear RGB."""
 XYZ_FROM_RGB = np.array(
     [
         [0.4124564, 0.3575761, 0.1804375],
@@ -59,43 +59,51 @@ GROUNDS = {"white": "#ffffff", "road": styles.BEV_COLORS["road"], "mid-grey imag
 
 
 def linear(names: Iterable[str]) -> NDArray[np.float64]:
-    """(N, 3) linear RGB of sRGB colours."""
-    encoded = np.array([to_rgb(name) for name in names])
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    """Return (N, 3) linear RGB of sRGB colours."""
+    encoded = np.array(list(map(to_rgb, names)))
+    dark = encoded / 12.92
+    bright = ((encoded + 0.055) / 1.055) ** 2.4
+    return np.where(encoded <= 0.04045, dark, bright)
 
 
 def lab(names: Iterable[str], eye: str = "normal") -> NDArray[np.float64]:
-    """(N, 3) lightness, green to red, and blue to yellow of CIELAB, as an eye of `EYES` sees the
-    colours.
+    """Return (N, 3) lightness, green to red, and blue to yellow of CIELAB, as an eye of `EYES` sees
+    the colours.
     """
-    seen = np.clip(linear(names) @ EYES[eye].T, 0, 1)
-    part = seen @ XYZ_FROM_RGB.T / XYZ_FROM_RGB.sum(axis=1)
-    x, y, z = np.where(part > (6 / 29) ** 3, np.cbrt(part), part / (3 * (6 / 29) ** 2) + 4 / 29).T
+    rgb = np.clip(linear(names) @ EYES[eye].T, 0, 1)
+    white = XYZ_FROM_RGB.sum(axis=1)
+    ratio = rgb @ XYZ_FROM_RGB.T / white
+    dark = ratio / (3 * (6 / 29) ** 2) + 4 / 29
+    x, y, z = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), dark).T
     return np.column_stack([116 * y - 16, 500 * (x - y), 200 * (y - z)])
 
 
 def chroma(names: Iterable[str]) -> NDArray[np.float64]:
-    """(N,) how saturated colours are; grey has 0."""
-    return np.hypot(*lab(names)[:, 1:].T)
+    """Return (N,) the saturation of colours; grey has 0."""
+    _, green_to_red, blue_to_yellow = lab(names).T
+    return np.hypot(green_to_red, blue_to_yellow)
 
 
 def distances(
     first: Iterable[str], second: Iterable[str], eye: str = "normal"
 ) -> NDArray[np.float64]:
-    """(N, M) ΔE between the colours of two groups."""
-    return np.linalg.norm(lab(first, eye)[:, None] - lab(second, eye), axis=-1)
+    """Return (N, M) ΔE between the colours of two groups."""
+    difference = lab(first, eye)[:, None] - lab(second, eye)
+    return np.linalg.norm(difference, axis=-1)
 
 
-def least_distance(group: Iterable[str], eye: str = "normal") -> float:
-    """The smallest ΔE between two colours of a group."""
-    group = tuple(group)
-    return float(distances(group, group, eye)[np.triu_indices(len(group), 1)].min())
+def least_distance(group: Sequence[str], eye: str = "normal") -> float:
+    """Return the smallest ΔE between two colours of a group."""
+    pairs = np.triu_indices(len(group), 1)
+    return float(distances(group, group, eye)[pairs].min())
 
 
 def contrast(names: Iterable[str], ground: str) -> NDArray[np.float64]:
-    """(N,) the ratio of luminances of colours to that of a ground, from 1 to 21."""
-    light, behind = ((linear(each) @ XYZ_FROM_RGB[1]) + 0.05 for each in (names, [ground]))
-    return np.maximum(light, behind) / np.minimum(light, behind)
+    """Return (N,) WCAG's ratio of luminances of colours and a ground, from 1 to 21."""
+    luminance_weights = XYZ_FROM_RGB[1]
+    colors = linear(names) @ luminance_weights + 0.05
+    background = linear([ground]) @ luminance_weights + 0.05
+    return np.maximum(colors, background) / np.minimum(colors, background)
 
 
 def main() -> None:
@@ -104,9 +112,8 @@ def main() -> None:
         print(f"{name:22}", *(f"{least_distance(group, eye):13.1f}" for eye in EYES))
     print(f"\n{'smallest contrast':22}", *(f"{ground:>15}" for ground in GROUNDS))
     for name, group in GROUPS.items():
-        print(
-            f"{name:22}", *(f"{contrast(group, ground).min():15.2f}" for ground in GROUNDS.values())
-        )
+        ratios = [contrast(group, ground).min() for ground in GROUNDS.values()]
+        print(f"{name:22}", *(f"{ratio:15.2f}" for ratio in ratios))
 
 
 if __name__ == "__main__":

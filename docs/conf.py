@@ -1,5 +1,5 @@
-"""The documentation site: the guides as they lie in the repository, and an API reference from the
-docstrings.
+"""Build the documentation site: the guides as they lie in the repository, and an API reference from
+the docstrings.
 
     pip install '.[docs]' && sphinx-build -W --keep-going -c docs . build/site
 
@@ -39,7 +39,7 @@ html_theme = "furo"
 html_title = project
 html_static_path = ["static"]
 html_css_files = ["code.css"]
-html_additional_pages = {"index": "to_docs.html"}  # for those who open the folder
+html_additional_pages = {"index": "to_docs.html"}  # for readers who open the folder
 html_copy_source = False
 
 myst_heading_anchors = 3
@@ -114,9 +114,9 @@ REFERENCE = {
     "Studies": ("plugins.study",),
     "The explorer": ("plugins.explore",),
 }
-"""Title of a page → what it lists: modules, classes, a type."""
-INTERNAL = ("MOST_QUOTED", "MOST_SAID", "MOST_TOLD", "escaped", "shortened")
-"""What no page lists, of modules without `__all__`."""
+"""Title of a page → modules, classes and types that it lists."""
+INTERNAL = ("MAX_MESSAGE_LENGTH", "MAX_QUOTE_LENGTH", "MAX_REASON_LENGTH", "escaped", "shortened")
+"""Names that no page lists, of modules without `__all__`."""
 INTRODUCTION = """# API reference
 
 For everybody who programs with the devkit: all public names, with what they take, return and raise. A page to look
@@ -131,39 +131,43 @@ purpose is a `DeepAccidentError`. Modules that are not listed here may change wi
 
 
 def write_reference(folder: Path) -> None:
-    """Write the pages of the reference; they are not kept in the repository."""
+    """Write the pages of the reference; they are not stored in the repository."""
     folder.mkdir(exist_ok=True)
-    seen: set[str] = set()
-    names = []
-    for title, listed in REFERENCE.items():
-        names.append(re.sub(r"\W+", "_", title.lower()))
-        sections = "\n".join(
-            f"## `{each}`\n\n```{{eval-rst}}\n{_directive(each, seen)}\n```\n" for each in listed
-        )
-        (folder / f"{names[-1]}.md").write_text(f"# {title}\n\n{sections}", encoding="utf-8")
-    tree = "\n".join(["```{toctree}", ":maxdepth: 2", "", *names, "```", ""])
+    listed_names = set()
+    pages = []
+    for title, modules in REFERENCE.items():
+        page = re.sub(r"\W+", "_", title.lower())
+        pages.append(page)
+        text = f"# {title}\n\n"
+        for module in modules:
+            directive = _directive(module, listed_names)
+            text += f"## `{module}`\n\n```{{eval-rst}}\n{directive}\n```\n\n"
+        (folder / f"{page}.md").write_text(text.removesuffix("\n"), encoding="utf-8")
+    tree = "\n".join(["```{toctree}", ":maxdepth: 2", "", *pages, "```", ""])
     (folder / "index.md").write_text(f"{INTRODUCTION}\n{tree}", encoding="utf-8")
 
 
-def _directive(name: str, seen: set[str]) -> str:
-    """What autodoc takes of a module, without names that stand on an earlier page; of a class or a
-    type.
+def _directive(name: str, listed_names: set[str]) -> str:
+    """Return the autodoc directive of a module, without names on an earlier page, or of a class or
+    a type.
     """
     path = f"deepaccident_devkit.{name}"
     if name == "DeepAccident":
         return f".. autoclass:: {path}\n   :members:\n   :inherited-members:"
     if name.rpartition(".")[2][0].isupper():
         return f".. {'autodata' if name.endswith('Layer') else 'autoclass'}:: {path}"
+    directive = f".. automodule:: {path}"
     try:
         public = getattr(import_module(path), "__all__", None)
     except MissingExtraError:  # autodoc mocks what it lacks
-        return f".. automodule:: {path}\n   :members:\n   :imported-members:"
+        return f"{directive}\n   :members:\n   :imported-members:"
     if public is None:
-        return f".. automodule:: {path}\n   :members:\n   :exclude-members: {', '.join(INTERNAL)}"
-    members = [each for each in public if each not in seen]
-    seen.update(public)
-    shown = f"\n   :members: {', '.join(members)}" if members else ""  # an empty list would be all
-    return f".. automodule:: {path}{shown}\n   :imported-members:"
+        return f"{directive}\n   :members:\n   :exclude-members: {', '.join(INTERNAL)}"
+    members = [member for member in public if member not in listed_names]
+    listed_names.update(public)
+    if members:  # an empty list would mean all
+        directive += f"\n   :members: {', '.join(members)}"
+    return f"{directive}\n   :imported-members:"
 
 
 _CODE_SPAN = re.compile(r"(?<![`\\])`([^`]+)`(?!`)")
@@ -177,63 +181,73 @@ _ARRAY_NAMES = {
     "bool": "BoolArray",
     "uint8": "ByteArray",
 }
-"""As `deepaccident_devkit.support.arrays` calls them."""
+"""Names in `deepaccident_devkit.support.arrays`."""
 _WITHOUT_TYPE = ("attribute", "data", "property")
-"""What napoleon takes `type: text` off, if there is a colon in the first line."""
+"""Objects in which napoleon reads a first line with a colon as `type: text`."""
 _SECTIONS = ("Args:", "Attributes:", "Examples:", "Raises:", "Returns:", "Yields:")
 
 
 def restructured(lines: list[str]) -> list[str]:
-    """A docstring's lines as reStructuredText; doctests, and the sections that napoleon takes
-    apart, stay.
+    """Return a docstring's lines as reStructuredText; doctests, and the sections that napoleon
+    parses, stay.
     """
     result: list[str] = []
     block: list[str] = []
     kind = "text"
     for number, line in enumerate(lines):
-        following = _kind(line, kind, lines[:number])
-        if following != kind:
-            result += _RESTRUCTURED[kind](block) if block else []
-            kind, block = following, []
+        line_kind = _kind(line, kind, lines[:number])
+        if line_kind != kind:
+            result += _CONVERTERS[kind](block) if block else []
+            kind, block = line_kind, []
         block.append(line)
-    return result + _RESTRUCTURED[kind](block)
+    return result + _CONVERTERS[kind](block)
 
 
 def _kind(line: str, kind: str, before: list[str]) -> str:
-    """What a line belongs to: `fence`, `table`, `doctest`, `example` (indented code) or `text`."""
+    """Return what a line belongs to: `fence`, `table`, `doctest`, `example` (indented code) or
+    `text`.
+    """
     words = line.strip()
-    if kind == "fence" and before[-1].strip() != "```":
-        return "fence"
-    if words.startswith("```"):
+    is_in_fence = kind == "fence" and before[-1].strip() != "```"
+    if is_in_fence or words.startswith("```"):
         return "fence"
     if words.startswith("|") and words.endswith("|"):
         return "table"
     if words.startswith(">>>") or (kind == "doctest" and words):
         return "doctest"
-    indented = line.startswith("    ")
+    is_indented = line.startswith("    ")
     if kind == "example":
-        return "example" if indented or not words else "text"
+        return "example" if is_indented or not words else "text"
     starts_block = not before or not before[-1].strip()
-    return "example" if indented and starts_block and not _in_section(before) else "text"
+    if is_indented and starts_block and not _in_section(before):
+        return "example"
+    return "text"
 
 
 def _in_section(before: list[str]) -> bool:
-    """Whether the last line that is not indented begins a section."""
-    outermost = next((line for line in reversed(before) if line and not line.startswith(" ")), "")
-    return outermost in _SECTIONS
+    """Return whether the last line that is not indented begins a section."""
+    for line in reversed(before):
+        if line and not line.startswith(" "):
+            return line in _SECTIONS
+    return False
 
 
 def _text(lines: list[str]) -> list[str]:
-    """Code spans as literals, which may touch a letter (`token`s); bars are bars."""
+    """Return text with code spans as literals, which may touch a letter (`token`s), and with
+    escaped bars.
+    """
     pieces = _CODE_SPAN.split("\n".join(lines))
-    pieces[::2] = [piece.replace("|", r"\|") for piece in pieces[::2]]
-    pieces[1::2] = [rf"\ ``{piece}``\ " for piece in pieces[1::2]]
-    return "".join(pieces).replace("\n\\ ``", "\n``").removeprefix("\\ ").split("\n")
+    for index, piece in enumerate(pieces):
+        is_code = index % 2
+        pieces[index] = rf"\ ``{piece}``\ " if is_code else piece.replace("|", r"\|")
+    text = "".join(pieces).replace("\n\\ ``", "\n``")
+    return text.removeprefix("\\ ").split("\n")
 
 
 def _fence(lines: list[str]) -> list[str]:
-    indent = lines[0][: len(lines[0]) - len(lines[0].lstrip())]
-    return ["", f"{indent}.. code-block:: python", "", *(f"    {line}" for line in lines[1:-1]), ""]
+    first, *code, _ = lines
+    indent = first.partition("`")[0]
+    return ["", f"{indent}.. code-block:: python", "", *(f"    {line}" for line in code), ""]
 
 
 def _example(lines: list[str]) -> list[str]:
@@ -241,15 +255,17 @@ def _example(lines: list[str]) -> list[str]:
 
 
 def _table(lines: list[str]) -> list[str]:
-    rows = [re.split(r"(?<!\\)\|", line.strip()[1:-1]) for line in lines]
     result = ["", ".. list-table::", "    :header-rows: 1", ""]
-    for row in (row for row in rows if set("".join(row)) - set(" -:")):
-        cells = [_text([cell.strip()])[0] for cell in row]
-        result += [f"    {'*' if not index else ' '} - {cell}" for index, cell in enumerate(cells)]
+    for line in lines:
+        if not set(line) <= set(" |-:"):
+            marker = "*"
+            for cell in re.split(r"(?<!\\)\|", line.strip()[1:-1]):
+                result.append(f"    {marker} - {_text([cell.strip()])[0]}")
+                marker = " "
     return [*result, ""]
 
 
-_RESTRUCTURED = {
+_CONVERTERS = {
     "text": _text,
     "fence": _fence,
     "example": _example,
@@ -259,33 +275,34 @@ _RESTRUCTURED = {
 
 
 def _process(
-    _app: Any, what: str, _name: str, _obj: object, _options: Any, lines: list[str]
+    _app: Any, kind: str, _name: str, _obj: object, _options: Any, lines: list[str]
 ) -> None:
-    if what == "method":  # functions that the facade binds: it is `self`
-        lines[:] = [line for line in lines if line.strip() != "dataset: the release."]
+    if kind == "method":  # functions that the facade binds: it is `self`
+        lines[:] = [line for line in lines if line.strip() != "dataset: The release."]
     lines[:] = restructured(lines)
-    if what in _WITHOUT_TYPE:
+    if kind in _WITHOUT_TYPE:
         lines.insert(0, "")
 
 
 def _name_arrays(
     _app: Any,
-    _what: str,
+    _object_kind: str,
     _name: str,
     _obj: object,
     _options: Any,
     signature: str | None,
     result: str | None,
 ) -> tuple[str | None, ...]:
-    return tuple(text and _ARRAY.sub(_array_name, text) for text in (signature, result))
+    texts = (signature, result)
+    return tuple(text and _ARRAY.sub(_array_name, text) for text in texts)
 
 
-def _array_name(found: re.Match[str]) -> str:
-    return _ARRAY_NAMES.get(found["dtype"], "AnyArray")
+def _array_name(array: re.Match[str]) -> str:
+    return _ARRAY_NAMES.get(array["dtype"], "AnyArray")
 
 
 def setup(app: Any) -> None:
-    """Connect what reads docstrings, ahead of napoleon, and write the reference."""
+    """Connect the functions that change docstrings, before napoleon, and write the reference."""
     write_reference(Path(__file__).parent / "api")
     app.setup_extension("sphinx.ext.autodoc")
     app.connect("autodoc-process-docstring", _process, priority=400)

@@ -1,9 +1,7 @@
-"""Write docs/cli.md from the help texts of the commands themselves: `python
-docs/make_cli_page.py`.
-"""
+"""Write docs/cli.md from the help texts of the commands themselves: `python docs/make_cli_page.py`."""
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from textwrap import indent
 
@@ -14,12 +12,10 @@ from deepaccident_devkit.cli.options import release_parameters
 from deepaccident_devkit.cli.verbs import Advanced
 
 PAGE = Path(__file__).parent / "cli.md"
-WORDS_A_MINUTE = 200
 
 _HEAD = """# Command line: all commands
 
-For everybody who uses the command `deepaccident`: what each command does, and all of its options. {minutes} minutes;
-one minute if you look up one command.
+For everyone who uses the command `deepaccident`: what each command does, and all of its options.
 
 `python docs/make_cli_page.py` makes this page from the help of the commands. `deepaccident COMMAND --help` prints the
 same text in the terminal.
@@ -70,120 +66,128 @@ Every command with a DATAROOT and a link to this section has these options:
 def _release(**_: object) -> None: ...
 
 
-_ALIKE = 3
-"""Options that at least so many commands of a group have in common are described once, at the
-group.
-"""
-_UNLIKE = ("video", "replay")
-_SHARED = {parameter.name for parameter in _release.params}
+_MIN_SIMILAR_COMMANDS = 3
+"""Number of commands of a group from which on their common options are described at the group."""
+_DIFFERENT_COMMANDS = ("video", "replay")
+_RELEASE_NAMES = {parameter.name for parameter in _release.params}
 
 
 def page() -> str:
-    """The page's text."""
+    """Return the page's text."""
     release = "\n".join(_tables(_options(_release)))
-    commands = "\n".join(_section(*each) for each in _commands(deepaccident, ("deepaccident",)))
-    text = _HEAD.replace("{release}", release) + commands
-    return text.replace("{minutes}", str(max(1, round(len(text.split()) / WORDS_A_MINUTE))))
+    text = _HEAD.replace("{release}", release)
+    sections = [_section(*command) for command in _commands(deepaccident, ("deepaccident",))]
+    return text + "\n".join(sections)
 
 
 def _options(command: click.Command) -> list[click.Option]:
-    return [each for each in command.params if isinstance(each, click.Option) and not each.hidden]
+    options = [parameter for parameter in command.params if isinstance(parameter, click.Option)]
+    return [option for option in options if not option.hidden]
 
 
 def _commands(
     command: click.Command, path: tuple[str, ...], parent: click.Group | None = None
 ) -> Iterator[tuple[click.Command, tuple[str, ...], click.Group | None]]:
-    """All commands below a group, each with its words and its group."""
+    """Yield all commands below a group, each with its words and its group."""
     if len(path) > 1:
         yield command, path, parent
     if isinstance(command, click.Group):
         context = click.Context(command)
         for name in command.list_commands(context):
-            below = command.get_command(context, name)
-            assert below is not None
-            yield from _commands(below, (*path, name), command)
+            subcommand = command.get_command(context, name)
+            assert subcommand is not None
+            yield from _commands(subcommand, (*path, name), command)
 
 
-def _on_release(command: click.Command) -> bool:
-    return {each.name for each in command.params if not getattr(each, "hidden", False)} >= _SHARED
+def _has_release_options(command: click.Command) -> bool:
+    visible = [option for option in command.params if not getattr(option, "hidden", False)]
+    return {parameter.name for parameter in visible} >= _RELEASE_NAMES
 
 
-def _alike(group: click.Group) -> dict[str, click.Command]:
-    """The commands of a group that have the options of a release, except for those that differ from
-    the others.
+def _similar_commands(group: click.Group) -> dict[str, click.Command]:
+    """Return the commands of a group that have the options of a release, except for the ones that
+    differ from the rest.
     """
     context = click.Context(group)
-    commands = {name: group.get_command(context, name) for name in group.list_commands(context)}
-    return {
-        name: each
-        for name, each in commands.items()
-        if each and _on_release(each) and name not in _UNLIKE
-    }
+    commands = {}
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if command and _has_release_options(command) and name not in _DIFFERENT_COMMANDS:
+            commands[name] = command
+    return commands
 
 
-def _common(group: click.Group) -> list[click.Option]:
-    """The options that all of these commands have; none if they are few."""
-    alike = [_options(command) for command in _alike(group).values()]
-    if len(alike) < _ALIKE:
+def _common_options(group: click.Group) -> list[click.Option]:
+    """Return the options that all similar commands have; none if these are few."""
+    commands = _similar_commands(group).values()
+    if len(commands) < _MIN_SIMILAR_COMMANDS:
         return []
-    return [
-        each
-        for each in _without(alike[0], _options(_release))
-        if all(_is_in(each, options) for options in alike)
-    ]
+    first, *further = [_options(command) for command in commands]
+    common = _without(first, _options(_release))
+    for options in further:
+        common = [option for option in common if _is_in(option, options)]
+    return common
 
 
 def _is_in(option: click.Option, options: list[click.Option]) -> bool:
-    """Whether one of some options has the same row."""
+    """Return whether one of several options has the same row."""
     return _row(option) in map(_row, options)
 
 
-def _without(options: list[click.Option], others: list[click.Option]) -> list[click.Option]:
-    return [each for each in options if not _is_in(each, others)]
+def _without(options: list[click.Option], excluded: list[click.Option]) -> list[click.Option]:
+    return [option for option in options if not _is_in(option, excluded)]
 
 
-def _with_release(group: click.Group) -> str:
-    *most, last = (f"`{name}`" for name in _alike(group))
-    return f"{', '.join(most)} and {last}"
+def _join_names(names: Iterable[str]) -> str:
+    *first_names, last = [f"`{name}`" for name in names]
+    return f"{', '.join(first_names)} and {last}"
 
 
 def _section(command: click.Command, path: tuple[str, ...], parent: click.Group | None) -> str:
-    """One command: its name, usage, help and options."""
+    """Return one command's section: its name, usage, help and options."""
     lines = [f"### {' '.join(path)}", ""]
-    only_group = isinstance(command, click.Group) and not command.invoke_without_command
-    if not only_group:
-        words = [_argument(each) for each in command.params if isinstance(each, click.Argument)]
-        lines += [f"    {' '.join([*path, '[OPTIONS]', *words])}", ""]
+    is_only_group = isinstance(command, click.Group) and not command.invoke_without_command
+    if not is_only_group:
+        words = [*path, "[OPTIONS]"]
+        for parameter in command.params:
+            if isinstance(parameter, click.Argument):
+                words.append(_argument(parameter))
+        lines += [f"    {' '.join(words)}", ""]
     lines += [_plain(command.help), ""]
     if isinstance(command, click.Group):
         context = click.Context(command)
-        names = [
-            f"[`{name}`](#{'-'.join((*path, name))})" for name in command.list_commands(context)
-        ]
-        lines += [f"Commands below it: {', '.join(names)}.", ""]
-        if common := _common(command):
-            lines += [
-                f"{_with_release(command)} have these options in common:",
-                "",
-                *_tables(common),
-            ]
-    if only_group:
+        anchor = "-".join(path)
+        names = command.list_commands(context)
+        links = [f"[`{name}`](#{anchor}-{name})" for name in names]
+        lines += [f"Commands below it: {', '.join(links)}.", ""]
+        common = _common_options(command)
+        if common:
+            commands = _join_names(_similar_commands(command))
+            lines += [f"{commands} have these options in common:", "", *_tables(common)]
+    if is_only_group:
         return "\n".join(lines)
     options = _options(command)
-    if _on_release(command):
+    if _has_release_options(command):
         options = _without(options, _options(_release))
-        also = ""
-        if parent is not None and path[-1] not in _UNLIKE and (common := _common(parent)):
-            options = _without(options, common)
-            also = f", those of [{' '.join(path[:-1])}](#{'-'.join(path[:-1])})"
-        lines += [
-            f"It has the [options of a release](#options-of-a-release){also}{', and these:' if options else '.'}",
-            "",
-        ]
+        text = "It has the [options of a release](#options-of-a-release)"
+        described_at_group = _options_at_group(path[-1], parent)
+        if described_at_group:
+            options = _without(options, described_at_group)
+            group = path[:-1]
+            text += f", the options of [{' '.join(group)}](#{'-'.join(group)})"
+        text += ", and these:" if options else "."
+        lines += [text, ""]
     lines += _tables(options)
     if command.epilog:
         lines += [_plain(command.epilog), ""]
     return "\n".join(lines)
+
+
+def _options_at_group(name: str, parent: click.Group | None) -> list[click.Option]:
+    """Return the options of a command that are described at its group."""
+    if parent is None or name in _DIFFERENT_COMMANDS:
+        return []
+    return _common_options(parent)
 
 
 def _argument(argument: click.Argument) -> str:
@@ -196,10 +200,11 @@ def _row(option: click.Option) -> str:
 
 
 def _tables(options: list[click.Option]) -> list[str]:
-    """A row an option; the advanced ones in a table of their own."""
+    """Return a row for each option; the advanced ones in a table of their own."""
     lines = []
-    for heading, kind in (("option", False), ("advanced option", True)):
-        if rows := [_row(each) for each in options if isinstance(each, Advanced) is kind]:
+    for heading, is_advanced in (("option", False), ("advanced option", True)):
+        rows = [_row(option) for option in options if isinstance(option, Advanced) is is_advanced]
+        if rows:
             lines += [f"| {heading} | what it does |", "|---|---|", *rows, ""]
     return lines
 
@@ -208,33 +213,35 @@ def _name(option: click.Option) -> str:
     names = ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
     if option.is_flag or isinstance(option.type, click.Choice):
         return names
-    return f"{names} `{option.metavar or option.type.name.upper().removesuffix(' RANGE')}`".replace(
-        "|", "\\|"
-    )
+    value = option.metavar or option.type.name.upper().removesuffix(" RANGE")
+    return f"{names} `{value}`".replace("|", "\\|")
 
 
 def _meaning(option: click.Option) -> str:
-    words = [_plain(option.help).replace("\n", " ").replace("  [", " [").replace("|", "\\|")]
+    text = _plain(option.help).replace("\n", " ").replace("  [", " [")
+    sentences = [text.replace("|", "\\|")]
     if isinstance(option.type, click.Choice):
-        words.append(f"One of {', '.join(f'`{choice}`' for choice in option.type.choices)}.")
+        choices = [f"`{choice}`" for choice in option.type.choices]
+        sentences.append(f"One of {', '.join(choices)}.")
     if option.required:
-        words.append("Required.")
+        sentences.append("Required.")
     elif option.show_default is True:
         value = option.default
         if isinstance(value, (list, tuple)):
             value = ", ".join(map(str, value))
         if option.is_flag:
             value = (option.opts if value else option.secondary_opts)[0]
-        words.append(f"Default: `{value}`.")
-    return " ".join(word for word in words if word)
+        sentences.append(f"Default: `{value}`.")
+    return " ".join(filter(None, sentences))
 
 
 def _plain(text: str | None) -> str:
-    """A help text; what click does not wrap is a block."""
-    parts = inspect.cleandoc(text or "").split("\n\n")
-    return "\n\n".join(
-        indent(each[2:], "    ") if each.startswith("\b\n") else each for each in parts
-    )
+    """Return a help text as Markdown; what click does not wrap is a block."""
+    paragraphs = inspect.cleandoc(text or "").split("\n\n")
+    for index, paragraph in enumerate(paragraphs):
+        if paragraph.startswith("\b\n"):
+            paragraphs[index] = indent(paragraph[2:], "    ")
+    return "\n\n".join(paragraphs)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""Write docs/public_names.json, the list of all that is public: `python docs/make_public_names.py`.
+"""Write docs/public_names.json, the list of all public names: `python docs/make_public_names.py`.
 
-Names are read from the text of the modules, not imported: so nobody needs PyTorch to make the list
-    or to compare it.
-Public are the modules that docs/conf.py lists for the reference: what is in their `__all__`, or,
-where a module has none, what it defines without an underscore.
+Names are read from the text of the modules, which are not imported: so nobody needs PyTorch to make
+the list or to compare it. Public are the modules that docs/conf.py lists for the reference: the
+names in their `__all__`, or, if a module has none, the names that it defines without an underscore.
 """
 
 import ast
@@ -56,13 +55,11 @@ DAILY = {
     "plugins.synth": "SynthConfig make_release",
     "testing": "write_small_release broken_release",
 }
-"""Room, or the class that users know by its name → the names of daily use."""
-MOST = 80
-"""Names of daily use at most."""
-LONGEST = 160
-"""Letters of a constant's value that are kept."""
-RECORDS = {"NamedTuple", "TypedDict", "msgspec.Struct"}
-"""What makes a class with fields of one, beside `dataclass`."""
+"""Module, or class that users know by its name → names of daily use."""
+MAX_VALUE_LENGTH = 160
+"""Letters of a constant's value that are listed."""
+RECORD_BASES = {"NamedTuple", "TypedDict", "msgspec.Struct"}
+"""Bases, besides the decorator `dataclass`, that make a class with fields."""
 
 
 def main() -> None:
@@ -71,70 +68,75 @@ def main() -> None:
 
 
 def listed() -> dict[str, Any]:
-    """What is public now: the names of daily use, those of each room, and the commands."""
-    rooms = {room: names_of(room) for room in public_modules()}
-    return {"daily": daily(rooms), "rooms": rooms, "commands": commands()}
+    """Return what is public now: the names of daily use, the names of each module, and the
+    commands.
+    """
+    modules = {module: names_of(module) for module in public_modules()}
+    return {"daily": daily(modules), "rooms": modules, "commands": commands()}
 
 
 def as_json(names: dict[str, Any]) -> str:
-    """The list as text, one name a line."""
+    """Return the list as text, one name on each line."""
     return json.dumps(names, indent=1, ensure_ascii=False) + "\n"
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """A line for each name that was added, removed or changed, from one list to another."""
-    before, after = _lines(old), _lines(new)
-    changed = [name for name in before.keys() & after.keys() if before[name] != after[name]]
-    return [
-        *(f"removed: {name}" for name in sorted(before.keys() - after.keys())),
-        *(f"added: {name}" for name in sorted(after.keys() - before.keys())),
-        *(
-            f"changed: {name}\n    was {before[name]}\n    is  {after[name]}"
-            for name in sorted(changed)
-        ),
-    ]
+    """Return a line for each name that was added, removed or changed from one list to another."""
+    before = _descriptions(old)
+    after = _descriptions(new)
+    lines = [f"removed: {name}" for name in sorted(before.keys() - after.keys())]
+    lines += [f"added: {name}" for name in sorted(after.keys() - before.keys())]
+    for name in sorted(before.keys() & after.keys()):
+        if before[name] != after[name]:
+            lines.append(f"changed: {name}\n    was {before[name]}\n    is  {after[name]}")
+    return lines
 
 
-def _lines(names: dict[str, Any]) -> dict[str, str]:
-    return {
-        **{
-            f"{room}: {name}": said
-            for room, each in names["rooms"].items()
-            for name, said in each.items()
-        },
-        **names["commands"],
-        **{
-            f"{name}, of daily use": f"in {found['page']}" for name, found in names["daily"].items()
-        },
-    }
+def _descriptions(names: dict[str, Any]) -> dict[str, str]:
+    """Return the description of every entry of a list."""
+    descriptions = dict(names["commands"])
+    for module, members in names["rooms"].items():
+        for name, description in members.items():
+            descriptions[f"{module}: {name}"] = description
+    for name, use in names["daily"].items():
+        descriptions[f"{name}, of daily use"] = f"in {use['page']}"
+    return descriptions
 
 
 # names of daily use
 
 
-def daily(rooms: dict[str, dict[str, str]]) -> dict[str, dict[str, str | None]]:
-    """Names of daily use → the first page whose code uses them, and what they are; None where there
-    is none.
+def daily(modules: dict[str, dict[str, str]]) -> dict[str, dict[str, str | None]]:
+    """Return, for each name of daily use, the first page with code that uses it, and its
+    description; None where there is none.
     """
-    uses = {page: used_names(TOP / page) for page in pages()}
-    found: dict[str, dict[str, str | None]] = {}
+    names_by_page = {page: used_names(TOP / page) for page in pages()}
+    uses: dict[str, dict[str, str | None]] = {}
     for group, names in DAILY.items():
+        module = PACKAGE if group == "DeepAccident" else _dotted(group)
         for name in names.split():
-            page = next(
-                (page for page, used in uses.items() if name.rpartition(".")[2] in used), None
-            )
-            room, whole = (
-                (PACKAGE, f"{group}.{name}") if group == "DeepAccident" else (_dotted(group), name)
-            )
-            while (said := rooms[room].get(whole, "")).startswith(f"= {PACKAGE}."):
-                room = said.removeprefix("= ").removesuffix(f".{whole}")
-            found[f"{group}.{name}".lstrip(".")] = {"page": page, "is": said or None}
-    return found
+            last = name.rpartition(".")[2]
+            using_pages = (page for page, used in names_by_page.items() if last in used)
+            member = f"{group}.{name}" if group == "DeepAccident" else name
+            uses[f"{group}.{name}".lstrip(".")] = {
+                "page": next(using_pages, None),
+                "is": _resolve(modules, module, member),
+            }
+    return uses
+
+
+def _resolve(modules: dict[str, dict[str, str]], module: str, name: str) -> str | None:
+    """Return the description of a name in the module that describes it."""
+    description = modules[module].get(name)
+    while description and description.startswith(f"= {PACKAGE}."):
+        module = description.removeprefix("= ").removesuffix(f".{name}")
+        description = modules[module].get(name)
+    return description
 
 
 def pages() -> list[str]:
-    """The pages that users read: those of docs/ in the order of docs/index.md, then this one and
-    README.md.
+    """Return the pages that users read: the pages of docs/ in the order of docs/index.md, then that
+    page and README.md.
     """
     start = (TOP / "docs" / "index.md").read_text(encoding="utf-8")
     listed = [f"docs/{name}.md" for name in re.findall(r"^\w+$", start, re.MULTILINE)]
@@ -142,88 +144,92 @@ def pages() -> list[str]:
 
 
 def code_of(page: Path) -> Iterator[ast.AST]:
-    """The nodes of a page's Python blocks."""
-    for block in re.findall(
-        r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    ):
+    """Yield the nodes of a page's Python blocks."""
+    text = page.read_text(encoding="utf-8")
+    for block in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         yield from ast.walk(ast.parse(block))
 
 
 def used_names(page: Path) -> set[str]:
-    """Names and attributes in a page's Python blocks."""
-    nodes = [*code_of(page)]
-    return (
-        {node.attr for node in nodes if isinstance(node, ast.Attribute)}
-        | {node.id for node in nodes if isinstance(node, ast.Name)}
-        | {node.name for node in nodes if isinstance(node, ast.alias)}
-    )
+    """Return the names and attributes in a page's Python blocks."""
+    names = set()
+    for node in code_of(page):
+        if isinstance(node, ast.Attribute):
+            names.add(node.attr)
+        elif isinstance(node, ast.Name):
+            names.add(node.id)
+        elif isinstance(node, ast.alias):
+            names.add(node.name)
+    return names
 
 
-# rooms
+# modules
 
 
 @cache
 def public_modules() -> dict[str, tuple[str, ...]]:
-    """Module → the names in it that the reference lists."""
+    """Return the names that the reference lists, by module."""
     constants = _constants(TOP / "docs" / "conf.py")
     internal = ast.literal_eval(constants["INTERNAL"])
-    result = {PACKAGE: _all_of(PACKAGE)}
+    result = {PACKAGE: _public_names(PACKAGE)}
     for listed in ast.literal_eval(constants["REFERENCE"]).values():
         for name in listed:
-            room, _, last = name.rpartition(".")
+            parent, _, last = name.rpartition(".")
             if not last[0].isupper():
-                result[_dotted(name)] = tuple(
-                    each for each in _all_of(_dotted(name)) if each not in internal
+                module = _dotted(name)
+                result[module] = tuple(
+                    member for member in _public_names(module) if member not in internal
                 )
-            elif room:
-                result[_dotted(room)] = (*result.get(_dotted(room), ()), last)
+            elif parent:
+                module = _dotted(parent)
+                result[module] = (*result.get(module, ()), last)
     return result
 
 
-def _dotted(room: str) -> str:
-    return f"{PACKAGE}.{room}".rstrip(".")
+def _dotted(name: str) -> str:
+    return f"{PACKAGE}.{name}".rstrip(".")
 
 
-def _all_of(module: str) -> tuple[str, ...]:
-    if "__all__" in (constants := _constants(_path(module))):
+def _public_names(module: str) -> tuple[str, ...]:
+    constants = _constants(_path(module))
+    if "__all__" in constants:
         return tuple(ast.literal_eval(constants["__all__"]))
-    return tuple(
-        name
-        for name, (home, _) in _names(module).items()
-        if home == module and not name.startswith("_")
-    )
+    names = [name for name, (home, _) in _names(module).items() if home == module]
+    return tuple(name for name in names if not name.startswith("_"))
 
 
-def names_of(room: str) -> dict[str, str]:
-    """A room's public names and the members of its classes → parameters, types, values, as they are
-    written.
+def names_of(module: str) -> dict[str, str]:
+    """Return the parameters, types and values of a module's public names and of the members of its
+    classes, as they are written.
     """
     result: dict[str, str] = {}
-    for name in public_modules()[room]:
-        module, node = _found(room, name)
-        owner = _describing(module, name)
-        if owner != room:
-            result[name] = f"= {owner}.{name}"
+    for name in public_modules()[module]:
+        home, node = _definition(module, name)
+        describing_module = _describing_module(home, name)
+        if describing_module != module:
+            result[name] = f"= {describing_module}.{name}"
         elif isinstance(node, ast.ClassDef):
-            result[name] = f"class{_public_bases(module, node)} {_constructor(module, node)}"
-            result |= {f"{name}.{member}": said for member, said in _members(module, node).items()}
+            result[name] = f"class{_public_bases(home, node)} {_constructor(home, node)}"
+            for member, description in _members(home, node).items():
+                result[f"{name}.{member}"] = description
         else:
-            result[name] = _said(module, node)
+            result[name] = _describe(home, node)
     return result
 
 
 @cache
-def _describing(home: str, name: str) -> str:
-    """Of the rooms that have a name, the one that describes it: the nearest above its module, or
-    the first.
+def _describing_module(home: str, name: str) -> str:
+    """Return the public module that describes a name: the nearest above its home, or the first that
+    has it.
     """
-    rooms = [
-        room
-        for room, names in public_modules().items()
-        if name in names and _found(room, name)[0] == home
+    modules = [
+        module
+        for module, names in public_modules().items()
+        if name in names and _definition(module, name)[0] == home
     ]
-    near = [room for room in rooms if f"{home}.".startswith(f"{room}.") and room != PACKAGE]
-    return max(near, key=len, default=rooms[0])
+    above = [module for module in modules if f"{home}.".startswith(f"{module}.")]
+    nearest = max(above, key=len, default=PACKAGE)
+    return modules[0] if nearest == PACKAGE else nearest
 
 
 # the text of a module
@@ -231,8 +237,8 @@ def _describing(home: str, name: str) -> str:
 
 @cache
 def _path(module: str) -> Path:
-    place = TOP / module.replace(".", "/")
-    return place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+    path = TOP / module.replace(".", "/")
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
 @cache
@@ -249,7 +255,7 @@ def _constants(path: Path) -> dict[str, ast.expr]:
 
 
 def _statements(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
-    """Those of a module or class, and those below an `if` or a `try`."""
+    """Yield the statements of a module or class, and the ones below an `if` or a `try`."""
     for node in body:
         if isinstance(node, ast.If | ast.Try):
             yield from _statements(node.body)
@@ -259,37 +265,37 @@ def _statements(body: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
 
 @cache
 def _names(module: str) -> dict[str, tuple[str, ast.stmt | str]]:
-    """Name → where it comes from: this module and the statement, or another module and the name
-    there.
+    """Return where each name comes from: this module and the statement, or another module and the
+    name there.
     """
-    found: dict[str, tuple[str, ast.stmt | str]] = {}
+    origins: dict[str, tuple[str, ast.stmt | str]] = {}
     for node in _statements(_tree(_path(module)).body):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):  # of overloads the last
-            found[node.name] = (module, node)
+            origins[node.name] = (module, node)
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-                found.setdefault(
-                    ast.unparse(target), (module, node)
-                )  # a function that is wrapped stays itself
+                # a function that is wrapped stays itself
+                origins.setdefault(ast.unparse(target), (module, node))
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
-    return found
+            for alias in node.names:
+                origins[alias.asname or alias.name] = (node.module, alias.name)
+    return origins
 
 
 @cache
-def _found(module: str, name: str) -> tuple[str, ast.stmt]:
-    """The module of the devkit that defines a name of this one, and the statement; raises
+def _definition(module: str, name: str) -> tuple[str, ast.stmt]:
+    """Return the devkit's module that defines a name of this one, and the statement; raises
     AttributeError.
     """
     if name not in _names(module):
         raise AttributeError(f"module {module!r} has no attribute {name!r}")
-    home, there = _names(module)[name]
-    return _found(home, there) if isinstance(there, str) else (home, there)
+    home, origin = _names(module)[name]
+    return _definition(home, origin) if isinstance(origin, str) else (home, origin)
 
 
-def _said(module: str, node: ast.stmt, *, bound: bool = False) -> str:
-    """A function's parameters and result, or a constant's type or value; `bound` leaves the first
-    parameter out.
+def _describe(module: str, node: ast.stmt, *, bound: bool = False) -> str:
+    """Return a function's parameters and result, or a constant's type or value; `bound` leaves the
+    first parameter out.
     """
     if isinstance(node, ast.FunctionDef):
         parameters = _with_values(module, node.args)
@@ -298,59 +304,69 @@ def _said(module: str, node: ast.stmt, *, bound: bool = False) -> str:
         return f"({_text(parameters)}) -> {ast.unparse(node.returns or ast.Name('None'))}"
     if isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) != "Final":
         return f": {ast.unparse(node.annotation)}"
-    value = _text(node.value) if isinstance(node, ast.Assign | ast.AnnAssign) and node.value else ""
     if module.endswith(".version"):
-        return ": str"  # which a release changes
-    return f"= {value}" if len(value) <= LONGEST else f"= {value[:LONGEST]}…"
+        return ": str"  # the value changes with each release
+    value = ""
+    if isinstance(node, ast.Assign | ast.AnnAssign) and node.value:
+        value = _text(node.value)
+    if len(value) > MAX_VALUE_LENGTH:
+        value = f"{value[:MAX_VALUE_LENGTH]}…"
+    return f"= {value}"
 
 
 def _with_values(module: str, parameters: ast.arguments) -> ast.arguments:
-    """A copy in which defaults that are private constants of the module are their values."""
+    """Return a copy in which defaults that are private constants of the module are their values."""
 
     def value(default: ast.expr | None) -> ast.expr | None:
         if isinstance(default, ast.Name) and default.id.startswith("_"):
-            node = _found(module, default.id)[1]
+            _, node = _definition(module, default.id)
             return node.value if isinstance(node, ast.Assign | ast.AnnAssign) else default
         return default
 
-    copied = deepcopy(parameters)
-    copied.defaults = [each for each in map(value, parameters.defaults) if each]
-    copied.kw_defaults = [*map(value, parameters.kw_defaults)]
-    return copied
+    result = deepcopy(parameters)
+    result.defaults = list(filter(None, map(value, parameters.defaults)))
+    result.kw_defaults = list(map(value, parameters.kw_defaults))
+    return result
 
 
 def _bases(module: str, node: ast.ClassDef) -> Iterator[tuple[str, ast.ClassDef]]:
-    """A class, and those of the devkit that it inherits from."""
+    """Yield a class, and the devkit's classes that it inherits from."""
     yield module, node
     for base in node.bases:
-        if found := _of_devkit(module, base):
-            yield from _bases(*found)
+        definition = _devkit_class(module, base)
+        if definition:
+            yield from _bases(*definition)
 
 
-def _of_devkit(module: str, base: ast.expr) -> tuple[str, ast.ClassDef] | None:
-    """The module and the statement of a base; None where it is not the devkit's."""
+def _devkit_class(module: str, base: ast.expr) -> tuple[str, ast.ClassDef] | None:
+    """Return the module and the statement of a base; None if it is not the devkit's."""
     name = ast.unparse(base.value if isinstance(base, ast.Subscript) else base)
-    home, there = _names(module).get(name, ("", ""))
+    home, _ = _names(module).get(name, ("", ""))
     if not home.startswith(PACKAGE):
         return None
-    home, node = _found(home, there) if isinstance(there, str) else (home, there)
+    home, node = _definition(module, name)
     return (home, node) if isinstance(node, ast.ClassDef) else None
 
 
 @cache
 def _is_public(node: ast.ClassDef) -> bool:
-    rooms = public_modules().items()
-    return any(node.name in names and _found(room, node.name)[1] is node for room, names in rooms)
+    for module, names in public_modules().items():
+        if node.name in names and _definition(module, node.name)[1] is node:
+            return True
+    return False
 
 
 def _public_bases(module: str, node: ast.ClassDef) -> str:
-    bases = [(base, _of_devkit(module, base)) for base in node.bases]
-    shown = [ast.unparse(base) for base, found in bases if found is None or _is_public(found[1])]
-    return f"({', '.join(shown)})" if shown else ""
+    bases = []
+    for base in node.bases:
+        definition = _devkit_class(module, base)
+        if definition is None or _is_public(definition[1]):
+            bases.append(ast.unparse(base))
+    return f"({', '.join(bases)})" if bases else ""
 
 
-class _Short(ast.NodeTransformer):
-    """Leaves out what computes a value, which not every Python writes alike."""
+class _OmitComputations(ast.NodeTransformer):
+    """Transformer that leaves out computed values, which not every Python version writes alike."""
 
     def visit(self, node: ast.AST) -> ast.AST:
         computes = isinstance(
@@ -360,7 +376,7 @@ class _Short(ast.NodeTransformer):
 
 
 def _text(node: ast.AST) -> str:
-    return ast.unparse(_Short().visit(deepcopy(node)))
+    return ast.unparse(_OmitComputations().visit(deepcopy(node)))
 
 
 def _decorators(node: ast.FunctionDef | ast.ClassDef) -> str:
@@ -368,20 +384,23 @@ def _decorators(node: ast.FunctionDef | ast.ClassDef) -> str:
 
 
 def _constructor(module: str, node: ast.ClassDef) -> str:
-    """Its parameters: those of `__init__`, or the fields of a record."""
-    bases = [*_bases(module, node)][::-1]
-    record = any(
-        "dataclass" in _decorators(each) or RECORDS.intersection(map(ast.unparse, each.bases))
-        for _, each in bases
-    )
+    """Return a class's parameters: the parameters of `__init__`, or the fields of a record."""
+    classes = list(_bases(module, node))
+    is_record = any(_is_record(base) for _, base in classes)
     fields: dict[str, str] = {}
-    for home, each in bases:
-        for statement in each.body:
+    for home, base in reversed(classes):
+        for statement in base.body:
             if isinstance(statement, ast.FunctionDef) and statement.name == "__init__":
-                fields = {"": _said(home, statement, bound=True).rpartition(" -> ")[0][1:-1]}
-            elif isinstance(statement, ast.AnnAssign) and record and _is_parameter(statement):
+                parameters, _, _ = _describe(home, statement, bound=True).rpartition(" -> ")
+                fields = {"": parameters[1:-1]}
+            elif isinstance(statement, ast.AnnAssign) and is_record and _is_parameter(statement):
                 fields[ast.unparse(statement.target)] = _text(statement)
     return f"({', '.join(fields.values())})"
+
+
+def _is_record(node: ast.ClassDef) -> bool:
+    bases = set(map(ast.unparse, node.bases))
+    return "dataclass" in _decorators(node) or not RECORD_BASES.isdisjoint(bases)
 
 
 def _is_parameter(field: ast.AnnAssign) -> bool:
@@ -390,53 +409,63 @@ def _is_parameter(field: ast.AnnAssign) -> bool:
 
 
 def _members(module: str, node: ast.ClassDef) -> dict[str, str]:
-    """Its public methods, properties and class attributes, with those of its bases that are not
-    public themselves.
+    """Return a class's public methods, properties and attributes, with the members of its bases
+    that are not public themselves.
     """
     result: dict[str, str] = {}
     for base in node.bases:
-        if (found := _of_devkit(module, base)) and not _is_public(found[1]):
-            result |= _members(*found)
+        definition = _devkit_class(module, base)
+        if definition and not _is_public(definition[1]):
+            result |= _members(*definition)
     for statement in _statements(node.body):
-        if isinstance(statement, ast.FunctionDef) and not statement.name.startswith("_"):
-            result[statement.name] = _member(module, statement)
-        elif isinstance(statement, ast.Assign) and not (
-            name := ast.unparse(statement.targets[0])
-        ).startswith("_"):
-            result[name] = _attribute(module, statement)
+        if isinstance(statement, ast.FunctionDef):
+            name = statement.name
+            describe = _describe_method
+        elif isinstance(statement, ast.Assign):
+            name = ast.unparse(statement.targets[0])
+            describe = _describe_attribute
+        else:
+            continue
+        if not name.startswith("_"):
+            result[name] = describe(module, statement)
     return result
 
 
-def _member(module: str, node: ast.FunctionDef) -> str:
-    kinds = _decorators(node)
-    if "property" in kinds:
+def _describe_method(module: str, node: ast.FunctionDef) -> str:
+    decorators = _decorators(node)
+    if "property" in decorators:
         return f": {ast.unparse(node.returns or ast.Name('None'))}"
-    return _said(module, node, bound="staticmethod" not in kinds)
+    return _describe(module, node, bound="staticmethod" not in decorators)
 
 
-def _attribute(module: str, node: ast.Assign) -> str:
-    """That of a class: a value, or a function of another module that is its method."""
+def _describe_attribute(module: str, node: ast.Assign) -> str:
+    """Return the description of a class attribute: a value, or a function of another module that is
+    its method.
+    """
     value = node.value
     if isinstance(value, ast.Attribute) and isinstance(value.value, ast.Name):
         package, name = _names(module).get(value.value.id, ("", ""))
         if isinstance(name, str) and package.startswith(PACKAGE):
-            return _said(*_found(f"{package}.{name}", value.attr), bound=True)
-    return _said(module, node)
+            home, function = _definition(f"{package}.{name}", value.attr)
+            return _describe(home, function, bound=True)
+    return _describe(module, node)
 
 
 # commands
 
 
 def commands(group: click.Group = deepaccident, *path: str) -> dict[str, str]:
-    """Commands → their arguments and options."""
-    context, result = click.Context(group), {}
+    """Return the arguments and options of all commands."""
+    context = click.Context(group)
+    result = {}
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         assert command is not None
+        visible = [
+            parameter for parameter in command.params if not getattr(parameter, "hidden", False)
+        ]
         words = ("deepaccident", *path, name)
-        result[" ".join(words)] = " ".join(
-            _parameter(each) for each in command.params if not getattr(each, "hidden", False)
-        )
+        result[" ".join(words)] = " ".join(map(_parameter, visible))
         if isinstance(command, click.Group):
             result |= commands(command, *path, name)
     return result

@@ -1,9 +1,9 @@
-"""Measure the numbers of the pages again, and write them where they stand: `python
+"""Measure the numbers of the pages again, and write them into the pages: `python
 docs/make_tables.py [NAME…]`.
 
-It runs in a checkout; each NAME takes some minutes, and without a NAME all run. `--release` is a
-release that is taken in place of a new synthetic one, if it was made as the module in
-benchmarks/pages says.
+It runs in a checkout; each NAME takes a few minutes, and without a NAME all of them run.
+`--release` is used instead of a new synthetic release, if it was made as described in the module in
+benchmarks/pages.
 """
 
 import sys
@@ -13,28 +13,29 @@ from pathlib import Path
 import click
 
 TOP = Path(__file__).parents[1]
-NAMES = {
-    "baselines": "what constant velocity foresees, by who cooperates",
+DESCRIPTIONS = {
+    "baselines": "what constant velocity predicts, by set of cooperating agents",
     "benchmark": "the rows that benchmarks/v1 keeps",
-    "facts": "the real release's facts beside a synthetic one, or beside --release",
+    "facts": "the facts of the real release, compared with a synthetic one or with --release",
     "labels": "cells in which label protocols differ",
     "model": "the studies that benchmarks/studies keeps",
     "real": "the real scenario; needs --release",
     "safety": "outputs of the commands on the page",
-    "synth": "what the generator makes; with --release, the real scenario beside it",
-    "warnings": "warning protocols",
+    "synth": "what the generator makes; with --release, the real scenario is measured again",
+    "warnings": "the numbers of warnings in warnings.json",
 }
 
 
 @click.command(help=__doc__)
-@click.argument("names", nargs=-1, metavar=f"[{'|'.join(NAMES)}]…")
+@click.argument("names", nargs=-1, metavar=f"[{'|'.join(DESCRIPTIONS)}]…")
 @click.option("--release", type=click.Path(exists=True, path_type=Path))
 def main(names: tuple[str, ...], release: Path | None) -> None:
-    """Run what is named."""
-    for name in names or [each for each in NAMES if each != "real"]:
-        if name not in NAMES:
-            raise click.BadParameter(f"expected one of {', '.join(NAMES)}, found {name!r}")
-        click.echo(f"{name}: {NAMES[name]}")
+    """Run the named modules."""
+    default_names = [name for name in DESCRIPTIONS if name != "real"]
+    for name in names or default_names:
+        if name not in DESCRIPTIONS:
+            raise click.BadParameter(f"expected one of {', '.join(DESCRIPTIONS)}, found {name!r}")
+        click.echo(f"{name}: {DESCRIPTIONS[name]}")
         import_module(f"benchmarks.pages.{name}").main(release)
 
 

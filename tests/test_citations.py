@@ -1,6 +1,4 @@
-"""Pages that the text cites ship with it: whoever reads of `docs/protocols.md` in a docstring can
-open it.
-"""
+"""Every page that a text cites ships with it: a reader of a docstring can open it."""
 
 import re
 from collections.abc import Iterator
@@ -14,17 +12,17 @@ EXCEPTIONS = {
     "questions/README.md": "the page that `export questions` writes beside its questions",
     "../conventions.md": "as the reference links it, whose pages are made in docs/api",
 }
-"""Names that are cited and not there, each with the reason."""
-_NOT_TEXT = re.compile(r"https?://\S+|\$\w+/")
+"""Name of a page that is cited although it does not exist → reason."""
+_ADDRESS = re.compile(r"https?://\S+|\$\w+/")
 """Addresses of other sites; variables that stand for a folder."""
-_PAGE = re.compile(r"[\w./*<>{}~-]*[\w*>}]\.md\b")
-_SECTION = re.compile(r"\b(docs/\w+\.md),[\s#]+([A-Z][\w'-]*)")
-"""A page and the first word of what follows, which is the section's name if it is a capital one."""
+_PAGE_NAME = re.compile(r"[\w./*<>{}~-]*[\w*>}]\.md\b")
+_SECTION_CITATION = re.compile(r"\b(docs/\w+\.md),[\s#]+([A-Z][\w'-]*)")
+"""A page followed by the first word of a section's name, which begins with a capital letter."""
 
 
 def repository_files() -> list[str]:
-    """Without git, since a copy of the checkout has none."""
-    found = [path for path in TOP.iterdir() if path.is_file()]
+    """List the files without git, since a copy of the checkout may not have it."""
+    paths = [*TOP.iterdir()]
     for folder in (
         "deepaccident_devkit",
         "docs",
@@ -34,35 +32,38 @@ def repository_files() -> list[str]:
         "benchmarks",
         ".ci",
     ):
-        found += [
-            path
-            for path in (TOP / folder).rglob("*")
-            if path.is_file() and not {"__pycache__", "node_modules"} & {*path.parts}
-        ]
+        for path in (TOP / folder).rglob("*"):
+            if {"__pycache__", "node_modules"}.isdisjoint(path.parts):
+                paths.append(path)
     return [
-        path.relative_to(TOP).as_posix() for path in found if path.parent != TOP / "docs" / "api"
+        path.relative_to(TOP).as_posix()
+        for path in paths
+        if path.is_file() and path.parent != TOP / "docs" / "api"
     ]
 
 
-def texts(files: list[str]) -> Iterator[tuple[str, str]]:
-    """The text files that mention any page, with their text."""
+def citing_texts(files: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield the name and text of each text file that mentions a page."""
     for name in files:
         path = TOP / name
         content = path.read_bytes() if path.is_file() else b""
         if b".md" in content and b"\0" not in content:
-            yield name, _NOT_TEXT.sub("", content.decode("utf-8").replace("\\n", "\n"))
+            yield name, _ADDRESS.sub("", content.decode("utf-8").replace("\\n", "\n"))
 
 
 def cited_pages(text: str) -> set[str]:
-    """All that looks like a page's name but patterns of names."""
-    return {page for page in _PAGE.findall(text) if not set(page) & set("*<>{}~")}
+    """Return everything that looks like a page's name, except patterns of names."""
+    names = _PAGE_NAME.findall(text)
+    return {name for name in names if set(name).isdisjoint("*<>{}~")}
 
 
-def ships(page: str, citing: str, files: set[str]) -> bool:
-    """Whether a page is there: seen from the citing file, from the top, from docs/, or as the end
-    of one path alone.
+def ships(page: str, citing_file: str, files: set[str]) -> bool:
+    """Return whether a page exists.
+
+    Its name is relative to the citing file, to the top or to docs/, or is the end of exactly one
+    path.
     """
-    folders = (str(PurePosixPath(citing).parent), ".", "docs")
+    folders = (str(PurePosixPath(citing_file).parent), ".", "docs")
     if any(normpath(f"{folder}/{page}") in files for folder in folders):
         return True
     return sum(f"/{name}".endswith(f"/{page}") for name in files) == 1
@@ -74,43 +75,42 @@ def files() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def citing(files: list[str]) -> dict[str, str]:
-    return dict(texts(files))
+def texts(files: list[str]) -> dict[str, str]:
+    return dict(citing_texts(files))
 
 
-def test_every_page_that_is_cited_ships(files: list[str], citing: dict[str, str]) -> None:
-    there = {*files}
-    missing = {
-        f"{name}: {page}"
-        for name, text in citing.items()
-        for page in cited_pages(text) - EXCEPTIONS.keys()
-        if not ships(page, name, there)
+@pytest.fixture(scope="module")
+def missing_pages(files: list[str], texts: dict[str, str]) -> set[tuple[str, str]]:
+    """Citing file and page, for each page that does not exist."""
+    existing_files = set(files)
+    return {
+        (name, page)
+        for name, text in texts.items()
+        for page in cited_pages(text)
+        if not ships(page, name, existing_files)
     }
-    assert sorted(missing) == []
 
 
-def test_every_section_that_is_cited_is_a_heading(citing: dict[str, str]) -> None:
-    headings = {
-        name: {
-            word
-            for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE)
-            for word in line.split()[:1]
-        }
-        for name, text in citing.items()
-        if name.endswith(".md")
-    }
-    cited = {
+def test_every_page_that_is_cited_ships(missing_pages: set[tuple[str, str]]) -> None:
+    assert sorted(missing for missing in missing_pages if missing[1] not in EXCEPTIONS) == []
+
+
+def test_every_section_that_is_cited_is_a_heading(texts: dict[str, str]) -> None:
+    citations = {
         (name, page, word)
-        for name, text in citing.items()
-        for page, word in _SECTION.findall(text)
+        for name, text in texts.items()
+        for page, word in _SECTION_CITATION.findall(text)
         if page not in EXCEPTIONS
     }
-    assert len(cited) > 20
-    assert sorted(each for each in cited if each[2] not in headings[each[1]]) == []
+    wrong_citations = [
+        (name, page, word)
+        for name, page, word in citations
+        if not re.search(rf"^#+ +{re.escape(word)}(\s|$)", texts[page], re.MULTILINE)
+    ]
+
+    assert len(citations) > 20
+    assert sorted(wrong_citations) == []
 
 
-def test_the_exceptions_are_needed(files: list[str], citing: dict[str, str]) -> None:
-    there = {*files}
-    cited = {(page, name) for name, text in citing.items() for page in cited_pages(text)}
-    needed = {page for page, name in cited if not ships(page, name, there)}
-    assert EXCEPTIONS.keys() - needed == set()
+def test_the_exceptions_are_needed(missing_pages: set[tuple[str, str]]) -> None:
+    assert EXCEPTIONS.keys() - {page for _, page in missing_pages} == set()

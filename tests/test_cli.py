@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tiny import NAME, TYPE, write_tiny_release
-from verbs import called, commands, ran
+from support.command_calls import invoke_command, run_command, walk_commands
+from support.text_contents import missing_parts
+from support.tiny_release import SCENARIO_NAME, SCENARIO_TYPE, write_tiny_release
 
 from deepaccident_devkit import DeepAccident, __version__
 from deepaccident_devkit.cli import deepaccident
@@ -23,47 +24,37 @@ from deepaccident_devkit.selection.splits import official_split
 @pytest.mark.slow
 def test_synth_index_info_end_to_end(tmp_path: Path) -> None:
     out = tmp_path / "my release"
-    made = ran(
-        "synth",
-        out,
-        "--scenarios",
-        2,
-        "--frames",
-        3,
-        "--size",
-        "64x36",
-        "--layout",
-        "B",
-        "--seed",
-        7,
-    )
-    assert "deepaccident info" in made.stdout
-    assert "2 scenarios, 30 samples" in ran("index", out).stdout
-    text = " ".join(ran("info", out).stdout.split())
-    wanted = (
+    size = ("--scenarios", 2, "--frames", 3, "--size", "64x36")
+    process = run_command("synth", out, *size, "--layout", "B", "--seed", 7)
+    assert "deepaccident info" in process.stdout
+    assert "2 scenarios, 30 samples" in run_command("index", out).stdout
+
+    text = " ".join(run_command("info", out).stdout.split())
+    expected = (
         "layout B",
         "train 2 of 483",
         "collision scenarios false 1 true 1",
         "type1_subtype1_accident 1",
         "Camera_Front 10",
     )
-    assert [line for line in wanted if line not in text] == []
-    counts = json.loads(ran("info", out, "--json").stdout)
-    assert (counts["tables"]["sample"], counts["agents"]["infrastructure"]) == (30, 2)
+    assert missing_parts(text, *expected) == []
+
+    counts = json.loads(run_command("info", out, "--json").stdout)
+    assert counts["tables"]["sample"] == 30
+    assert counts["agents"]["infrastructure"] == 2
     assert counts["splits"] == {"train": 2, "val": 0, "test": 0}
     release = DeepAccident(dataroot=out)
     assert release.load_image(release.sample_data[0]).shape == (36, 64, 3)
 
 
 def test_errors_are_one_message_and_status_2(tmp_path: Path) -> None:
-    failed = ran("info", tmp_path / "nowhere", status=2)
-    assert failed.stderr.startswith(
-        f"error: {tmp_path / 'nowhere'}: does not exist; give the folder"
-    )
-    assert failed.stdout == ""
+    root = tmp_path / "nowhere"
+    process = run_command("info", root, status=2)
+    assert process.stderr.startswith(f"error: {root}: does not exist; pass the folder")
+    assert process.stdout == ""
 
 
-FAILING = """
+FAILING_COMMAND = """
 import sys
 from deepaccident_devkit import cli
 from deepaccident_devkit.errors import MissingFileError
@@ -71,179 +62,186 @@ from deepaccident_devkit.errors import MissingFileError
 def fail(command):
     if "memory" in sys.argv:
         raise MemoryError("Unable to allocate 9.9 TiB")
-    told = "Caught MissingFileError in DataLoader worker process 0.\\nOriginal Traceback (most recent call last):"
-    raise MissingFileError(f"{told}\\n  …\\ndeepaccident_devkit.errors.MissingFileError: a.jpg: no such file")
+    head = "Caught MissingFileError in DataLoader worker process 0.\\nOriginal Traceback (most recent call last):"
+    raise MissingFileError(f"{head}\\n  …\\ndeepaccident_devkit.errors.MissingFileError: a.jpg: no such file")
 
 cli.run_interruptibly = fail
 cli.main()
 """  # noqa: E501
 
 
-def test_of_an_error_in_a_loaders_worker_the_message_is_told_alone() -> None:
-    failed = subprocess.run(
-        [sys.executable, "-c", FAILING], check=False, capture_output=True, text=True
-    )
-    assert (failed.returncode, failed.stderr) == (2, "error: a.jpg: no such file\n")
-    failed = subprocess.run(
-        [sys.executable, "-c", FAILING, "memory"], check=False, capture_output=True, text=True
-    )
-    assert (failed.returncode, failed.stderr[:24]) == (2, "error: memory ran out; u")
+def test_an_error_in_a_loader_worker_is_printed_without_its_traceback() -> None:
+    command = [sys.executable, "-c", FAILING_COMMAND]
+    process = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert (process.returncode, process.stderr) == (2, "error: a.jpg: no such file\n")
+
+    command.append("memory")
+    process = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert (process.returncode, process.stderr[:24]) == (2, "error: out of memory; us")
 
 
 @pytest.mark.slow
 def test_a_broken_release_is_listed_and_may_be_skipped(own_release: Path) -> None:
     broken = next(own_release.glob("train/*/ego_vehicle/label/*/*_002.txt"))
     broken.write_text("0 0\ncar 1 2 3 4\n")
-    told = ran("info", own_release, status=2).stderr
-    assert "1 of 6 scenarios are broken" in told
-    assert f"{broken}:2: expected 13 fields, found 5" in told
-    skipped = ran("info", own_release, "--on-error", "skip")
-    assert ("left out as broken:" in skipped.stdout, "WARNING: left out" in skipped.stderr) == (
-        True,
-        True,
-    )
+
+    message = run_command("info", own_release, status=2).stderr
+    assert "errors in 1 of 6 scenarios" in message
+    assert f"{broken}:2: expected 13 fields, found 5" in message
+
+    process = run_command("info", own_release, "--on-error", "skip")
+    assert "excluded as broken:" in process.stdout
+    assert "warning: excluded" in process.stderr
 
 
-OF_FILES = ("--version", "--workers", "--scheduler")
-NOT_OF_ALL = {"validate": OF_FILES, "release": OF_FILES, "scores": ("--version",)}
-NOT_OF_ALL |= dict.fromkeys(("train", "explore", "results", "sensor-setups"), ())
-"""Verb on a release → the options of a release that it has; those that are left out run in one
-process, say.
-"""
+FILE_OPTIONS = ("--version", "--workers", "--scheduler")
+RELEASE_OPTIONS = (*FILE_OPTIONS, "--index-dir", "--on-error")
+REDUCED_OPTIONS = {"validate": FILE_OPTIONS, "release": FILE_OPTIONS, "scores": ("--version",)}
+REDUCED_OPTIONS |= dict.fromkeys(("train", "explore", "results", "sensor-setups"), ())
+"""Verb on a release that does not have all release options → the ones that it has."""
 
 
 @pytest.mark.slow
 def test_all_verbs_have_one_grammar_and_a_help_that_says_everything() -> None:
-    for words, _ in commands(deepaccident):
-        text = called(*words, "--help").output
+    for words, _ in walk_commands(deepaccident):
+        text = invoke_command(*words, "--help").output
         options, _, advanced = text.partition("\nAdvanced:\n")
-        assert not re.search(r"^  (-\w, )?--[\w-]+( [A-Z]+)?$(?!\n {4})", text, re.MULTILINE), (
-            "an option without a help"
-        )
+        option_without_help = r"^  (-\w, )?--[\w-]+( [A-Z]+)?$(?!\n {4})"
+        assert not re.search(option_without_help, text, re.MULTILINE), "an option without a help"
         for name in ("--index-dir", "--scheduler", "--on-error"):
             assert f"  {name} " not in options
         if " DATAROOT" in text.splitlines()[0]:
-            for name in NOT_OF_ALL.get(words[-1], (*OF_FILES, "--index-dir", "--on-error")):
-                assert f"  {name} " in (options if name in OF_FILES[:2] else advanced), words
-    assert len({words[0] for words, _ in commands(deepaccident) if words}) == 19
+            for name in REDUCED_OPTIONS.get(words[-1], RELEASE_OPTIONS):
+                section = options if name in FILE_OPTIONS[:2] else advanced
+                assert f"  {name} " in section, words
+
+    verbs = {words[0] for words, _ in walk_commands(deepaccident) if words}
+    assert len(verbs) == 19
 
 
 def test_versions_for_a_report() -> None:
-    assert called("--version").output == f"deepaccident, version {__version__}\n"
-    lines = [line.split() for line in called("--version", "--all").output.splitlines()]
-    told = {words[0]: words[1:] for words in lines}
-    assert (told["deepaccident"], told["numpy"]) == ([__version__], [np.__version__])
-    assert {"Python", "system", "torch", "mcap"} <= told.keys()
-    assert told.keys().isdisjoint({"ruff", "sphinx", "deepaccident_devkit"})
+    assert invoke_command("--version").output == f"deepaccident, version {__version__}\n"
+    lines = invoke_command("--version", "--all").output.splitlines()
+    versions = {words[0]: words[1:] for words in map(str.split, lines)}
+    assert versions["deepaccident"] == [__version__]
+    assert versions["numpy"] == [np.__version__]
+    assert {"Python", "system", "torch", "mcap"} <= versions.keys()
+    assert versions.keys().isdisjoint({"ruff", "sphinx", "deepaccident_devkit"})
 
 
 @pytest.mark.slow
 def test_index_check_sees_an_edit_that_folder_times_hide(own_release: Path) -> None:
-    ran("index", own_release)
+    run_command("index", own_release)
     label = next(own_release.glob("train/*/ego_vehicle/label/*/*_001.txt"))
     label.write_text("\n".join(label.read_text().splitlines()[:-1]) + "\n")
-    before, after = (
-        json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"]
-        for _ in range(2)
-    )
-    ran("check", "index", own_release)
-    checked = json.loads(ran("info", own_release, "--json").stdout)["tables"]["annotation"]
-    assert (after, checked) == (before, before - 1)
+
+    num_boxes = count_boxes(own_release)
+    assert count_boxes(own_release) == num_boxes
+    run_command("check", "index", own_release)
+    assert count_boxes(own_release) == num_boxes - 1
 
 
-def imported(*words: str) -> set[str]:
-    """The devkit's parts that a command imports, and NumPy."""
+def count_boxes(root: Path) -> int:
+    counts = json.loads(run_command("info", root, "--json").stdout)
+    return int(counts["tables"]["annotation"])
+
+
+def imported_modules(*words: str) -> set[str]:
+    """Return the modules of the devkit that a command imports, and `numpy` if it imports it."""
     code = f"""if True:
         import sys
         from deepaccident_devkit.cli import deepaccident
         deepaccident({words!r}, standalone_mode=False)
         print("IMPORTED", *sys.modules)"""
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
     )
-    names = done.stdout.rpartition("IMPORTED")[2].split()
+    names = process.stdout.rpartition("IMPORTED")[2].split()
     return {
         name.removeprefix("deepaccident_devkit.")
         for name in names
-        if name.startswith("deepaccident_devkit.")
-    } | ({"numpy"} & set(names))
+        if name == "numpy" or name.startswith("deepaccident_devkit.")
+    }
 
 
 @pytest.mark.parametrize(
-    ("words", "others"),
+    ("words", "unneeded_modules"),
     [
         ("info --help", {"evaluation", "render", "export", "safety"}),
         ("evaluate motion --help", {"render", "cli.evaluate_bundles", "export"}),
         ("--help", {"numpy", "cli.options", "deepaccident"}),
     ],
 )
-def test_a_verb_does_not_wait_for_what_others_import(words: str, others: set[str]) -> None:
-    assert imported(*words.split()).isdisjoint(others)
+def test_a_verb_does_not_wait_for_the_imports_of_others(
+    words: str, unneeded_modules: set[str]
+) -> None:
+    assert imported_modules(*words.split()).isdisjoint(unneeded_modules)
 
 
 @pytest.mark.slow
 def test_split_makes_the_official_split_and_writes_it(tmp_path: Path) -> None:
-    root = tmp_path / "release"
+    root, out = tmp_path / "release", tmp_path / "new"
     name = "Town03_type001_subtype0001_scenario000"
     for number in range(14):
         write_tiny_release(root, frames=6, agents=("ego_vehicle",), name=f"{name}{number:02d}")
-    made = ran("split", root, "--out", tmp_path / "new", "--json")
-    assert json.loads(made.stdout)["scenarios"] == {
+
+    process = run_command("split", root, "--out", out, "--json")
+
+    assert json.loads(process.stdout)["scenarios"] == {
         "train": 10,
         "val": 2,
         "test": 2,
         "train_mini": 2,
         "val_mini": 0,
     }
-    assert f"written: {tmp_path / 'new' / 'val_mini.txt'}" in made.stderr
-    by_library = official_split(DeepAccident(dataroot=root)).by_name()
-    assert {
-        path.stem: tuple(read_split_file(path)) for path in (tmp_path / "new").iterdir()
-    } == by_library
-    again = ("split", root, "--out", tmp_path / "new", "--seed", 1)
-    assert "train.txt: is there already" in ran(*again, status=2).stderr
-    ran(*again, "--overwrite")
-    assert tuple(read_split_file(tmp_path / "new" / "train.txt")) != by_library["train"]
+    assert f"wrote {out / 'val_mini.txt'}" in process.stderr
+    split = official_split(DeepAccident(dataroot=root)).by_name()
+    assert {path.stem: tuple(read_split_file(path)) for path in out.iterdir()} == split
+
+    other_seed = ("split", root, "--out", out, "--seed", 1)
+    assert "train.txt: already exists" in run_command(*other_seed, status=2).stderr
+    run_command(*other_seed, "--overwrite")
+    assert tuple(read_split_file(out / "train.txt")) != split["train"]
 
 
 @pytest.mark.slow
 def test_split_saves_a_selection(own_release: Path, tmp_path: Path) -> None:
-    some = ("--where", "collision=true", "--where", "split=train")
-    saved = ran("split", own_release, *some, "--out", tmp_path / "a.txt")
-    found = [
-        scenario["token"]
-        for scenario in DeepAccident(dataroot=own_release).find(collision=True, split="train")
-    ]
-    assert read_split_file(tmp_path / "a.txt") == found
-    assert f"scenarios {len(found)}" in " ".join(saved.stdout.split())
-    ran("split", own_release, "--out", tmp_path / "b.txt")
-    everything = [scenario["token"] for scenario in DeepAccident(dataroot=own_release).scenario]
-    assert read_split_file(tmp_path / "b.txt") == everything
+    selection = ("--where", "collision=true", "--where", "split=train")
+    process = run_command("split", own_release, *selection, "--out", tmp_path / "selected.txt")
+    run_command("split", own_release, "--out", tmp_path / "all.txt")
+
+    release = DeepAccident(dataroot=own_release)
+    selected = [scenario["token"] for scenario in release.find(collision=True, split="train")]
+    assert read_split_file(tmp_path / "selected.txt") == selected
+    assert f"scenarios {len(selected)}" in " ".join(process.stdout.split())
+    all_tokens = [scenario["token"] for scenario in release.scenario]
+    assert read_split_file(tmp_path / "all.txt") == all_tokens
 
 
 @pytest.mark.slow
 def test_info_lists_the_scenarios_of_where(own_release: Path) -> None:
-    wanted = ("info", own_release, "--where", "designed_accident=true")
-    some = json.loads(ran(*wanted, "--json").stdout)
-    assert [each["designed_accident"] for each in some] == [True] * 3
-    count, *lines = ran(*wanted).stdout.splitlines()
-    assert (count, [line.split()[0] for line in lines]) == (
-        "3 of 6 scenarios match",
-        [each["token"] for each in some],
-    )
-    none = ran("info", own_release, "--where", "length=1..2").stdout
+    command = ("info", own_release, "--where", "designed_accident=true")
+    scenarios = json.loads(run_command(*command, "--json").stdout)
+    assert [scenario["designed_accident"] for scenario in scenarios] == [True] * 3
+
+    count, *lines = run_command(*command).stdout.splitlines()
+    assert count == "3 of 6 scenarios match"
+    assert [line.split()[0] for line in lines] == [scenario["token"] for scenario in scenarios]
+
+    message = run_command("info", own_release, "--where", "length=1..2").stdout
     assert (
-        none == "no scenario matches length=1..2; deepaccident info --fields lists "
-        "what can be asked for\n"
+        message == "no scenario matches length=1..2; deepaccident info --fields lists "
+        "the possible filters\n"
     )
 
 
 @pytest.mark.slow
 def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "stats"
-    made = ran(
+    process = run_command(
         "info", own_release, "--statistics", "--where", "designed_accident=true", "--out", out
     )
+
     names = {path.name for path in out.iterdir()}
     assert {
         "statistics.json",
@@ -252,87 +250,94 @@ def test_stats_prints_and_writes_tables_and_figures(own_release: Path, tmp_path:
         "scenarios.png",
         "collisions.png",
     } <= names
-    told = ("selected: 3 of 6 scenarios", f"written: {len(names)} files in {out}")
-    assert ([each for each in told if each not in made.stdout], [*out.glob("*.tmp")]) == ([], [])
-    content = json.loads(ran("info", own_release, "--statistics", "--json").stdout)
-    of_some = json.loads((out / "statistics.json").read_text())["scenarios"]["total"]
-    assert (content["scenarios"]["total"], of_some, content["selected"]) == (6, 3, False)
-    assert content["counts"]["collisions"]["counts"]["yes"]["total"] == 3
+    assert "selected: 3 of 6 scenarios" in process.stdout
+    assert f"wrote {len(names)} files to {out}" in process.stdout
+    assert [*out.glob("*.tmp")] == []
+    selected = json.loads((out / "statistics.json").read_text())
+    assert selected["scenarios"]["total"] == 3
+
+    statistics = json.loads(run_command("info", own_release, "--statistics", "--json").stdout)
+    assert statistics["scenarios"]["total"] == 6
+    assert statistics["selected"] is False
+    assert statistics["counts"]["collisions"]["counts"]["yes"]["total"] == 3
 
 
 @pytest.mark.slow
 def test_labels_writes_a_split_and_goes_on_where_it_stopped(
     own_release: Path, tmp_path: Path
 ) -> None:
-    out, agents = tmp_path / "new" / "labels", ("ego_vehicle", "infrastructure")
-    verb = ("labels", own_release, "--split", "train", "--out", out, "--workers", 2)
+    out = tmp_path / "new" / "labels"
+    agents = ("ego_vehicle", "infrastructure")
+    command = ("labels", own_release, "--split", "train", "--out", out, "--workers", 2)
     switches = ("--switch", "half_cell_shift=no", "--switch", "own_box_default=no")
-    made = ran(*verb, "--agents", ",".join(agents), *switches)
+
+    process = run_command(*command, "--agents", ",".join(agents), *switches)
+
     scenarios = DeepAccident(dataroot=own_release).split_scenarios("train")
-    whole = (
-        f"{8 * len(scenarios)} samples in {out}: {2 * len(scenarios)} files "
-        f"written, 0 were there already\n"
+    num_samples, num_files = 8 * len(scenarios), 2 * len(scenarios)
+    assert process.stdout == (
+        f"wrote {out}: {num_samples} samples ({num_files} new files, 0 already there)\n"
     )
-    assert (made.stdout, "motion labels: 100%" in made.stderr) == (whole, True)
+    assert "Writing motion labels: 100%" in process.stderr
     rules = replace(LABEL_PROTOCOLS["released"], half_cell_shift=False, own_box_default=False)
     files = LabelFiles(out, MotionLabelConfig(protocol=rules))
     assert {token.rsplit("/", 1)[0] for token in files} == {
-        f"{one}/{agent}" for one in scenarios for agent in agents
+        f"{scenario}/{agent}" for scenario in scenarios for agent in agents
     }
-    kept = ran(*verb, "--agents", "infrastructure", *switches)
-    assert f"0 files written, {len(scenarios)} were there already" in kept.stdout
-    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    other = ran(*verb, "--protocol", "clean", status=2)
-    assert other.stderr.startswith(f"error: {out}: holds labels of another configuration (")
-    assert ("drawn_when: 'present', asked for 'since'" in other.stderr, other.stdout) == (True, "")
-    named = ran(*verb, "--agents", "infrastructure", "--names", "fiery", status=2)
-    assert "names: None, asked for 'fiery'" in named.stderr
-    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+    process = run_command(*command, "--agents", "infrastructure", *switches)
+    assert f"0 new files, {len(scenarios)} already there" in process.stdout
+
+    contents = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    process = run_command(*command, "--protocol", "clean", status=2)
+    assert process.stderr.startswith(f"error: {out}: contains labels with other settings (")
+    assert "drawn_when: 'present', asked for 'since'" in process.stderr
+    assert process.stdout == ""
+    process = run_command(*command, "--agents", "infrastructure", "--names", "fiery", status=2)
+    assert "names: None, asked for 'fiery'" in process.stderr
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == contents
 
 
 @pytest.mark.slow
 def test_labels_writes_batches_by_their_names(own_release: Path, tmp_path: Path) -> None:
-    verb = (
-        "labels",
-        own_release,
-        "--split",
-        "train",
-        "--out",
-        tmp_path / "batches",
-        "--names",
-        "fiery",
-    )
-    ran(*verb, "--preset", "fiery", "--samples", "all", "--agents", "infrastructure")
+    out = tmp_path / "batches"
+    selection = ("--split", "train", "--samples", "all", "--agents", "infrastructure")
+    names = ("--names", "fiery", "--preset", "fiery")
+    run_command("labels", own_release, *selection, "--out", out, *names)
+
     release = DeepAccident(dataroot=own_release)
     token = release.samples("train", "all")[-1]
-    with np.load(tmp_path / "batches" / f"{token}.npz", allow_pickle=False) as file:
-        for name, array in release.motion_labels(token, "fiery").as_batch("fiery").items():
+    batch = release.motion_labels(token, "fiery").as_batch("fiery")
+    with np.load(out / f"{token}.npz", allow_pickle=False) as file:
+        for name, array in batch.items():
             np.testing.assert_array_equal(file[name], array)
 
 
 def test_labels_looks_at_its_folder_before_it_indexes(own_release: Path) -> None:
-    result = CliRunner().invoke(
-        deepaccident, ["labels", *map(str, (own_release, "--split", "train", "--out", own_release))]
+    words = ["labels", str(own_release), "--split", "train", "--out", str(own_release)]
+    result = CliRunner().invoke(deepaccident, words)
+    assert "is not empty and contains no motion labels; choose a new folder" in str(
+        result.exception
     )
-    assert "is not empty and holds no motion labels; choose a new folder" in str(result.exception)
     assert not (own_release / ".deepaccident").exists()
 
 
 @pytest.mark.slow
-def test_labels_of_what_has_none(tmp_path: Path) -> None:
+def test_labels_are_refused_for_samples_without_them(tmp_path: Path) -> None:
     write_tiny_release(tmp_path / "test", labelled=False)
     write_tiny_release(tmp_path / "partial", agents=("ego_vehicle",))
-    (tmp_path / "mine.txt").write_text(f"{TYPE} {NAME}\n")
+    (tmp_path / "mine.txt").write_text(f"{SCENARIO_TYPE} {SCENARIO_NAME}\n")
     options = ("--split", tmp_path / "mine.txt", "--out", tmp_path / "labels")
-    for root, more, told in (
-        ("test", (), "none of its samples here has labels"),
+    for name, more_options, message in (
+        ("test", (), "no sample of this split has labels"),
         (
             "partial",
             ("--agents", "infrastructure"),
-            "has no labelled samples of infrastructure for --samples",
+            "has no labelled samples of infrastructure with --samples",
         ),
         ("partial", ("--seen-by", "+other"), "agents: other_vehicle is not in this release"),
     ):
-        assert told in ran("labels", tmp_path / root, *options, *more, status=2).stderr
+        command = ("labels", tmp_path / name, *options, *more_options)
+        assert message in run_command(*command, status=2).stderr
     assert not (tmp_path / "labels").exists()
-    ran("labels", tmp_path / "partial", *options, "--seen-by", "single")
+    run_command("labels", tmp_path / "partial", *options, "--seen-by", "single")

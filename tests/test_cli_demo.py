@@ -1,6 +1,4 @@
-"""`deepaccident demo`: what it makes, where it refuses to, and whether its reader can see the crash
-coming.
-"""
+"""`deepaccident demo`: what it makes, when it refuses, and whether the crash can be foreseen."""
 
 import importlib
 import json
@@ -13,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import assert_refused
-from report_page import page_of
-from verbs import called
+from support.command_calls import invoke_command
+from support.expected_errors import assert_raises
+from support.report_page import read_report
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
@@ -25,29 +23,32 @@ demo: Any = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
 
 
 def run(*words: str) -> str:
-    result = called(*words)
-    assert result.stderr == "" or words[0] != "demo"  # no bar where nobody sees it
+    result = invoke_command(*words)
+    assert result.stderr == "" or words[0] != "demo"  # no progress bar without a terminal
     return result.output
 
 
-def times(folder: Path) -> dict[Path, int]:
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+def modification_times(folder: Path) -> dict[Path, int]:
+    paths = [path for path in folder.rglob("*") if path.is_file()]
+    return {path: path.stat().st_mtime_ns for path in paths}
 
 
 @pytest.mark.slow
 def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
     out, _ = made_demo
-    page = page_of(out / "index.html")
-    pictures, links = (
-        [str(each[key]) for each in page.all(tag)] for tag, key in (("img", "src"), ("a", "href"))
-    )
+    page = read_report(out / "index.html")
+    pictures = [str(image["src"]) for image in page.all("img")]
+    links = [str(link["href"]) for link in page.all("a")]
+    own_links = {link for link in links if link.startswith("#")}
+
     assert sorted(pictures) == sorted(path.name for path in out.glob("*.png"))
     assert len(pictures) == 4 + (find_spec("torch") is not None)
     assert [name for name in pictures if (out / name).stat().st_size <= 20_000] == []
-    assert [each["src"] for each in page.all("iframe")] == ["replay.html", "evaluation/report.html"]
-    assert [link for link in links if not link.startswith("#") and not (out / link).is_file()] == []
-    assert {link[1:] for link in links if link.startswith("#")} == {
-        each.get("id") for each in page.all("section")
+    frames = [frame["src"] for frame in page.all("iframe")]
+    assert frames == ["replay.html", "evaluation/report.html"]
+    assert [link for link in links if link not in own_links and not (out / link).is_file()] == []
+    assert {link[1:] for link in own_links} == {
+        section.get("id") for section in page.all("section")
     }
     ((single, five),) = re.findall(
         r"single vehiclefive agents\s*IoU \(%\)(\d+\.\d)(\d+\.\d)", page.text
@@ -59,55 +60,58 @@ def test_the_page_shows_all_that_was_made(made_demo: tuple[Path, str]) -> None:
 def test_the_next_steps_run_as_they_are_printed(
     made_demo: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    served: list[object] = []
+    served_pages: list[object] = []
     monkeypatch.setattr(
         "deepaccident_devkit.plugins.explore.serving.serve",
-        lambda _, **how: served.append(how["page"]),
+        lambda _, **options: served_pages.append(options["page"]),
     )
-    out, printed = made_demo
-    assert printed.rstrip().endswith(str(out / "index.html"))
-    steps = re.findall(r"^(\d of 7: \w+), which takes some \d+ s$", printed, re.MULTILINE)
-    assert steps[::3] == ["1 of 7: recording", "4 of 7: model", "7 of 7: replay"]
-    assert ("\r" in printed, "  100 % recorded\n2 of 7: " in printed) == (False, True)
-    commands = re.findall(r"^ +deepaccident (.+)$", printed, re.MULTILINE)
+    out, output = made_demo
+    assert f"Open {out / 'index.html'} in a browser" in output.splitlines()[-1]
+    steps = re.findall(r"^\[(\d/7)\] (\w+) [\w ]+ \(about \d+ s\)$", output, re.MULTILINE)
+    assert steps[::3] == [("1/7", "Recording"), ("4/7", "Predicting"), ("7/7", "Writing")]
+    assert "\r" not in output
+    assert "  100 % recorded\n[2/7] " in output
+    commands = re.findall(r"^ +deepaccident (.+)$", output, re.MULTILINE)
     assert len(commands) == 6
-    page = page_of(out / "index.html").text
+    page = read_report(out / "index.html").text
     for command in commands:
         assert f"deepaccident {command}" in page
         for part in command.split(" && deepaccident "):
             run(*shlex.split(part))
-    # the table, the report and the fifth step are of the same samples
+    # the table, the report and the fifth step evaluate the same samples
     ((single, five),) = re.findall(r"\bAPA(\d\.\d{3})(\d\.\d{3})", page)
     for bundle, apa in (("evaluation/single_vehicle", single), ("five_agents/evaluation", five)):
         summary = json.loads((out / bundle / "metrics_summary.json").read_bytes())
         assert f"{summary['metrics']['apa']:.3f}" == apa
-    assert served == ["model/single_vehicle/"]  # with its verdicts
+    assert served_pages == ["model/single_vehicle/"]  # with its verdicts
 
 
 @pytest.mark.slow
 def test_another_demo_keeps_the_release_and_the_readers_files(made_demo: tuple[Path, str]) -> None:
     out, _ = made_demo
     (out / "notes.txt").write_text("mine")
-    before = times(out)
+    before = modification_times(out)
+
     (out / "replay.html").unlink()
     run("demo", str(out))
-    after = times(out)
-    kept = {path.relative_to(out).parts[0] for path in before if before[path] == after[path]}
-    assert {"release", "accident.yaml", "notes.txt"} <= kept
-    assert kept.isdisjoint({"index.html", "countdown.png", "single_vehicle.json"})
+
+    after = modification_times(out)
+    unchanged = {path.relative_to(out).parts[0] for path in before if before[path] == after[path]}
+    assert {"release", "accident.yaml", "notes.txt"} <= unchanged
+    assert unchanged.isdisjoint({"index.html", "countdown.png", "single_vehicle.json"})
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "index.html", "release", ".deepaccident_demo"])
 def test_a_folder_of_somebody_else_is_refused(name: str, tmp_path: Path) -> None:
-    """The last one is of a demo of another version, whose page would not fit."""
+    """The last file comes from a demo of another version; its page would not fit."""
     (tmp_path / name).write_text("0.0.1\n")
-    another = ("was not made by the demo of version ", " deepaccident demo OTHER_FOLDER")
-    assert_refused(
-        (lambda: run("demo", str(tmp_path)), ConfigError, another),
+    message = ("was not made by the demo of version ", " deepaccident demo OTHER_FOLDER")
+    assert_raises(
+        (lambda: run("demo", str(tmp_path)), ConfigError, message),
         (
             lambda: run("demo", str(tmp_path / name)),
             ConfigError,
-            (f"{name}: exists, and was not made",),
+            (f"{name}: already exists, and was not made",),
         ),
     )
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "0.0.1\n")]
@@ -125,19 +129,17 @@ def test_ego_sees_the_crash_coming_and_five_agents_see_it_earlier(tmp_path: Path
     def in_view(tenths: int) -> bool:
         boxes = da.boxes(da.get_sample(accident, "ego_vehicle", frame=40 - tenths), "ego")
         (other,) = boxes.select(boxes.actor_id == collider)
-        # of 35 degrees to each side
-        return (
-            bool(other.camera_visible)
-            and abs(np.degrees(np.arctan2(other.center[1], other.center[0]))) < 30
-        )
+        bearing = np.degrees(np.arctan2(other.center[1], other.center[0]))
+        # the front camera sees 35 degrees to each side
+        return bool(other.camera_visible) and abs(bearing) < 30
 
     assert all(map(in_view, range(1, 21)))
     assert not any(map(in_view, range(27, 36)))
+
     heading, *lines = demo.demo_table(da)
     single, five = (dict(zip(heading[1:], map(float, line[1:]), strict=True)) for line in lines)
-    assert (
-        0.5 < single["recall"] < five["recall"] == 1
-    )  # what alone is seen late is missed in the first samples
+    # the single vehicle sees the collider late, and misses the accident in the first samples
+    assert 0.5 < single["recall"] < five["recall"] == 1
     assert five["IoU (%)"] > single["IoU (%)"] + 10
     assert [name for name in ("VPQ (%)", "APA", "mAP (%)") if five[name] <= single[name]] == []
     assert single["precision"] == five["precision"] == 1

@@ -10,41 +10,38 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
-from processes import catches, is_running, wait_for, workers_of, works
-from verbs import called
+from support.command_calls import invoke_command
+from support.linux_processes import catches, is_running, wait_for, worker_processes, works
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.support.files import temporary_of
 
-LINE = "interrupted; no file is half-written, and the same command can be run again"
-KILLED = "error: a worker process was killed ("
-SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143}
-LONGEST = 120.0
-"""Seconds until a verb has ended, however much else the machine does: what hangs ends here."""
-MOMENTS = 6
+INTERRUPTED_MESSAGE = "interrupted; no file is half-written, and the same command can be run again"
+KILLED_MESSAGE = "error: a worker process was killed ("
+STATUS_BY_SIGNAL = {signal.SIGINT: 130, signal.SIGTERM: 143}
+TIMEOUT_S = 120.0
+"""A verb that has not ended by then hangs, however busy the machine is."""
+NUM_MOMENTS = 6
 Process = subprocess.Popen[str]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 @contextmanager
-def started(*words: object) -> Iterator[Process]:
-    """A verb in a process group of its own, as a shell makes it, with its handlers in place."""
+def start_verb(*words: object) -> Iterator[Process]:
+    """Start a verb in its own process group, as a shell does, and wait for its signal handlers."""
     command = [sys.executable, "-m", "deepaccident_devkit.cli", *map(str, words)]
-    how: dict[str, Any] = {
-        "stdout": subprocess.PIPE,
-        "stderr": subprocess.PIPE,
-        "text": True,
-        "env": ENVIRONMENT,
-    }
-    # as in a terminal: a runner in the background ignores Ctrl-C, and so would its children
-    how |= {
-        "start_new_session": True,
-        "preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    }
-    with subprocess.Popen(command, **how) as process:
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+        start_new_session=True,
+        # as in a terminal: a runner in the background ignores Ctrl-C, and so would its children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509
+    ) as process:
         wait_for(lambda: process.poll() is not None or catches(process.pid, signal.SIGTERM))
         try:
             yield process
@@ -53,24 +50,23 @@ def started(*words: object) -> Iterator[Process]:
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-def lines_of(process: Process) -> list[str]:
-    """What a verb says on stderr until it ends, without the states of progress bars."""
-    _, said = process.communicate(timeout=LONGEST)
-    return [
-        line for line in said.replace("\r", "\n").splitlines() if line.strip() and "%|" not in line
-    ]
+def read_messages(process: Process) -> list[str]:
+    """Return the lines of a verb's stderr until it ends, without progress bars."""
+    _, errors = process.communicate(timeout=TIMEOUT_S)
+    lines = errors.replace("\r", "\n").splitlines()
+    return [line for line in lines if line.strip() and "%|" not in line]
 
 
-def stopped(process: Process, number: signal.Signals) -> list[str]:
-    """The lines of a verb to whose whole group a signal is sent; no process is left."""
-    own = workers_of(process.pid)
+def stop_verb(process: Process, number: signal.Signals) -> list[str]:
+    """Send a signal to a verb's whole group, wait for its end, and return its messages."""
+    workers = worker_processes(process.pid)
     os.killpg(process.pid, number)
-    lines = lines_of(process)
-    wait_for(lambda: not any(map(is_running, own)))
-    return lines
+    messages = read_messages(process)
+    wait_for(lambda: not any(map(is_running, workers)))
+    return messages
 
 
-def leftovers(folder: Path) -> list[str]:
+def temporary_files(folder: Path) -> list[str]:
     return [
         path.name
         for path in folder.rglob(".*")
@@ -80,24 +76,15 @@ def leftovers(folder: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def results(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The accidents that the baseline foresees in `da_motion`."""
+    """The accidents that the baseline predicts in `da_motion`."""
     out = tmp_path_factory.mktemp("results")
-    words = (
-        "predict",
-        "constant_velocity",
-        da_motion.dataroot,
-        "--task",
-        "accident",
-        *IN_TRAIN,
-        "--out",
-        out,
-    )
-    called(*words, "--workers", 1)
+    command = ("predict", "constant_velocity", da_motion.dataroot, "--task", "accident")
+    invoke_command(*command, *TRAIN_SPLIT, "--out", out, "--workers", 1)
     return out / "accident.json"
 
 
-IN_TRAIN = ("--split", "train", "--scope", "all")
-WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
+TRAIN_SPLIT = ("--split", "train", "--scope", "all")
+VERBS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
     "index": lambda root, out, _: ("index", root, "--index-dir", out),
     "info": lambda root, out, _: ("info", root, "--index-dir", out),
     "stats": lambda root, out, _: (
@@ -131,20 +118,25 @@ WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
         "64x36",
     ),
     "demo": lambda _, out, __: ("demo", out / "demo"),
-    "predict": lambda root, out, _: ("predict", "constant_velocity", root, *IN_TRAIN, "--out", out),
+    "predict": lambda root, out, _: (
+        "predict",
+        "constant_velocity",
+        root,
+        *TRAIN_SPLIT,
+        "--out",
+        out,
+    ),
     "evaluate": lambda root, out, results: (
-        *(
-            "evaluate",
-            "accident",
-            root,
-            *IN_TRAIN,
-            "--results",
-            results,
-            "--protocol",
-            "boxes",
-            "--out",
-            out / "run",
-        ),
+        "evaluate",
+        "accident",
+        root,
+        *TRAIN_SPLIT,
+        "--results",
+        results,
+        "--protocol",
+        "boxes",
+        "--out",
+        out / "run",
     ),
     "export": lambda root, out, _: (
         "export",
@@ -164,30 +156,32 @@ WORDS: dict[str, Callable[[Path, Path, Path], tuple[object, ...]]] = {
         out / "video.gif",
     ),
 }
-"""Verb with workers → its words, for a release, a folder to write into and a results file."""
+"""Verb with workers → its words, for a release, an output folder and a results file."""
 
 
-@pytest.fixture(params=WORDS)
+@pytest.fixture(params=VERBS)
 def words(
     request: pytest.FixtureRequest, da_motion: DeepAccident, results: Path, tmp_path: Path
 ) -> tuple[object, ...]:
-    return (*WORDS[request.param](da_motion.dataroot, tmp_path, results), "--workers", 2)
+    return (*VERBS[request.param](da_motion.dataroot, tmp_path, results), "--workers", 2)
 
 
-@pytest.mark.parametrize(("number", "status"), SIGNALS.items())
+@pytest.mark.parametrize(("number", "status"), STATUS_BY_SIGNAL.items())
 def test_a_signal_ends_a_verb_with_one_line(
     number: signal.Signals, status: int, tmp_path: Path
 ) -> None:
-    with started("synth", tmp_path / "out", "--sensors", "none") as process:
-        assert (stopped(process, number), process.returncode) == ([LINE], status)
-    assert not leftovers(tmp_path)
+    with start_verb("synth", tmp_path / "out", "--sensors", "none") as process:
+        assert stop_verb(process, number) == [INTERRUPTED_MESSAGE]
+    assert process.returncode == status
+    assert not temporary_files(tmp_path)
 
 
 @pytest.mark.slow
 def test_a_signal_ends_the_workers_of_every_verb(words: tuple[object, ...], tmp_path: Path) -> None:
-    with started(*words) as process:
-        wait_for(lambda: any(map(works, workers_of(process.pid))))
-        assert (stopped(process, signal.SIGTERM), process.returncode) == ([LINE], 143)
+    with start_verb(*words) as process:
+        wait_for(lambda: any(map(works, worker_processes(process.pid))))
+        assert stop_verb(process, signal.SIGTERM) == [INTERRUPTED_MESSAGE]
+    assert process.returncode == 143
 
 
 @pytest.mark.slow
@@ -195,50 +189,50 @@ def test_a_signal_ends_the_workers_of_every_verb(words: tuple[object, ...], tmp_
 def test_a_killed_worker_is_named(
     verb: str, da_motion: DeepAccident, results: Path, tmp_path: Path
 ) -> None:
-    with started(*WORDS[verb](da_motion.dataroot, tmp_path, results), "--workers", 2) as process:
-        wait_for(lambda: len(workers_of(process.pid)) == 2)
-        os.kill(workers_of(process.pid)[0], signal.SIGKILL)
-        lines = lines_of(process)
-    assert (process.returncode, [line.startswith(KILLED) for line in lines]) == (2, [True]), lines
-    assert not [name for name in leftovers(tmp_path) if temporary_of(name)]
+    with start_verb(*VERBS[verb](da_motion.dataroot, tmp_path, results), "--workers", 2) as process:
+        wait_for(lambda: len(worker_processes(process.pid)) == 2)
+        os.kill(worker_processes(process.pid)[0], signal.SIGKILL)
+        messages = read_messages(process)
+    assert process.returncode == 2
+    assert [message.startswith(KILLED_MESSAGE) for message in messages] == [True], messages
+    assert not [name for name in temporary_files(tmp_path) if temporary_of(name)]
 
 
 @pytest.mark.slow
-def test_mcap(da: DeepAccident, tmp_path: Path) -> None:
-    words = ("export", "mcap", da.dataroot, "--out", tmp_path / "story.mcap")
-    with started(*words) as process:
-        wait_for(lambda: leftovers(tmp_path))  # it is being written
-        assert (stopped(process, signal.SIGINT), process.returncode) == ([LINE], 130)
+def test_an_interrupted_mcap_export_leaves_no_file(da: DeepAccident, tmp_path: Path) -> None:
+    with start_verb("export", "mcap", da.dataroot, "--out", tmp_path / "story.mcap") as process:
+        wait_for(lambda: temporary_files(tmp_path))  # the verb is writing
+        assert stop_verb(process, signal.SIGINT) == [INTERRUPTED_MESSAGE]
+    assert process.returncode == 130
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 def test_a_signal_at_any_moment(release_root_b: Path, tmp_path: Path) -> None:
-    """From the first to the last: libraries are imported, workers start, files are written, Python
-    ends.
-    """
+    """Between the start and the end, libraries are imported, workers start, files are written."""
     source = shutil.copytree(
         release_root_b, tmp_path / "release", ignore=shutil.ignore_patterns(".deepaccident")
     )
     words = ("index", source, "--workers", 2, "--index-dir")
-    with started(*words, tmp_path / "whole") as process:
+    with start_verb(*words, tmp_path / "undisturbed") as process:
         begin = time.monotonic()
-        assert lines_of(process) == []
-        whole = time.monotonic() - begin
-    for moment in range(MOMENTS):
+        assert read_messages(process) == []
+        duration = time.monotonic() - begin
+
+    for moment in range(NUM_MOMENTS):
         out = tmp_path / str(moment)
-        with started(*words, out) as process:
-            time.sleep(whole * moment / (MOMENTS - 1))
-            ended = (stopped(process, signal.SIGTERM), process.returncode)
-        assert ended in [([LINE], 143), ([], 0)], moment  # at the end there is nothing to stop
-        with started(
-            "check", *words, out
-        ) as process:  # removes locks that were left at the very end, too
-            assert lines_of(process) == []
-        assert files(out) == files(tmp_path / "whole")
+        with start_verb(*words, out) as process:
+            time.sleep(duration * moment / (NUM_MOMENTS - 1))
+            ending = (stop_verb(process, signal.SIGTERM), process.returncode)
+        # at the end there is nothing to stop
+        assert ending in [([INTERRUPTED_MESSAGE], 143), ([], 0)], moment
+        # the check also removes locks that were left at the very end
+        with start_verb("check", *words, out) as process:
+            assert read_messages(process) == []
+        assert read_files(out) == read_files(tmp_path / "undisturbed")
 
 
-def files(folder: Path) -> dict[str, bytes]:
+def read_files(folder: Path) -> dict[str, bytes]:
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in folder.rglob("*")
@@ -246,7 +240,7 @@ def files(folder: Path) -> dict[str, bytes]:
     }
 
 
-IN_A_LIBRARY = """
+SCRIPT_WITH_LIBRARY = """
     import os, sys, time
     from deepaccident_devkit.cli.process import run_interruptibly
 
@@ -261,8 +255,8 @@ IN_A_LIBRARY = """
 """
 
 
-def scripted(script: str) -> Process:
-    """A process that runs a script."""
+def start_script(script: str) -> Process:
+    """Start a process that runs a script."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT
@@ -271,35 +265,35 @@ def scripted(script: str) -> Process:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("then", ["time.sleep(600)", "raise ImportError('numpy')", "pass"])
-def test_a_library_that_takes_the_exception(then: str) -> None:
-    with scripted(IN_A_LIBRARY.format(then=then)) as process:
+def test_a_signal_ends_a_verb_although_a_library_catches_the_exception(then: str) -> None:
+    with start_script(SCRIPT_WITH_LIBRARY.format(then=then)) as process:
         assert process.stdout is not None
         process.stdout.readline()
         process.terminate()
-        said = process.communicate(timeout=LONGEST)[1]
-    assert (said.splitlines(), process.returncode) == ([LINE], 143)
+        _, errors = process.communicate(timeout=TIMEOUT_S)
+    assert errors.splitlines() == [INTERRUPTED_MESSAGE]
+    assert process.returncode == 143
 
 
 @pytest.mark.slow
 def test_a_second_signal_ends_at_once() -> None:
-    """Not only when the first one's time is over."""
-    with scripted(
-        IN_A_LIBRARY.format(then="print('tidying', flush=True); time.sleep(600)")
-    ) as process:
+    """The second signal does not wait for the grace period of the first."""
+    script = SCRIPT_WITH_LIBRARY.format(then="print('tidying', flush=True); time.sleep(600)")
+    with start_script(script) as process:
         assert process.stdout is not None
         for _ in range(2):
             process.stdout.readline()
             process.terminate()
-        process.wait(timeout=LONGEST)
+        process.wait(timeout=TIMEOUT_S)
     assert process.returncode == 143
 
 
-ENDS = {
+ENDINGS = {
     """
     import signal
     from deepaccident_devkit.cli.process import run_interruptibly
 
-    def verb():  # a signal such as that of a terminal whose size changes ends nothing
+    def verb():  # other signals, such as a change of the terminal's size, end nothing
         signal.signal(signal.SIGUSR1, lambda *_: None)
         signal.raise_signal(signal.SIGUSR1)
         print("whole")
@@ -310,7 +304,7 @@ ENDS = {
     import atexit, os
     from deepaccident_devkit.cli.process import run_interruptibly
 
-    # the verb has done its work: this runs last of what is to run at the end
+    # the verb has done its work: this runs when Python ends
     atexit.register(lambda: (os.kill(os.getpid(), {number}), print("went on")))
     run_interruptibly(lambda: print("whole"))
     """: ("whole\nwent on\n", [], 0),
@@ -318,7 +312,7 @@ ENDS = {
     import os, time
     from deepaccident_devkit.cli.process import run_interruptibly
 
-    class Last:  # Python ignores what a `__del__` raises, and would say so
+    class Last:  # Python ignores errors in `__del__`, and would print them
         def __del__(self):
             os.kill(os.getpid(), {number})
             time.sleep(0.01)
@@ -331,23 +325,21 @@ ENDS = {
             print("tidied up", flush=True)
 
     run_interruptibly(verb)
-    """: ("tidied up\n", [LINE], None),
+    """: ("tidied up\n", [INTERRUPTED_MESSAGE], None),
 }
-"""A script that gets a signal, by what it is sent amid → what it prints, what it says, its status.
-"""
+"""Script that gets a signal → its output, its messages, and its status; None for the usual one."""
 
 
-@pytest.mark.parametrize(("number", "status"), SIGNALS.items())
+@pytest.mark.parametrize(("number", "status"), STATUS_BY_SIGNAL.items())
 @pytest.mark.parametrize(
-    ("script", "ends"), ENDS.items(), ids=["another signal", "Python's end", "in between"]
+    ("script", "ending"), ENDINGS.items(), ids=["another signal", "Python's end", "in between"]
 )
-def test_a_signal_amid(
-    number: signal.Signals, status: int, script: str, ends: tuple[Any, ...]
+def test_a_signal_at_an_awkward_moment(
+    number: signal.Signals, status: int, script: str, ending: tuple[str, list[str], int | None]
 ) -> None:
-    with scripted(script.format(number=int(number))) as process:
-        printed, said = process.communicate(timeout=LONGEST)
-    *told, usual = ends
-    assert (printed, said.splitlines(), process.returncode) == (
-        *told,
-        status if usual is None else usual,
-    )
+    expected_output, messages, own_status = ending
+    with start_script(script.format(number=int(number))) as process:
+        output, errors = process.communicate(timeout=TIMEOUT_S)
+    assert output == expected_output
+    assert errors.splitlines() == messages
+    assert process.returncode == (status if own_status is None else own_status)

@@ -1,17 +1,17 @@
-"""docs/cli.md has the help of all commands as it is now."""
+"""docs/cli.md has the current help of all commands."""
 
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-from scripts import loaded_script
+from support.repository_scripts import load_script
 
 DOCS = Path(__file__).parents[1] / "docs"
 
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    return loaded_script("docs/make_cli_page.py")
+    return load_script("docs/make_cli_page.py")
 
 
 def test_the_page_is_up_to_date(script: ModuleType) -> None:

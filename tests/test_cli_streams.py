@@ -1,5 +1,6 @@
-"""What verbs print, on any terminal and on none: nothing that they write depends on it, and no
-letter ends them.
+"""What verbs print on any terminal, or without one.
+
+The files that they write do not depend on it, and no letter makes them fail.
 """
 
 import io
@@ -20,40 +21,43 @@ from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.cli.process import Stream
 from deepaccident_devkit.plugins.baselines import predict_results
 
-HOSTILE = "town\x1b[31m\x07\x9b\u202e\udcff"
-SHOWN = r"town\u001b[31m\u0007\u009b\u202e\udcff"
-OUTPUTS = {"closed pipe": 141, "full": 2, "latin-1": 0, "ascii": 0, "none": 0}
-"""What a verb's standard output leads to → its exit status."""
+HOSTILE_TEXT = "town\x1b[31m\x07\x9b\u202e\udcff"
+ESCAPED_TEXT = r"town\u001b[31m\u0007\u009b\u202e\udcff"
+STATUS_BY_OUTPUT = {"closed pipe": 141, "full": 2, "latin-1": 0, "ascii": 0, "none": 0}
+"""Destination of a verb's standard output → exit status."""
 
 
-def shown(*texts: str, encoding: str = "utf-8") -> str:
-    """What a terminal of an encoding gets."""
-    beneath = io.BytesIO()
-    stream = Stream(io.TextIOWrapper(beneath, encoding, newline=""))
+def print_texts(*texts: str, encoding: str = "utf-8") -> str:
+    """Return what a terminal with an encoding receives."""
+    terminal = io.BytesIO()
+    stream = Stream(io.TextIOWrapper(terminal, encoding, newline=""))
     for text in texts:
         assert stream.write(text) == len(text)
     stream.flush()
-    return beneath.getvalue().decode(encoding)
+    return terminal.getvalue().decode(encoding)
 
 
 BARS = ("\rindexing:  50%|█| 1/2", "\n", "\x1b[A", "\n\n\x1b[A\x1b[A", "")
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
-    [(f"{HOSTILE}\n\tnext\r\n", f"{SHOWN}\n\tnext\\u000d\n"), *zip(BARS, BARS, strict=True)],
+    ("text", "received"),
+    [
+        (f"{HOSTILE_TEXT}\n\tnext\r\n", f"{ESCAPED_TEXT}\n\tnext\\u000d\n"),
+        *zip(BARS, BARS, strict=True),
+    ],
 )
-def test_a_strangers_text_moves_no_cursor_and_progress_bars_do(text: str, told: str) -> None:
-    assert shown(text) == told
+def test_progress_bars_move_the_cursor_but_foreign_text_does_not(text: str, received: str) -> None:
+    assert print_texts(text) == received
 
 
 def test_json_stays_the_same_document() -> None:
-    document = {"town": HOSTILE, HOSTILE: ["é", 1]}
-    assert json.loads(shown(json.dumps(document, ensure_ascii=False))) == document
+    document = {"town": HOSTILE_TEXT, HOSTILE_TEXT: ["é", 1]}
+    assert json.loads(print_texts(json.dumps(document, ensure_ascii=False))) == document
 
 
 @pytest.mark.parametrize(
-    ("encoding", "told"),
+    ("encoding", "received"),
     [
         ("ascii", "m, N, ,  "),
         ("latin-1", "m², N, , é "),
@@ -61,14 +65,14 @@ def test_json_stays_the_same_document() -> None:
         ("utf-8", "m², N…, 車, é 😀"),
     ],
 )
-def test_a_letter_that_the_terminal_lacks_is_replaced(encoding: str, told: str) -> None:
-    assert shown("m², N…, 車, é 😀", encoding=encoding).replace("?", "") == told
+def test_a_letter_that_the_terminal_lacks_is_replaced(encoding: str, received: str) -> None:
+    assert print_texts("m², N…, 車, é 😀", encoding=encoding).replace("?", "") == received
 
 
-def test_a_stream_without_an_encoding_or_a_descriptor_will_do() -> None:
-    beneath = io.StringIO()
-    Stream(beneath).write(HOSTILE)
-    assert beneath.getvalue() == SHOWN
+def test_a_stream_without_an_encoding_or_a_descriptor_works() -> None:
+    terminal = io.StringIO()
+    Stream(terminal).write(HOSTILE_TEXT)
+    assert terminal.getvalue() == ESCAPED_TEXT
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +82,7 @@ def results(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -
     return predict_results(da_motion, "accident", tokens, path, workers=1)
 
 
-IN_TRAIN = (
+EVALUATION_OPTIONS = (
     "--split",
     "train",
     "--scope",
@@ -90,14 +94,14 @@ IN_TRAIN = (
     "--workers",
     1,
 )
-WRITING: dict[str, Callable[[Any, Path, Path], tuple[object, ...]]] = {
+VERBS: dict[str, Callable[[Any, Path, Path], tuple[object, ...]]] = {
     "evaluate": lambda root, results, out: (
         "evaluate",
         "accident",
         root,
         "--results",
         results,
-        *IN_TRAIN,
+        *EVALUATION_OPTIONS,
         "--out",
         out,
     ),
@@ -117,17 +121,17 @@ WRITING: dict[str, Callable[[Any, Path, Path], tuple[object, ...]]] = {
         "predict",
         "constant_velocity",
         root,
-        *IN_TRAIN[:4],
+        *EVALUATION_OPTIONS[:4],
         "--out",
         out,
         "--workers",
         1,
     ),
 }
-"""Verb that writes and prints → its words, for a release, results and a folder."""
+"""Verb that writes and prints → its words, for a release, results and an output folder."""
 
 
-def files(folder: Path) -> set[str]:
+def list_files(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -142,16 +146,18 @@ def test_all_is_written_before_anything_is_printed(
 ) -> None:
     def words(name: str) -> list[str]:
         (tmp_path / name).mkdir()
-        return [str(word) for word in WRITING[verb](da_motion.dataroot, results, tmp_path / name)]
+        return [str(word) for word in VERBS[verb](da_motion.dataroot, results, tmp_path / name)]
 
-    assert CliRunner().invoke(deepaccident, words("usual"), catch_exceptions=False).exit_code == 0
+    result = CliRunner().invoke(deepaccident, words("usual"), catch_exceptions=False)
+    assert result.exit_code == 0
     monkeypatch.setattr(click, "echo", lambda *_, **__: sys.exit(7))
-    assert CliRunner().invoke(deepaccident, words("mute"), catch_exceptions=False).exit_code == 7
-    assert files(tmp_path / "mute") == files(tmp_path / "usual") != set()
+    result = CliRunner().invoke(deepaccident, words("mute"), catch_exceptions=False)
+    assert result.exit_code == 7
+    assert list_files(tmp_path / "mute") == list_files(tmp_path / "usual") != set()
 
 
 def run(*words: object, output: str) -> subprocess.CompletedProcess[bytes]:
-    """A verb in a process of its own, whose standard output leads to one of `OUTPUTS`."""
+    """Run a verb in its own process, with its standard output led to one of `STATUS_BY_OUTPUT`."""
     encoding = output if output in ("latin-1", "ascii") else "utf-8"
     environment = {
         **os.environ,
@@ -159,14 +165,17 @@ def run(*words: object, output: str) -> subprocess.CompletedProcess[bytes]:
         "PYTHONIOENCODING": encoding,
     }
     command = [sys.executable, "-m", "deepaccident_devkit", *map(str, words)]
-    closed = ["sh", "-c", 'exec "$@" >&-', "sh"] if output == "none" else []
-    reading, writing = os.pipe()
-    os.close(reading)
-    to = {"closed pipe": writing, "full": os.open("/dev/full", os.O_WRONLY)}.get(
-        output, subprocess.PIPE
-    )
+    if output == "none":
+        command = ["sh", "-c", 'exec "$@" >&-', "sh", *command]
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    descriptors = {"closed pipe": write_end, "full": os.open("/dev/full", os.O_WRONLY)}
     return subprocess.run(
-        [*closed, *command], stdout=to, stderr=subprocess.PIPE, env=environment, check=False
+        command,
+        stdout=descriptors.get(output, subprocess.PIPE),
+        stderr=subprocess.PIPE,
+        env=environment,
+        check=False,
     )
 
 
@@ -174,33 +183,34 @@ def run(*words: object, output: str) -> subprocess.CompletedProcess[bytes]:
 @pytest.mark.parametrize(
     ("verb", "output"),
     [
-        *(("stats", output) for output in OUTPUTS),
+        *(("stats", output) for output in STATUS_BY_OUTPUT),
         ("render", "full"),
         ("parquet", "closed pipe"),
         ("predict", "none"),
     ],
 )
-def test_what_is_written_does_not_depend_on_who_reads(
+def test_written_files_do_not_depend_on_the_standard_output(
     da_motion: DeepAccident, results: Path, tmp_path: Path, verb: str, output: str
 ) -> None:
-    done = run(*WRITING[verb](da_motion.dataroot, results, tmp_path), output=output)
-    told = [
-        line
-        for line in done.stderr.decode().splitlines()
-        if line.startswith("error") or "Traceback" in line
-    ]
-    full = (
-        "error: standard output: cannot be written (No space left on device); files that "
-        "the command wrote are whole"
+    process = run(*VERBS[verb](da_motion.dataroot, results, tmp_path), output=output)
+
+    lines = process.stderr.decode().splitlines()
+    errors = [line for line in lines if line.startswith("error") or "Traceback" in line]
+    disk_is_full = (
+        "error: standard output: cannot be written (No space left on device); the files that "
+        "the command wrote are complete"
     )
-    assert (done.returncode, told) == (OUTPUTS[output], [full] * (output == "full"))
-    assert len(files(tmp_path)) >= 2
+    assert process.returncode == STATUS_BY_OUTPUT[output]
+    assert errors == ([disk_is_full] if output == "full" else [])
+    assert len(list_files(tmp_path)) >= 2
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("to", [">&-", ">/dev/full"])
-def test_a_verb_that_fails_keeps_its_status_without_standard_error(to: str, tmp_path: Path) -> None:
-    command = f'"{sys.executable}" -m deepaccident_devkit info "{tmp_path}/nothing" 2{to}'
+@pytest.mark.parametrize("redirection", [">&-", ">/dev/full"])
+def test_a_verb_that_fails_keeps_its_status_without_standard_error(
+    redirection: str, tmp_path: Path
+) -> None:
+    command = f'"{sys.executable}" -m deepaccident_devkit info "{tmp_path}/nothing" 2{redirection}'
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     assert subprocess.run(["sh", "-c", command], env=environment, check=False).returncode == 2
 
@@ -210,21 +220,16 @@ def test_a_verb_that_fails_keeps_its_status_without_standard_error(to: str, tmp_
     ("name", "value"),
     [("MPLBACKEND", "module://not_there"), ("MATPLOTLIBRC", "{}/rc")],
 )
-def test_no_setting_of_matplotlib_ends_a_verb(
+def test_no_setting_of_matplotlib_makes_a_verb_fail(
     da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str
 ) -> None:
     (tmp_path / "rc").write_text(
         "backend: nonsense\ntext.usetex: true\nimage.origin: lower\nno such setting\n"
     )
     monkeypatch.setenv(name, value.format(tmp_path))
-    words = (
-        "render",
-        "bev",
-        da_motion.dataroot,
-        "--layers",
-        "boxes",
-        "--out",
-        tmp_path / "bev.png",
-    )
-    done = run(*words, output="utf-8")
-    assert (done.returncode, done.stderr, (tmp_path / "bev.png").is_file()) == (0, b"", True)
+    out = tmp_path / "bev.png"
+    words = ("render", "bev", da_motion.dataroot, "--layers", "boxes", "--out", out)
+    process = run(*words, output="utf-8")
+    assert process.returncode == 0
+    assert process.stderr == b""
+    assert out.is_file()

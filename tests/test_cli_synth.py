@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from support.text_contents import missing_parts
 
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.plugins.synth.benchmark import described_release
@@ -14,8 +15,8 @@ from deepaccident_devkit.release import find_release
 
 
 @pytest.fixture
-def made(monkeypatch) -> list[SynthConfig]:
-    """The configurations of the releases that were asked for; none is made."""
+def requested_configs(monkeypatch) -> list[SynthConfig]:
+    """Configurations of the releases that the command asks for; no release is made."""
     configs: list[SynthConfig] = []
 
     def make_release(out: Path, config: SynthConfig, **_options: object) -> Path:
@@ -27,11 +28,13 @@ def made(monkeypatch) -> list[SynthConfig]:
 
 
 def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
-    out, words = tmp_path / "a b", "--scenarios 1 --frames 1 --layout B --seed 3 --sensors none"
+    out = tmp_path / "a b"
+    words = "--scenarios 1 --frames 1 --layout B --seed 3 --sensors none"
     result = CliRunner().invoke(synth, [str(out), *words.split()])
-    told = (f"deepaccident info {out}", f"{out}: 1 scenario of 1 frame with five agents, layout B")
-    assert [each for each in told if each not in result.output] == []
-    assert ("slow" in result.stderr, find_release(out).layout) == (False, "B")
+    assert f"deepaccident info {out}" in result.output
+    assert f"wrote {out} (1 scenario of 1 frame with five agents, layout B)" in result.output
+    assert "slow" not in result.stderr
+    assert find_release(out).layout == "B"
 
 
 @pytest.mark.parametrize(
@@ -57,64 +60,61 @@ def test_verb_writes_a_release_and_names_the_next_step(tmp_path):
         ),
     ],
 )
-def test_every_option_reaches_the_configuration(tmp_path, made, monkeypatch, words, config):
+def test_every_option_reaches_the_configuration(
+    tmp_path, requested_configs, monkeypatch, words, config
+):
     monkeypatch.chdir(tmp_path)
     Path("3").write_text(design_text(1), encoding="utf-8")
     result = CliRunner().invoke(synth, ["out", *words.split()])
     assert result.exit_code == 0, result.output
-    assert made == [SynthConfig(**{"frames": None, **config})]
+    assert requested_configs == [SynthConfig(**{"frames": None, **config})]
 
 
 @pytest.mark.slow
 def test_a_benchmark_is_made_and_compared(tmp_path, monkeypatch):
-    """One that is there is compared alone; which differences there are is told, and what else was
-    asked for refused.
-    """
+    """An existing release is only compared, and its differences are listed."""
     config = SynthConfig(scenarios=1, frames=2, image_size=(32, 18), seed=6)
-    small = make_release(tmp_path / "small", config, workers=1)
+    small_release = make_release(tmp_path / "small", config, workers=1)
+    description = described_release(small_release, workers=1)
     module = sys.modules[synth.callback.__module__]
     monkeypatch.setattr(module, "BENCHMARKS", {"v1": config})
-    wanted = described_release(small, workers=1)
-    monkeypatch.setattr(module, "published", lambda name: {"v1": wanted}[name])
+    monkeypatch.setattr(module, "published", lambda name: {"v1": description}[name])
+    out = tmp_path / "out"
 
     def run(*words: str):
-        return CliRunner().invoke(
-            synth, [str(tmp_path / "out"), "--benchmark", "v1", "--workers", "1", *words]
-        )
+        command = [str(out), "--benchmark", "v1", "--workers", "1", *words]
+        return CliRunner().invoke(synth, command)
 
-    assert (
-        "--seed changes nothing with --benchmark, which says all of it" in run("--seed", "6").stderr
+    message = "--seed has no effect with --benchmark, which defines all settings"
+    assert message in run("--seed", "6").stderr
+
+    result = run("--sensors", "clouds")
+    assert result.exit_code == 0
+    assert result.stdout.splitlines()[0] == (
+        f"{out}: same as the published benchmark v1 (1 scenario: labels, num_lidar_pts, clouds)"
     )
-    first = run("--sensors", "clouds")
-    assert (first.exit_code, first.stdout.splitlines()[0]) == (
-        0,
-        (
-            f"{tmp_path / 'out'}: is the benchmark v1 as published, 1 scenario: "
-            f"labels, num_lidar_pts, clouds"
-        ),
-    )
-    [label] = (tmp_path / "out").glob("*/infrastructure/label/*/*_002.txt")
+
+    [label] = out.glob("*/infrastructure/label/*/*_002.txt")
     label.write_text(label.read_text().replace("car ", "van ", 1))
-    second = run()
-    assert second.exit_code == 1
-    told = (
-        "out: is not the benchmark v1 as published, 1 difference:\n",
+    result = run()
+    assert result.exit_code == 1
+    expected = (
+        "out: differs from the published benchmark v1 (1 difference):\n",
         "scenario00001: boxes differ\n",
         "v1/lock.txt",
     )
-    assert [each for each in told if each not in second.stderr] == []
+    assert missing_parts(result.stderr, *expected) == []
 
 
-def test_labels_without_embree_are_said_to_take_long(tmp_path, made, monkeypatch):
+def test_labels_without_embree_are_announced_as_slow(tmp_path, requested_configs, monkeypatch):
     monkeypatch.setattr(sys.modules[synth.callback.__module__], "has_embree", lambda: False)
     result = CliRunner().invoke(synth, [str(tmp_path), "--sensors", "none"])
-    assert (
-        "slow without the package embreex; in a checkout: pip install '.[synth]'" in result.stderr
-    )
-    assert made == [SynthConfig(frames=None, sensors=False)]
+    message = "warning: slow without the package embreex; run pip install '.[synth]' in a checkout"
+    assert message in result.stderr
+    assert requested_configs == [SynthConfig(frames=None, sensors=False)]
 
 
-MINE = """\
+SCENARIO_TEXT = """\
 road: {signalized: false}
 actors:
   - {role: ego, from: west, max_speed: 9}
@@ -125,21 +125,23 @@ background: {vehicles: 0, two_wheelers: 0, parked: 2, walking: 1, crossing: 0}
 
 
 @pytest.fixture
-def mine(tmp_path, monkeypatch) -> Path:
+def scenario_file(tmp_path, monkeypatch) -> Path:
     """A scenario file in the working folder."""
     monkeypatch.chdir(tmp_path)
     path = Path("mine.yaml")
-    path.write_text(MINE, encoding="utf-8")
+    path.write_text(SCENARIO_TEXT, encoding="utf-8")
     return path
 
 
-def test_a_file_that_is_no_scenario_is_refused(mine):
-    mine.write_text(MINE.replace("van", "cyclist"), encoding="utf-8")
-    told = "mine.yaml:4: actors[1].category: the role other cannot be a cyclist"
-    assert told in str(CliRunner().invoke(synth, ["out", "--design", "mine.yaml"]).exception)
+def test_a_file_that_is_no_scenario_is_refused(scenario_file):
+    scenario_file.write_text(SCENARIO_TEXT.replace("van", "cyclist"), encoding="utf-8")
+    result = CliRunner().invoke(synth, ["out", "--design", "mine.yaml"])
+    message = "mine.yaml:4: actors[1].category: the role other cannot be a cyclist"
+    assert message in str(result.exception)
     assert not Path("out").exists()
 
 
-def test_a_design_is_shown_as_a_file_to_begin_with():
-    shown = CliRunner().invoke(synth, ["--show-design", "9"]).output
-    assert (shown, parse_spec(shown).design) == (design_text(9), 9)
+def test_a_design_is_printed_as_a_file_to_begin_with():
+    output = CliRunner().invoke(synth, ["--show-design", "9"]).output
+    assert output == design_text(9)
+    assert parse_spec(output).design == 9

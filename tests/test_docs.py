@@ -1,4 +1,4 @@
-"""The pages' code runs as it stands, and what must be listed is."""
+"""The code on the pages runs as it is, and the pages list everything that they must list."""
 
 import ast
 import inspect
@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from click import Context, Group
 from click.testing import CliRunner
-from scripts import loaded_script, of_checkout
+from support.repository_scripts import import_from_checkout, load_script
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -35,30 +35,25 @@ pytestmark = pytest.mark.slow
 
 TOP = Path(__file__).parents[1]
 DOCS = TOP / "docs"
-FROM_NUSCENES = (
-    (DOCS / "reading.md").read_text(encoding="utf-8").partition("## From the nuScenes devkit")[2]
-)
-COUNTERPARTS = sorted(
-    {
-        span
-        for row in re.findall(r"^\| .* \| (.*) \|$", FROM_NUSCENES, re.MULTILINE)
-        for span in re.findall(r"`([^`]+)`", row)
-    }
-)
-"""The code in the right columns of that section's tables."""
+NUSCENES_PAGE = (DOCS / "nuscenes_names.md").read_text(encoding="utf-8")
+_ROWS = "\n".join(re.findall(r"^\| .* \| (.*) \|$", NUSCENES_PAGE, re.MULTILINE))
+COUNTERPARTS = sorted(set(re.findall(r"`([^`\n]+)`", _ROWS)))
+"""The code in the right column of the page's tables."""
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
-NOT_ON_EXPORTS = ("town-maps",)
-"""Formats with a page of their own."""
-ON_LABELS = ("docs/protocols.md", "docs/evaluating.md", "docs/safety.md", "docs/baselines.md")
-ON_SENSORS = (
-    *(
-        "README.md",
-        "docs/exports.md",
-        "docs/format.md",
-        "docs/index.md",
-        "docs/town_maps.md",
-        "docs/validation.md",
-    ),
+FORMATS_WITH_OWN_PAGE = ("town-maps",)
+PAGES_ABOUT_LABELS = (
+    "docs/evaluating.md",
+    "docs/evaluators.md",
+    "docs/safety.md",
+    "docs/baselines.md",
+)
+PAGES_ABOUT_SENSORS = (
+    "README.md",
+    "docs/exports.md",
+    "docs/format.md",
+    "docs/index.md",
+    "docs/town_maps.md",
+    "docs/validation.md",
 )
 RUN_ELSEWHERE = {
     "docs/plugins.md": "tests/test_plugin_package.py",
@@ -72,59 +67,66 @@ RUN_ELSEWHERE = {
     "schema/results/README.md": "tests/unit/evaluation/results/test_records.py",
 }
 """Pages whose Python needs more than the demo's release, and the tests that run it."""
-STAND_FOR = {
+EXAMPLE_VALUES = {
     "DATAROOT": "deepaccident_demo/release",
     "FILE": "deepaccident_demo/release/type1_subtype1_accident/meta/Town10HD_type001_subtype0001_scenario00001.txt",  # noqa: E501
     "LABEL": "deepaccident_demo/release/type1_subtype1_accident/ego_vehicle/label/"
     "Town10HD_type001_subtype0001_scenario00001/Town10HD_type001_subtype0001_scenario00001_001.txt",
     "OUT": "out",
 }
-"""What the words in capitals of a command line may be."""
-NOT_RUN = {
-    "check splits": "tests/test_cli_audit.py has them, and makes the files",
+"""Word in capitals of a command line → an example of its value."""
+ONLY_PARSED = {
+    "check splits": "tests/test_cli_audit.py runs them, and makes the files",
     "check scores": "likewise",
     "check reader": "likewise",
-    "synth ": "tests/test_cli_synth.py has them; some take minutes",
-    "safety describe OUT": "of what synth makes",
-    "render accident OUT": "tests/unit/plugins/synth/test_own_files.py has it, on a "
-    "release of a scenario file",
+    "synth ": "tests/test_cli_synth.py runs them; some take minutes",
+    "safety describe OUT": "it needs the output of synth",
+    "render accident OUT": "tests/unit/plugins/synth/test_own_files.py runs it, on a "
+    "release made from a scenario file",
     "info s3:": "tests/cloud has releases on S3",
-    "study ": "tests/test_cli_study.py has their like; some take hours",
-    "train ": "tests/torch_extra/model/test_commands.py has them; they need torch",
+    "study ": "tests/test_cli_study.py runs similar ones; some take hours",
+    "train ": "tests/torch_extra/model/test_commands.py runs them; they need torch",
     "predict ": "likewise",
-    "evaluate motion training_data": "of what predict makes; likewise",
+    "evaluate motion training_data": "it needs the output of predict; likewise",
     "evaluate motion DATAROOT --results results/motion ": "likewise",
-    "predict constant_velocity DATAROOT --split": "tests/test_cli_predict.py has their like",
-    "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py does that "
+    "predict constant_velocity DATAROOT --split": "tests/test_cli_predict.py runs similar ones",
+    "predict constant_velocity hidden_release": "benchmarks/pages/baselines.py runs this "
     "and the next one",
     "evaluate motion hidden_release": "likewise",
-    "evaluate warning DATAROOT --results all_": "of what these predict; "
-    "tests/test_cli_evaluate.py has their like",
-    "check bundle benchmarks/": "tests/test_cli_evaluate.py has its like",
-    "results ": "tests/unit/export/nuscenes/test_detections.py has it, and makes the file",
-    "sensor-setups data/": "tests/road/test_commands.py has it and its like; they "
+    "evaluate warning DATAROOT --results all_": "it needs these predictions; "
+    "tests/test_cli_evaluate.py runs similar ones",
+    "check bundle benchmarks/": "tests/test_cli_evaluate.py runs a similar one",
+    "results ": "tests/unit/export/nuscenes/test_detections.py runs it, and makes the file",
+    "sensor-setups data/": "tests/road/test_commands.py runs it and similar ones; they "
     "need the nuScenes devkit",
     "render sample data/": "likewise",
     "evaluate motion data/": "likewise",
     "evaluate detection data/": "likewise",
-    "export mcap": "tests/unit/export has it, which has the extra",
-    "explore ": "tests/browser/test_explore.py has it; it runs until Ctrl-C",
+    "export mcap": "tests/unit/export runs it, if the extra is installed",
+    "explore ": "tests/browser/test_explore.py runs it; it runs until Ctrl-C",
 }
-"""Command lines of pages that begin so are parsed alone, and why."""
+"""Beginning of a command line that is only parsed → reason."""
 NO_CALLS = (
-    *(".intensity", '"paper"', "link=", "agents="),
-    *('.figure.savefig("a.png")', '.savefig("a.png")', "found.pixels[found.mask]", "len(cloud)"),
+    ".intensity",
+    '"paper"',
+    "link=",
+    "agents=",
+    '.figure.savefig("a.png")',
+    '.savefig("a.png")',
+    "found.pixels[found.mask]",
+    "len(cloud)",
 )
+"""Counterparts that are no calls or names of the devkit."""
 
 
 def run_page(page: Path, languages: str = "python|bash") -> dict[str, Any]:
-    """Run the page's Python and shell blocks, as they stand and in their order, in the working
-    folder.
+    """Run the page's Python and shell blocks unchanged, in their order, in the working folder.
+
+    Returns the names that the Python blocks define.
     """
     names: dict[str, Any] = {}
-    blocks = re.findall(
-        rf"^```({languages})\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-    )
+    text = page.read_text(encoding="utf-8")
+    blocks = re.findall(rf"^```({languages})\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     assert blocks, f"{page}: no code"
     for language, code in blocks:
         if language == "python":
@@ -138,8 +140,8 @@ def run_page(page: Path, languages: str = "python|bash") -> dict[str, Any]:
     return names
 
 
-def folder_of_demo(root: Path, folder: Path) -> Path:
-    """Lay a release where `deepaccident demo` makes one."""
+def link_demo(root: Path, folder: Path) -> Path:
+    """Link a release at the path where `deepaccident demo` makes one; return the folder."""
     (folder / "deepaccident_demo").mkdir()
     (folder / "deepaccident_demo" / "release").symlink_to(root, target_is_directory=True)
     return folder
@@ -149,17 +151,16 @@ def folder_of_demo(root: Path, folder: Path) -> Path:
 def in_labels_demo(
     da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    """A working folder in which `deepaccident_demo/release` is a small release, with labels
-    alone.
-    """
-    monkeypatch.chdir(folder_of_demo(da_motion.dataroot, tmp_path))
+    """A working folder in which `deepaccident_demo/release` is a small release with labels only."""
+    monkeypatch.chdir(link_demo(da_motion.dataroot, tmp_path))
     return tmp_path
 
 
 @pytest.fixture(scope="module")
 def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An accident as the demo's, with all sensors: as many frames as the pages ask for, and small
-    images.
+    """A release of an accident like the demo's, with all sensors and small images.
+
+    It has as many frames as the pages need.
     """
     folder = tmp_path_factory.mktemp("demo")
     config = SynthConfig(scenarios=1, frames=32, image_size=(64, 36), view="hidden")
@@ -169,16 +170,16 @@ def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def in_demo(small_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder in which `deepaccident_demo/release` is the release of `small_demo`."""
-    monkeypatch.chdir(folder_of_demo(small_demo, tmp_path))
+    monkeypatch.chdir(link_demo(small_demo, tmp_path))
     return tmp_path
 
 
-@pytest.mark.parametrize("page", ON_LABELS)
+@pytest.mark.parametrize("page", PAGES_ABOUT_LABELS)
 def test_the_code_on_pages_about_labels_runs(page: str, in_labels_demo: Path) -> None:
     run_page(TOP / page)
 
 
-@pytest.mark.parametrize("page", ON_SENSORS)
+@pytest.mark.parametrize("page", PAGES_ABOUT_SENSORS)
 def test_the_code_on_pages_about_sensors_runs(page: str, in_demo: Path) -> None:
     run_page(TOP / page)
 
@@ -186,30 +187,28 @@ def test_the_code_on_pages_about_sensors_runs(page: str, in_demo: Path) -> None:
 def test_the_code_on_reading_runs(
     in_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And that of its tables, except for the pictures."""
+    """The code in the tables of nuScenes' names runs too, except for the pictures."""
     monkeypatch.setenv("DEEPACCIDENT_CACHE", str(tmp_path / "copies"))
     names = run_page(DOCS / "reading.md")
     assert names["camera"].in_image(names["pixels"]).all()
-    objects = re.compile(r"(da|box|boxes|camera|cloud|found)\.|len\(")
-    codes = [
-        code for code in COUNTERPARTS if objects.match(code) and not code.startswith("da.render_")
-    ]
+
+    expression = re.compile(r"(?!da\.render_)(da|box|boxes|camera|cloud|found)\.|len\(")
+    codes = [code for code in COUNTERPARTS if expression.match(code)]
     assert len(codes) > 60
     for code in codes:
-        eval(compile(code, "reading.md", "eval"), names)  # noqa: S307
+        eval(compile(code, "nuscenes_names.md", "eval"), names)  # noqa: S307
 
 
-@pytest.mark.parametrize("choices", [LabelProtocol, MotionProtocol])
-def test_the_page_of_the_released_code_has_each_switch(choices: type[Any]) -> None:
+@pytest.mark.parametrize("protocol", [LabelProtocol, MotionProtocol])
+def test_the_page_of_the_released_code_has_each_switch(protocol: type[Any]) -> None:
     page = (DOCS / "released_code.md").read_text(encoding="utf-8")
-    assert [
-        field.name for field in fields(choices) if not re.search(rf"[`.]{field.name}\b", page)
-    ] == []
-    named = set(re.findall(rf"`{choices.__name__}\.(\w+)", page))
-    assert named - {field.name for field in fields(choices)} == set()
+    switches = {field.name for field in fields(protocol)}
+    assert {name for name in switches if not re.search(rf"[`.]{name}\b", page)} == set()
+    named_switches = set(re.findall(rf"`{protocol.__name__}\.(\w+)", page))
+    assert named_switches - switches == set()
 
 
-CHOICES = (
+CHOICE_CLASSES = (
     MotionProtocol,
     PostProcessing,
     DetectionProtocol,
@@ -224,104 +223,90 @@ RESULT_CLASSES = (*(evaluator.result_class for evaluator in TASKS.values()), Pre
 def test_the_page_of_protocols_has_each_protocol_choice_and_number() -> None:
     page = (DOCS / "protocols.md").read_text(encoding="utf-8")
     protocols = [name for evaluator in TASKS.values() for name in evaluator.protocols]
-    choices = [field.name for kind in CHOICES for field in fields(kind)]
-    numbers = [
-        row.path.removesuffix("/*").rpartition("/")[2]
-        for kind in RESULT_CLASSES
-        for row in kind.rows
-    ]
+    choices = [field.name for cls in CHOICE_CLASSES for field in fields(cls)]
+    paths = [row.path.removesuffix("/*") for cls in RESULT_CLASSES for row in cls.rows]
+    numbers = [path.rpartition("/")[2] for path in paths]
+
     assert min(map(len, (protocols, choices, numbers))) > 10
-    missing = {
-        name
-        for name in (*protocols, *choices, *numbers)
-        if not re.search(rf"`([a-z]+\.)?{name}`", page)
-    }
-    assert missing == set()
+    names = {*protocols, *choices, *numbers}
+    assert {name for name in names if not re.search(rf"`([a-z]+\.)?{name}`", page)} == set()
 
 
 @pytest.mark.parametrize("name", export.list_commands(Context(export)))
 def test_every_format_has_a_row_on_the_page_of_exports(name: str) -> None:
-    rows = re.findall(
-        r"^\| (.*?) \|", (DOCS / "exports.md").read_text(encoding="utf-8"), re.MULTILINE
-    )
-    assert name in NOT_ON_EXPORTS or any(re.search(rf"\b{name}\b", row) for row in rows)
+    page = (DOCS / "exports.md").read_text(encoding="utf-8")
+    first_cells = re.findall(r"^\| (.*?) \|", page, re.MULTILINE)
+    has_row = any(re.search(rf"\b{name}\b", cell) for cell in first_cells)
+    assert name in FORMATS_WITH_OWN_PAGE or has_row
 
 
 def test_the_commands_of_the_pictures_run(da_motion: DeepAccident, in_demo: Path) -> None:
-    """`docs/make_pictures.py` runs them, too, and takes minutes."""
+    """`docs/make_pictures.py` runs them too, but takes minutes."""
     (in_demo / "many").symlink_to(da_motion.dataroot, target_is_directory=True)
-    run_page(DOCS / "pictures.md", "bash")
-    script = loaded_script("docs/make_pictures.py")
-    for picture in script.PICTURE.findall((DOCS / "pictures.md").read_text(encoding="utf-8")):
-        page = f"{Path(picture).stem}.html"  # which a browser shows
-        assert picture in script.MADE_ELSEWHERE or [
-            *in_demo.rglob(picture),
-            *in_demo.rglob(page),
-        ], picture
+    page = DOCS / "pictures.md"
+    run_page(page, "bash")
+    script = load_script("docs/make_pictures.py")
+    for picture in script.PICTURE.findall(page.read_text(encoding="utf-8")):
+        html_name = f"{Path(picture).stem}.html"  # a picture may show a page in a browser
+        paths = [*in_demo.rglob(picture), *in_demo.rglob(html_name)]
+        assert picture in script.MADE_ELSEWHERE or paths, picture
 
 
-def test_the_outputs_on_the_page_of_safety_are_as_commands_print_them_now(
-    in_labels_demo: Path,
-) -> None:
-    """Their headings and rows' names are compared: `python docs/make_tables.py safety` measures on
-    a larger release.
+def test_the_outputs_on_the_page_of_safety_are_up_to_date(in_labels_demo: Path) -> None:
+    """Only the names of columns and rows are compared.
+
+    `python docs/make_tables.py safety` measures the numbers on a larger release.
     """
-    script = of_checkout("benchmarks.pages.safety")
+    script = import_from_checkout("benchmarks.pages.safety")
     (in_labels_demo / script.RELEASE).symlink_to(in_labels_demo / "deepaccident_demo" / "release")
-    there = (DOCS / "safety.md").read_text(encoding="utf-8")
-    page = re.sub(r"^    deepaccident (synth|predict|evaluate) .*$", "", there, flags=re.MULTILINE)
-    now = script.with_outputs(page)
-    outputs = [
-        re.findall(r"^<!-- output -->\n(.*?)^<!-- end", text, re.MULTILINE | re.DOTALL)
-        for text in (there, now)
-    ]
-    assert len(outputs[0]) == 6
-    for old, new in zip(*outputs, strict=True):
-        if not re.search(
-            "^(prevented accidents|Twins)", old, re.MULTILINE
-        ):  # one accident has no such tables
+    page = (DOCS / "safety.md").read_text(encoding="utf-8")
+    slow_commands = re.compile(r"^    deepaccident (synth|predict|evaluate) .*$", re.MULTILINE)
+    new_page = script.with_outputs(slow_commands.sub("", page))
+
+    output = re.compile(r"^<!-- output -->\n(.*?)^<!-- end", re.MULTILINE | re.DOTALL)
+    old_outputs, new_outputs = output.findall(page), output.findall(new_page)
+    assert len(old_outputs) == 6
+    for old, new in zip(old_outputs, new_outputs, strict=True):
+        # one accident is too few for these two tables
+        if not re.search("^(prevented accidents|Twins)", old, re.MULTILINE):
             assert table_words(old) <= table_words(new) | {"val", "test", "…"}
 
 
 def table_words(output: str) -> set[str]:
-    """The names of columns and rows: what has no number, of lines that have several columns."""
-    lines = [
-        re.split(r"\s{2,}", line.strip())
-        for line in output.splitlines()
-        if not line.startswith("type")
-    ]
-    return {cell for line in lines if len(line) > 2 for cell in line if not re.search(r"\d", cell)}
+    """Return the cells without a number in the lines that have several columns."""
+    words = set()
+    for line in output.splitlines():
+        cells = re.split(r"\s{2,}", line.strip())
+        if len(cells) > 2 and not line.startswith("type"):
+            words.update(cell for cell in cells if not re.search(r"\d", cell))
+    return words
 
 
 def test_every_field_that_finds_scenarios_is_on_the_page() -> None:
-    table = (
-        (DOCS / "reading.md")
-        .read_text(encoding="utf-8")
-        .partition("### The fields of find")[2]
-        .partition("## ")[0]
-    )
-    told = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)))
-    assert sorted(told) == sorted([*FIELDS, "length", "type"])
-    for name in told:
-        values = [
-            str(value) for value in FIELDS[full_name(name)].known if not isinstance(value, int)
-        ]
-        assert [value for value in values if value.removeprefix("Town") not in table] == [], name
+    page = (DOCS / "reading.md").read_text(encoding="utf-8")
+    table = page.partition("### The fields of find")[2].partition("## ")[0]
+    first_cells = re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
+    names = re.findall(r"`(\w+)`", " ".join(first_cells))
+
+    assert sorted(names) == sorted([*FIELDS, "length", "type"])
+    for name in names:
+        known_values = FIELDS[full_name(name)].known
+        words = [value for value in known_values if not isinstance(value, int)]
+        assert [word for word in words if word.removeprefix("Town") not in table] == [], name
 
 
-def test_what_the_release_is_known_for_is_on_the_page() -> None:
+def test_the_known_findings_of_the_release_are_on_the_page() -> None:
     page = (DOCS / "validation.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([a-z-]+)` \|", page, re.MULTILINE)
-    assert [name for name in rows if name in CODES] == [
-        name for name, code in CODES.items() if code.known
-    ]
+    known_codes = [name for name, code in CODES.items() if code.known]
+    assert [name for name in rows if name in CODES] == known_codes
 
 
 @pytest.mark.slow
-def test_the_page_of_studies(
+def test_the_code_on_the_page_of_studies_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its first command, and its code, which reads what that has written."""
+    """The code reads the output of the page's first command."""
     monkeypatch.chdir(tmp_path)
     CliRunner().invoke(deepaccident, ["study", "v2x", "studies", "--smoke"], catch_exceptions=False)
     run_page(DOCS / "studies.md", "python")
@@ -329,13 +314,13 @@ def test_the_page_of_studies(
 
 
 def test_no_page_has_code_that_no_test_runs() -> None:
-    with_code = {
+    pages_with_code = {
         page.relative_to(TOP).as_posix()
         for page in PAGES
         if "```python" in page.read_text(encoding="utf-8")
     }
-    run_here = {*ON_LABELS, *ON_SENSORS, "docs/reading.md", "docs/studies.md"}
-    assert with_code - run_here == RUN_ELSEWHERE.keys()
+    run_here = {*PAGES_ABOUT_LABELS, *PAGES_ABOUT_SENSORS, "docs/reading.md", "docs/studies.md"}
+    assert pages_with_code - run_here == RUN_ELSEWHERE.keys()
     for page, test in RUN_ELSEWHERE.items():
         assert Path(page).name in (TOP / test).read_text(encoding="utf-8")
 
@@ -343,7 +328,7 @@ def test_no_page_has_code_that_no_test_runs() -> None:
 COMMANDS = [
     pytest.param(line, id=f"{page.stem}: {line[12:]}")
     for page in PAGES
-    if page.name != "cli.md"  # which is made from the commands themselves
+    if page.name != "cli.md"  # this page is made from the commands themselves
     for line in re.findall(
         r"^    (deepaccident \S[^#\n]*[^#\s])", page.read_text(encoding="utf-8"), re.MULTILINE
     )
@@ -354,21 +339,20 @@ COMMANDS = [
 @pytest.mark.parametrize("line", COMMANDS)
 def test_the_command_lines_of_the_pages_run(line: str, in_demo: Path) -> None:
     _, *words = shlex.split(line.split(" > ", maxsplit=1)[0])
-    words = [STAND_FOR.get(word, word) for word in words]
-    if any(line[len("deepaccident ") :].startswith(begin) for begin in NOT_RUN):
+    words = [EXAMPLE_VALUES.get(word, word) for word in words]
+    if line.removeprefix("deepaccident ").startswith(tuple(ONLY_PARSED)):
         command, context = deepaccident, Context(deepaccident)
         while isinstance(command, Group):
-            name, found, words = command.resolve_command(context, words)
-            command, context = found, Context(found, info_name=name, parent=context)
-        command.make_parser(context).parse_args(words)  # raises where there is no such option
+            name, command, words = command.resolve_command(context, words)
+            context = Context(command, info_name=name, parent=context)
+        command.make_parser(context).parse_args(words)  # fails if there is no such option
         return
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
-    assert result.exit_code in {0, 1} if words[0] == "validate" else result.exit_code == 0, (
-        result.output
-    )
+    statuses = {0, 1} if words[0] == "validate" else {0}
+    assert result.exit_code in statuses, result.output
 
 
-KINDS = {
+CLASSES = {
     "da": DeepAccident,
     "DeepAccident": DeepAccident,
     "box": Box,
@@ -376,23 +360,24 @@ KINDS = {
     "camera": PinholeCamera,
     "cloud": LidarPointCloud,
 }
-"""What the names on the page are."""
+"""Name of an object on the page → its class."""
 
 
-def named(expression: ast.expr) -> Any:
-    """What a dotted name on the page stands for: of `da`, `box` and others the member of their
-    class.
+def find_object(expression: ast.expr) -> Any:
+    """Return the object that a dotted name on the page stands for.
+
+    For a member of `da`, `box` and the others it is the member of their class.
     """
     if isinstance(expression, ast.Subscript):
-        return named(expression.value).__getitem__
+        return find_object(expression.value).__getitem__
     if isinstance(expression, ast.Attribute):
-        if isinstance(expression.value, ast.Name) and expression.value.id not in KINDS:
-            return getattr(
-                import_module(f"deepaccident_devkit.{expression.value.id}"), expression.attr
-            )
-        return getattr(named(expression.value), expression.attr)
+        owner = expression.value
+        if isinstance(owner, ast.Name) and owner.id not in CLASSES:
+            module = import_module(f"deepaccident_devkit.{owner.id}")
+            return getattr(module, expression.attr)
+        return getattr(find_object(owner), expression.attr)
     assert isinstance(expression, ast.Name)
-    return KINDS[expression.id]
+    return CLASSES[expression.id]
 
 
 @pytest.mark.parametrize("code", [code for code in COUNTERPARTS if code not in NO_CALLS])
@@ -402,26 +387,26 @@ def test_every_counterpart_of_a_nuscenes_call_exists(code: str) -> None:
         return
     expression = ast.parse(code, mode="eval").body
     if not isinstance(expression, ast.Call):
-        named(expression)
+        find_object(expression)
         return
+    arguments = list(expression.args)
+    # the object of a method, or a class: `geometry.Box.from_wlh`
+    owner = getattr(expression.func, "value", None)
+    if owner is not None and not getattr(owner, "attr", "").istitle():
+        arguments.insert(0, None)  # self
     keywords = {keyword.arg: keyword.value for keyword in expression.keywords if keyword.arg}
-    owner = getattr(
-        expression.func, "value", None
-    )  # of a method its object, or its class: `geometry.Box.from_wlh`
-    of_instance = owner is not None and not getattr(owner, "attr", "").istitle()
-    inspect.signature(named(expression.func)).bind(
-        *([None] if of_instance else []), *expression.args, **keywords
-    )
+    inspect.signature(find_object(expression.func)).bind(*arguments, **keywords)
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "ARCHITECTURE.md", "SECURITY.md"])
-def test_the_links_of_pages_that_are_not_on_the_site_lead_somewhere(page: str) -> None:
-    links = re.findall(r"\]\((?!http)([^)#]+)", (TOP / page).read_text(encoding="utf-8"))
+def test_the_links_of_pages_outside_the_site_lead_to_a_file(page: str) -> None:
+    text = (TOP / page).read_text(encoding="utf-8")
+    links = re.findall(r"\]\((?!http)([^)#]+)", text)
     assert [link for link in links if not (TOP / link).exists()] == []
 
 
-def test_the_picture_of_the_layers_is_that_of_the_contract() -> None:
-    script = loaded_script("docs/make_architecture.py")
+def test_the_picture_of_the_layers_agrees_with_the_contract() -> None:
+    script = load_script("docs/make_architecture.py")
     assert script.PICTURE.read_text(encoding="utf-8") == script.picture(), (
         "run: python docs/make_architecture.py"
     )

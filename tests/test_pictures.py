@@ -3,7 +3,7 @@
 from types import ModuleType
 
 import pytest
-from scripts import TOP, loaded_script
+from support.repository_scripts import TOP, load_script
 
 from deepaccident_devkit.cli.render import render
 
@@ -12,12 +12,12 @@ PAGE = TOP / "docs" / "pictures.md"
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    return loaded_script("docs/make_pictures.py")
+    return load_script("docs/make_pictures.py")
 
 
 def test_every_view_is_shown_by_its_command(script: ModuleType) -> None:
     commands = script.COMMAND.findall(PAGE.read_text(encoding="utf-8"))
     views = {line.split()[1] for line in commands if line.startswith("render ")}
     assert views == set(render.commands)
-    for others in ("export mcap ", "evaluate compare ", "info "):
-        assert any(line.startswith(others) for line in commands), others
+    for command in ("export mcap ", "evaluate compare ", "info "):
+        assert any(line.startswith(command) for line in commands), command

@@ -1,6 +1,4 @@
-"""The package of docs/plugins.md, installed in an environment of its own: its verb, format and task
-work.
-"""
+"""The plug-in package of docs/plugins.md works when it is installed in its own environment."""
 
 import json
 import os
@@ -23,9 +21,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "plugins.md"
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a new environment with the package of the page, beside what this one
-    has.
-    """
+    """The interpreter of a new environment that has this one's packages and the page's package."""
     folder = tmp_path_factory.mktemp("plugin")
     text = PAGE.read_text(encoding="utf-8")
     package = folder / "deepaccident-extras"
@@ -36,9 +32,8 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder / "environment")
     interpreter = folder / "environment" / "bin" / "python"
     (site_packages,) = folder.glob("environment/lib/python*/site-packages")
-    (site_packages / "shared.pth").write_text(
-        "\n".join(filter(os.path.isdir, sys.path)), encoding="utf-8"
-    )
+    shared_folders = "\n".join(filter(os.path.isdir, sys.path))
+    (site_packages / "shared.pth").write_text(shared_folders, encoding="utf-8")
     options = ("--quiet", "--no-deps", "--no-index", "--no-build-isolation")
     pip = [sys.executable, "-m", "pip", "--python", interpreter]
     subprocess.run([*pip, "install", *options, package], check=True, timeout=300)
@@ -46,48 +41,39 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(python: Path, *words: object, status: int = 0, **environment: str) -> str:
-    """Return what a command of the devkit prints in that environment."""
+    """Run a command of the devkit in the environment, and return its output."""
     command = [python, "-m", "deepaccident_devkit", *map(str, words)]
-    done = subprocess.run(
+    process = subprocess.run(
         command,
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
         timeout=300,
         check=False,
         env={**os.environ, **environment},
     )
-    assert done.returncode == status, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    assert process.returncode == status, process.stdout
+    return process.stdout
 
 
 @pytest.mark.slow
 def test_its_verb_and_its_format(python: Path, da_b: DeepAccident, tmp_path: Path) -> None:
     assert "top-speed" in run(python, "--help")
     assert "top-speed" not in run(python, "--help", DEEPACCIDENT_PLUGINS="off")
-    speeds = run(python, "top-speed", da_b.dataroot).splitlines()
-    assert [line.partition(":")[0] for line in speeds] == [
-        record["token"] for record in da_b.scenario
-    ]
-    assert min(float(line.split()[-2]) for line in speeds) > 0
-    run(
-        python,
-        "export",
-        "box-counts",
-        da_b.dataroot,
-        "--out",
-        tmp_path / "counts",
-        "--agents",
-        "ego_vehicle",
-    )
-    counts = {
-        token: count
-        for path in (tmp_path / "counts").glob("type*.json")
-        for token, count in json.loads(path.read_text()).items()
-    }
+    lines = run(python, "top-speed", da_b.dataroot).splitlines()
+    tokens = [scenario["token"] for scenario in da_b.scenario]
+    assert [line.partition(":")[0] for line in lines] == tokens
+    assert min(float(line.split()[-2]) for line in lines) > 0
+
+    out = tmp_path / "counts"
+    run(python, "export", "box-counts", da_b.dataroot, "--out", out, "--agents", "ego_vehicle")
+    counts = {}
+    for path in out.glob("type*.json"):
+        counts.update(json.loads(path.read_text()))
     assert counts == {
-        record["token"]: len(da_b.boxes(record["token"]))
-        for record in da_b.sample
-        if record["agent"] == "ego_vehicle"
+        sample["token"]: len(da_b.boxes(sample["token"]))
+        for sample in da_b.sample
+        if sample["agent"] == "ego_vehicle"
     }
 
 
@@ -95,35 +81,19 @@ def test_its_verb_and_its_format(python: Path, da_b: DeepAccident, tmp_path: Pat
 def test_its_task(python: Path, da_motion: DeepAccident, tmp_path: Path) -> None:
     tokens = samples(da_motion, "train", "evaluate")
     results = predict_results(da_motion, "detection", tokens, tmp_path / "detection.json")
-    words = (
-        "evaluate",
-        "counting",
-        da_motion.dataroot,
-        "--results",
-        results,
-        "--split",
-        "train",
-        "--workers",
-        2,
-    )
-    printed = run(python, *words, "--protocol", "about", "--out", tmp_path / "bundle")
-    assert "right" in printed
-    bundle = read_bundle(tmp_path / "bundle")  # here the plug-in is not installed
+    out = tmp_path / "bundle"
+    options = ("--split", "train", "--workers", 2, "--protocol", "about", "--out", out)
+    words = ("evaluate", "counting", da_motion.dataroot, "--results", results, *options)
+    assert "right" in run(python, *words)
+
+    bundle = read_bundle(out)  # in this process the plug-in is not installed
     assert bundle.summary["task"] == "counting"
     assert 0 <= bundle.summary["metrics"]["means"]["boxes"]["all"]["right"] <= 1
-    with pytest.raises(
-        ResultsError, match=r"'counting'.*; if a plug-in has this task, install it\."
-    ):
+    message = r"'counting'.*; if a plug-in adds this task, install it\."
+    with pytest.raises(ResultsError, match=message):
         _ = bundle.setup
-    assert "the same; " in run(
-        python,
-        "check",
-        "bundle",
-        tmp_path / "bundle",
-        *words[3:5],
-        "--dataroot",
-        da_motion.dataroot,
-    )
-    assert "No such command 'counting'" in run(
-        python, "evaluate", "counting", status=2, DEEPACCIDENT_PLUGINS="off"
-    )
+
+    sources = ("--results", results, "--dataroot", da_motion.dataroot)
+    assert "identical: " in run(python, "check", "bundle", out, *sources)
+    output = run(python, "evaluate", "counting", status=2, DEEPACCIDENT_PLUGINS="off")
+    assert "No such command 'counting'" in output

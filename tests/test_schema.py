@@ -1,4 +1,4 @@
-"""schema/ is what the code says, and records are what schema/ says."""
+"""The files in schema/ agree with the code, and records agree with the files in schema/."""
 
 import hashlib
 import json
@@ -24,21 +24,18 @@ def test_the_files_are_not_stale(schema_generator: ModuleType) -> None:
 
 
 def test_no_file_is_left_over(schema_generator: ModuleType) -> None:
-    by_hand = {
-        "generate.py",
-        "motion_labels.md",
-    }  # tests/unit/motion/test_label_files.py runs what the page says
-    assert {path.name for path in SCHEMA.iterdir() if path.is_file()} == {
-        *schema_generator.generated_files(),
-        *by_hand,
-    }
+    # tests/unit/motion/test_label_files.py runs the code on the page of motion labels
+    handwritten_files = {"generate.py", "motion_labels.md"}
+    names = {path.name for path in SCHEMA.iterdir() if path.is_file()}
+    assert names == {*schema_generator.generated_files(), *handwritten_files}
 
 
 @pytest.mark.parametrize("table", list(table_specs()))
-def test_records_are_as_their_schema_says(both_layouts: DeepAccident, table: str) -> None:
+def test_records_agree_with_their_schema(both_layouts: DeepAccident, table: str) -> None:
     schema = json.loads((SCHEMA / f"{table}.json").read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema)
-    validator, records = jsonschema.Draft202012Validator(schema), getattr(both_layouts, table)
+    validator = jsonschema.Draft202012Validator(schema)
+    records = getattr(both_layouts, table)
     for record in records[:: max(1, len(records) // 40)]:
         validator.validate(record)
         assert list(record) == list(schema["properties"]) == schema["required"]
@@ -54,13 +51,14 @@ def test_the_page_explains_every_table_and_stored_column() -> None:
 
 
 def test_stored_columns_do_not_change_without_a_new_schema_version() -> None:
-    """An index of other columns must not be read: count SCHEMA_VERSION up and write the new digest
-    here.
+    """An index with other columns must not be read.
+
+    After a change, increase SCHEMA_VERSION and write the new digest here.
     """
-    stored = [
+    stored_columns = [
         (name, field.name, str(field.type), field.nullable)
         for name, spec in table_specs().items()
         for field in arrow_schema(spec)
     ]
-    digest = hashlib.blake2b(repr(stored).encode(), digest_size=8).hexdigest()
+    digest = hashlib.blake2b(repr(stored_columns).encode(), digest_size=8).hexdigest()
     assert (SCHEMA_VERSION, digest) == (4, "a56005d98bcb9522")

@@ -11,39 +11,40 @@ from deepaccident_devkit import DeepAccident
 pytestmark = pytest.mark.slow
 
 TUTORIALS = Path(__file__).parents[1] / "tutorials"
-LAST_WORDS = {
+LAST_OUTPUT = {
     "01_first_steps": "gap one frame before",
     "02_v2x": "seen by the ego alone",
     "03_motion_labels": "the fastest actor's flow",
     "04_evaluate": "'100x100': (100.0, 100.0)",
     "05_own_scenario": "gap 0.050 m, sides ('right', 'front'), angle 90 degrees",
 }
-"""What each notebook prints last, where it lets its reader check something."""
+"""Notebook → a part of its last output, which lets its reader check something."""
 NEEDS_SENSORS = ("01_first_steps", "02_v2x")
-SECONDS = 300
+TIMEOUT_S = 300
 
 
-def read(name: str) -> nbformat.NotebookNode:
+def read_notebook(name: str) -> nbformat.NotebookNode:
     return nbformat.read(TUTORIALS / f"{name}.ipynb", as_version=4)
 
 
 def test_every_notebook_is_run_and_listed() -> None:
-    assert sorted(path.stem for path in TUTORIALS.glob("*.ipynb")) == sorted(LAST_WORDS)
+    assert sorted(path.stem for path in TUTORIALS.glob("*.ipynb")) == sorted(LAST_OUTPUT)
     page = (TUTORIALS / "README.md").read_text(encoding="utf-8")
-    assert [name for name in LAST_WORDS if f"({name}.ipynb)" not in page] == []
+    assert [name for name in LAST_OUTPUT if f"({name}.ipynb)" not in page] == []
 
 
-@pytest.mark.parametrize("name", LAST_WORDS)
-def test_notebook_is_stored_without_outputs_and_begins_with_what_installs_the_devkit(
+@pytest.mark.parametrize("name", LAST_OUTPUT)
+def test_notebook_is_stored_without_outputs_and_begins_by_installing_the_devkit(
     name: str,
 ) -> None:
-    code = [cell for cell in read(name).cells if cell.cell_type == "code"]
-    assert [cell.id for cell in code if cell.outputs or cell.execution_count is not None] == []
-    wanted = ("except ModuleNotFoundError:", "\n    %pip install --quiet '..[synth]'")
-    assert [each for each in wanted if each not in code[0].source] == []
+    cells = [cell for cell in read_notebook(name).cells if cell.cell_type == "code"]
+    executed_cells = [cell for cell in cells if cell.outputs or cell.execution_count is not None]
+    assert executed_cells == []
+    assert "except ModuleNotFoundError:" in cells[0].source
+    assert "\n    %pip install --quiet '..[synth]'" in cells[0].source
 
 
-@pytest.mark.parametrize("name", LAST_WORDS)
+@pytest.mark.parametrize("name", LAST_OUTPUT)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client|zmq|nbclient|asyncio")
 def test_notebook_runs(
     name: str,
@@ -52,16 +53,18 @@ def test_notebook_runs(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv(
-        "DEEPACCIDENT", str(release_root if name in NEEDS_SENSORS else da_motion.dataroot)
-    )
+    root = release_root if name in NEEDS_SENSORS else da_motion.dataroot
+    monkeypatch.setenv("DEEPACCIDENT", str(root))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    notebook = read(name)
-    NotebookClient(
+    notebook = read_notebook(name)
+    client = NotebookClient(
         notebook,
-        timeout=SECONDS,
+        timeout=TIMEOUT_S,
         kernel_name="python3",
         resources={"metadata": {"path": str(TUTORIALS)}},
-    ).execute()
-    last = next(cell for cell in reversed(notebook.cells) if cell.cell_type == "code")
-    assert LAST_WORDS[name] in last.outputs[0].text
+    )
+
+    client.execute()
+
+    last_cell = next(cell for cell in reversed(notebook.cells) if cell.cell_type == "code")
+    assert LAST_OUTPUT[name] in last_cell.outputs[0].text

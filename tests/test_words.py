@@ -9,7 +9,7 @@ from pathlib import Path
 from spellchecker import SpellChecker
 
 TOP = Path(__file__).parents[1]
-READ = (
+PATTERNS = (
     "*.md",
     "benchmarks/*.md",
     "schema/*.md",
@@ -25,35 +25,29 @@ CODE = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 EXAMPLE_OR_NAME = re.compile(r"^ *>>> .*\n(?:.*\S.*\n)*|^ +\**\w+: ", re.MULTILINE)
-"""In docstrings: examples, and names of arguments."""
+"""Examples and names of arguments in docstrings."""
 TOKEN = re.compile(r"[^\W\d][\w'’]*(?:\.\w[\w.]*)?|\d[\w.]*")
 
 
 def prose(path: Path) -> str:
-    """A page, the Markdown of a notebook, or the docstrings of a module, without code."""
+    """Return the prose of a page, of a notebook or of a module's docstrings, without code."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".ipynb":
-        cells = json.loads(text)["cells"]
-        text = "\n\n".join(
-            "".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"
-        )
+        cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown"]
+        text = "\n\n".join("".join(cell["source"]) for cell in cells)
     if path.suffix == ".py":
         nodes = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Expr)]
-        texts = [
-            node.value
-            for node in nodes
-            if isinstance(node, ast.Constant) and isinstance(node.value, str)
-        ]
-        return CODE.sub(
-            " • ",
-            re.sub(r"^ +", " ", EXAMPLE_OR_NAME.sub("", "\n".join(texts)), flags=re.MULTILINE),
-        )
+        constants = [node.value for node in nodes if isinstance(node, ast.Constant)]
+        docstrings = [constant for constant in constants if isinstance(constant, str)]
+        text = EXAMPLE_OR_NAME.sub("", "\n".join(docstrings))
+        text = re.sub(r"^ +", " ", text, flags=re.MULTILINE)
     return CODE.sub(" • ", text)
 
 
-def words(text: str) -> Iterator[str]:
-    """The small letters of each word that can be misspelt: no abbreviations, units or names of
-    code.
+def checked_words(text: str) -> Iterator[str]:
+    """Yield each word that can be misspelt, in small letters.
+
+    Abbreviations, units and names of code are left out.
     """
     for token in TOKEN.findall(text):
         word = re.sub(r"['’]s?$", "", token.rstrip("."))
@@ -62,8 +56,14 @@ def words(text: str) -> Iterator[str]:
 
 
 def test_all_words_are_spelt_right() -> None:
-    known = (TOP / "tests" / "data" / "words" / "known.txt").read_text(encoding="utf-8").split()
-    paths = [path for pattern in READ for path in TOP.glob(pattern) if path.name != "CHANGELOG.md"]
-    used = {path.relative_to(TOP).as_posix(): {*words(prose(path))} for path in paths}
-    strange = SpellChecker().unknown(set.union(*used.values())) - {*known}
-    assert {name: sorted(of & strange) for name, of in used.items() if of & strange} == {}
+    known_words = (TOP / "tests" / "data" / "words" / "known.txt").read_text(encoding="utf-8")
+    words_by_page = {}
+    for pattern in PATTERNS:
+        for path in TOP.glob(pattern):
+            if path.name != "CHANGELOG.md":
+                words_by_page[path.relative_to(TOP).as_posix()] = {*checked_words(prose(path))}
+
+    all_words = set.union(*words_by_page.values())
+    misspelt = SpellChecker().unknown(all_words).difference(known_words.split())
+    pages = {name: sorted(words & misspelt) for name, words in words_by_page.items()}
+    assert {name: words for name, words in pages.items() if words} == {}

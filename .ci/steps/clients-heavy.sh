@@ -1,4 +1,4 @@
-# exports opened by readers that take long to install
+# exports opened by readers that take a long time to install
 source .ci/tools/step.sh
 need environment environment core "$PYTHON" '.[test,lint]'
 check 'environment mmdet3d_infos' environment mmdet3d_infos "$PYTHON" "$TORCH" \

@@ -3,7 +3,7 @@ source .ci/tools/step.sh
 need environment environment core "$PYTHON" '.[test,lint]'
 
 nuscenes_devkit=('nuscenes-devkit==1.2.0 motmetrics==1.4.0 pandas<3 numpy<2' "$TORCH numpy<2")
-# first without this package, as other people have it
+# first without this package, as in other people's environments
 check 'environment nuscenes_devkit' environment nuscenes_devkit "$PYTHON" "${nuscenes_devkit[@]}"
 check 'nuscenes-devkit reads the export' client nuscenes_devkit
 check 'environment tables' environment tables "$PYTHON" \
@@ -18,7 +18,7 @@ check 'nuScenes as a source' "$nuscenes/pytest" -q -n auto -p no:cacheprovider t
 check 'mlcroissant reads the data card' "$nuscenes/pytest" -q -m slow -p no:cacheprovider \
   tests/unit/validation/test_croissant.py
 
-# s3fs needs a botocore of its own
+# s3fs needs its own version of botocore
 check 'environment cloud' environment cloud "$PYTHON" '.[test,cloud]'
 same_botocore() {
   "$CI_ENVIRONMENTS/cloud/bin/pip" install --quiet 'moto[server]' \

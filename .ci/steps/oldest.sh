@@ -2,11 +2,11 @@
 source .ci/tools/step.sh
 python="$(python_of "$OLDEST")"
 mapfile -t bounds < <("$PYTHON" .ci/tools/lower_bounds.py)
-# matplotlib's oldest calls what newer pyparsing warns of
+# the oldest matplotlib calls functions that newer versions of pyparsing deprecate
 need environment environment oldest "$python" ".[test] ${bounds[*]} pyparsing==3.1.*"
 check libraries "$CI_ENVIRONMENTS/oldest/bin/python" -c \
   'import cv2, numpy; assert numpy.__version__ < "1.27"; print("numpy", numpy.__version__, "OpenCV", cv2.__version__)'
-# without plug-ins, pictures, whole releases, pages and words
+# without the tests of plug-ins, pictures, whole releases, pages and words
 check tests "$CI_ENVIRONMENTS/oldest/bin/pytest" -q -n auto -p no:cacheprovider tests --ignore tests/test_tutorials.py \
   --ignore tests/test_docs.py --ignore tests/test_site.py --ignore tests/browser --ignore-glob 'tests/test_cli*' \
   --ignore tests/unit/render --ignore tests/unit/testing --ignore tests/fault_injection \

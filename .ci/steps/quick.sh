@@ -1,4 +1,4 @@
-# linters, types, layers, and the tests of the core that take seconds
+# linters, types, layers, and the quick tests of the core
 source .ci/tools/step.sh
 need environment environment core "$PYTHON" '.[test,lint]'
 PATH="$CI_ENVIRONMENTS/core/bin:$PATH"

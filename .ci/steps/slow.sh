@@ -1,4 +1,4 @@
-# tests marked slow: chains of commands, campaigns of faults, whole matrices, engines of clusters
+# tests marked slow: chains of commands, campaigns of faults, full matrices, cluster engines
 source .ci/tools/step.sh
 need environment environment core "$PYTHON" '.[test,lint]'
 need MPI system mpiexec openmpi-bin

@@ -1,6 +1,7 @@
 # the PyTorch adapter, the model and the studies
 source .ci/tools/step.sh
-need environment environment torch "$PYTHON" "$TORCH" '.[torch,test,lint]' # PyTorch first, so that its range is met
+# PyTorch comes first: its CPU build then satisfies the range that the package requires
+need environment environment torch "$PYTHON" "$TORCH" '.[torch,test,lint]'
 PATH="$CI_ENVIRONMENTS/torch/bin:$PATH"
 # with PyTorch's own types
 check types mypy --strict deepaccident_devkit/training deepaccident_devkit/plugins/model deepaccident_devkit/plugins/study &

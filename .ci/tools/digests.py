@@ -1,13 +1,11 @@
-"""What two checkouts of the devkit compute and write, compared by named digests: `digests.py BEFORE
-AFTER`.
+"""Compare by named digests what two checkouts of the devkit compute and write.
 
-Both read the same releases, made by BEFORE with a fixed seed, one after the other in the same
-folder, so that paths in
-files are equal. A worker in each checkout writes a JSON file of names and digests: tables, labels,
-    predictions, counts
-and summaries of all protocols, studies, exports, releases in nuScenes' format, a generated release.
-A name that a checkout cannot compute has the error as its digest. Then the names that changed, came
-and went are printed. Exit status 1 if there is one that no --expect names.
+Usage: `digests.py BEFORE AFTER`. Both read the same releases, which BEFORE made with a fixed seed,
+one after the other in the same folder, so that paths in files are equal. A worker in each checkout
+writes a JSON file of names and digests: tables, labels, predictions, counts and summaries of all
+protocols, studies, exports, releases in nuScenes' format, and a generated release. If a checkout
+cannot compute a name, the error is its digest. Then the names that changed, came and went are
+printed. The exit status is 1 if any of them matches no --expect.
 
     python .ci/tools/digests.py ../main . --expect 'evaluate/warning/boxes/*' --expect
     'export/*.manifest.json'
@@ -39,7 +37,7 @@ RELEASES = {
     "labelled": ["--scenarios", "6", "--frames", "35", "--sensors", "none", "--seed", "977"],
     "sensors": ["--scenarios", "2", "--frames", "11", "--size", "32x18", "--seed", "978"],
 }
-"""Name → how `synth` makes it: one with pasts and futures, and a small one with all sensors."""
+"""Release → options of `synth`: one with pasts and futures, and a small one with all sensors."""
 GENERATED = [
     "--scenarios",
     "2",
@@ -53,7 +51,7 @@ GENERATED = [
     "B",
     "--designed",
 ]
-"""How each checkout makes a release of its own, all of whose files are compared."""
+"""Options of `synth` for the release that each checkout makes; all its files are compared."""
 EXPORTS = {
     "cache": ("sensors", ["cache", "--size", "16x9", "--where", "length=1..1000"]),
     "labels": ("labelled", ["labels", "--samples", "all", "--split"]),
@@ -74,8 +72,9 @@ EXPORTS = {
     "town-maps": ("sensors", ["export", "town-maps"]),
     "webdataset": ("sensors", ["export", "webdataset"]),
 }
-"""Name → the release that is exported, and the command; what ends in --split gets a split file of
-all scenarios.
+"""Name → the release that is exported, and the command.
+
+Commands that end in --split get a split file of all scenarios.
 """
 NUSCENES_EXPORTS = {
     "labelled": ["--agents", "ego_vehicle,other_vehicle"],
@@ -141,18 +140,18 @@ STUDIES: dict[str, dict[str, Any]] = {
 }
 """Name → recipe of a study without models."""
 FILES_LEFT_OUT = {
-    "*.deepaccident*": "marks of how far an export is, for the devkit alone",
-    "*.manifest.json": "names the version of the devkit and of what it kept",
+    "*.deepaccident*": "marks of how far an export is, only for the devkit",
+    "*.manifest.json": "names the version of the devkit and of stored results",
 }
 """Pattern of files that are not compared → why."""
 KEYS_LEFT_OUT = {
     "devkit_version": "a version",
     "environment": "versions of libraries",
-    "settings": "all choices of the protocol: one that nobody can choose is none",
+    "settings": "all choices of the protocol, which later versions extend",
     "switches": "as settings",
-    "explanation": "asked for by no evaluation here",
-    "sanity": "asked for by no evaluation here",
-    "results": "where the predictions are, and notes with a version; they "
+    "explanation": "no evaluation here asks for it",
+    "sanity": "no evaluation here asks for it",
+    "results": "paths of the predictions, and notes with a version; predictions "
     "have digests of their own",
 }
 """Key of an evaluation's summary that is not compared → why."""
@@ -171,28 +170,26 @@ STUDY_FILES_LEFT_OUT = {
 """File of a study's results that is not compared → why."""
 SPLIT = "everything.txt"
 """Name of a split file of all scenarios of the labelled release."""
-SHOWN = 20
-"""Names of a section that are printed one by one."""
+MAX_PRINTED = 20
+"""Number of names of a section that are printed one by one."""
 Digests = dict[str, str]
 
 
 def digest(value: object) -> str:
-    """A hash of values: arrays by type, shape and bytes, records by the fields that say
-    something.
-    """
-    made = hashlib.sha256()
+    """Return a hash of values: arrays by type, shape and bytes, records by their fields."""
+    sha = hashlib.sha256()
     for part in _parts(value):
-        made.update(part)
-    return made.hexdigest()[:16]
+        sha.update(part)
+    return sha.hexdigest()[:16]
 
 
 def _parts(value: Any) -> Iterator[bytes]:
-    """What a value is made of, as bytes."""
+    """Yield the content of a value as bytes."""
     if dataclasses.is_dataclass(value):
-        value = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         for name in sorted(value, key=repr):
-            if value[name] is not None:  # a field that is not set may as well not be there
+            if value[name] is not None:  # a field that is None equals a field that is missing
                 yield f"{name!r}:".encode()
                 yield from _parts(value[name])
     elif isinstance(value, bytes):
@@ -202,46 +199,46 @@ def _parts(value: Any) -> Iterator[bytes]:
         yield value.tobytes()
     elif isinstance(value, Iterable) and not isinstance(value, str):
         yield b"["
-        for each in value:
-            yield from _parts(each)
+        for item in value:
+            yield from _parts(item)
         yield b"]"
     else:
         yield f"{value!r},".encode()
 
 
 def leaves(value: Any, name: str = "", depth: int = 3) -> Iterator[tuple[str, str]]:
-    """Name and text of each value of a JSON document; the digest of what is long, or deeper in
-    it.
+    """Yield the name and text of each value of a JSON document.
+
+    The text of a value that is long or lies deeper than `depth` is its digest.
     """
     if isinstance(value, list) and value and isinstance(value[0], Mapping):
         value = dict(enumerate(value))
     if isinstance(value, Mapping) and depth:
-        for key, each in value.items():
-            yield from leaves(each, f"{name}/{key}", depth - 1)
+        for key, item in value.items():
+            yield from leaves(item, f"{name}/{key}", depth - 1)
     else:
         text = json.dumps(value)
         yield name.removeprefix("/"), text if len(text) <= 40 else digest(value)
 
 
-class Found:
-    """The digests of a checkout, as they are found."""
+class DigestCollector:
+    """Collects the digests of a checkout."""
 
     def __init__(self) -> None:
         self.digests: Digests = {}
 
-    def add(self, name: str, find: Callable[..., object], *arguments: object) -> None:
-        """Take the digest of what a function gives, or those by name that it gives, or the error
-        that it raises.
-        """
+    def add(self, name: str, compute: Callable[..., object], *arguments: object) -> None:
+        """Add the digest of what a function returns, its digests by name, or its error."""
         try:
-            found = find(*arguments)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a name that went brings about
+            result = compute(*arguments)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a removed name may raise anything
             self.digests[name] = f"{type(error).__name__}: {str(error)[:160]}"
+            return
+        if isinstance(result, Mapping):
+            for part, part_digest in result.items():
+                self.digests[f"{name}/{part}"] = part_digest
         else:
-            if isinstance(found, Mapping):
-                self.digests |= {f"{name}/{part}": each for part, each in found.items()}
-            else:
-                self.digests[name] = digest(found)
+            self.digests[name] = digest(result)
 
 
 def first_of(*names: str) -> ModuleType:
@@ -267,101 +264,95 @@ def plugin(name: str) -> ModuleType:
 
 
 def command(*arguments: str) -> None:
-    """Run a command of the devkit in this process, silently; older checkouts spell some options
-    otherwise.
-    """
+    """Run a command of the devkit in this process, silently, with the options of its checkout."""
     import click
 
     from deepaccident_devkit.cli import deepaccident
 
     with (
-        Path(os.devnull).open("w") as nowhere,
-        contextlib.redirect_stdout(nowhere),
-        contextlib.redirect_stderr(nowhere),
+        Path(os.devnull).open("w") as sink,
+        contextlib.redirect_stdout(sink),
+        contextlib.redirect_stderr(sink),
     ):
         try:
             deepaccident.main(list(arguments), standalone_mode=False)
         except click.UsageError:
-            deepaccident.main(_as_before(arguments), standalone_mode=False)
+            deepaccident.main(_former_arguments(arguments), standalone_mode=False)
 
 
-def _as_before(arguments: Sequence[str]) -> list[str]:
-    """A command as it was written before November 2026; every spelling that went gets a line
-    here.
-    """
+def _former_arguments(arguments: Sequence[str]) -> list[str]:
+    """Return a command in the spelling of November 2026; add a line for each option renamed."""
     words = [word for word in arguments if word != "--designed"]
     if words != list(arguments):
-        return words  # of a day on which the other spellings were there
-    size = {"synth": "--image-size", "cache": "--resize"}.get(words[0], "--size")
-    return (
-        "\0".join(words)
-        .replace("--sensors\0none", "--no-sensors")
-        .replace("--size", size)
-        .split("\0")
-    )
+        return words  # that checkout lacks only --designed
+    size_option = {"synth": "--image-size", "cache": "--resize"}.get(words[0], "--size")
+    line = "\0".join(words)
+    line = line.replace("--sensors\0none", "--no-sensors").replace("--size", size_option)
+    return line.split("\0")
 
 
 def digests_of_files(folder: Path, left_out: Iterable[str] = FILES_LEFT_OUT) -> Digests:
-    """Map the relative path of each file to a hash of its content, or of where a link leads to."""
-    patterns, found = tuple(left_out), {}
+    """Return relative path → hash of the content of a file, or of the target of a link."""
+    patterns = tuple(left_out)
+    digests = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if not path.is_dir() and not any(fnmatchcase(name, pattern) for pattern in patterns):
-            found[name] = digest(str(path.readlink()) if path.is_symlink() else path.read_bytes())
-    return found
+        if path.is_dir() or any(fnmatchcase(name, pattern) for pattern in patterns):
+            continue
+        digests[name] = digest(str(path.readlink()) if path.is_symlink() else path.read_bytes())
+    return digests
 
 
 def digests_of_tables(dataset: Any, table: str) -> Digests:
-    """Each column as Arrow holds it, and each further field as records have it."""
+    """Return a digest of each column as Arrow holds it, and of each other field of the records."""
     arrow, records = dataset.arrow(table), list(getattr(dataset, table))
-    fields = [field for field in (records[0] if records else ()) if field not in arrow.column_names]
-    return {
-        **{
-            name: digest([str(arrow.schema.field(name).type), arrow[name].to_pylist()])
-            for name in arrow.column_names
-        },
-        **{name: digest([record[name] for record in records]) for name in fields},
-    }
+    digests = {}
+    for name in arrow.column_names:
+        digests[name] = digest([str(arrow.schema.field(name).type), arrow[name].to_pylist()])
+    for name in records[0] if records else ():
+        if name not in digests:
+            digests[name] = digest([record[name] for record in records])
+    return digests
 
 
-def add_tables(found: Found, name: str, dataset: Any) -> None:
-    """The index's tables, and what is derived from them: boxes, and pairs of road users."""
+def add_tables(collector: DigestCollector, name: str, dataset: Any) -> None:
+    """Add digests of the tables, and of the boxes and pairs of road users derived from them."""
     for table in dataset.table_names:
-        found.add(f"tables/{name}/{table}", digests_of_tables, dataset, table)
+        collector.add(f"tables/{name}/{table}", digests_of_tables, dataset, table)
     for frame in ("world", "ego", "lidar"):
-        found.add(f"tables/{name}/box/{frame}", digests_of_boxes, dataset, frame)
+        collector.add(f"tables/{name}/box/{frame}", digests_of_boxes, dataset, frame)
     for record in dataset.scenario:
-        found.add(
+        collector.add(
             f"tables/{name}/interaction/{record['token']}",
-            digests_of_pairs,
+            digests_of_interactions,
             dataset,
             record["token"],
         )
 
 
 def digests_of_boxes(dataset: Any, frame: str) -> Digests:
-    """Each field of the boxes of some samples."""
+    """Return a digest of each field of the boxes of some samples."""
     boxes = [dataset.boxes(token, frame) for token in some_samples(dataset, 40)]
-    return {
-        each.name: digest([getattr(one, each.name) for one in boxes])
-        for each in dataclasses.fields(boxes[0])
-    }
+    digests = {}
+    for field in dataclasses.fields(boxes[0]):
+        digests[field.name] = digest([getattr(sample_boxes, field.name) for sample_boxes in boxes])
+    return digests
 
 
-def digests_of_pairs(dataset: Any, scenario: str) -> Digests:
-    """Each column of the two tables of a scenario's interactions."""
+def digests_of_interactions(dataset: Any, scenario: str) -> Digests:
+    """Return a digest of each column of the two tables of a scenario's interactions."""
     from deepaccident_devkit.interactions import interactions
 
-    made = interactions(dataset, scenario)
-    tables = {"interaction": made.to_arrow(), "interaction_pair": made.pairs.to_arrow()}
-    return {
-        f"{name}/{column}": digest(of[column].to_pylist())
-        for name, of in tables.items()
-        for column in of.column_names
-    }
+    result = interactions(dataset, scenario)
+    tables = {"interaction": result.to_arrow(), "interaction_pair": result.pairs.to_arrow()}
+    digests = {}
+    for name, table in tables.items():
+        for column in table.column_names:
+            digests[f"{name}/{column}"] = digest(table[column].to_pylist())
+    return digests
 
 
-def add_labels(found: Found, name: str, dataset: Any) -> None:
+def add_labels(collector: DigestCollector, name: str, dataset: Any) -> None:
     """Add digests of the motion labels by each preset and protocol."""
     from deepaccident_devkit.motion import LABEL_PROTOCOLS, PRESETS, MotionLabelConfig
 
@@ -374,22 +365,22 @@ def add_labels(found: Found, name: str, dataset: Any) -> None:
         "vehicles": MotionLabelConfig(only_vehicle=True),
     }
     for choice, config in configs.items():
-        found.add(f"labels/{name}/{choice}", digests_of_labels, dataset, config)
+        collector.add(f"labels/{name}/{choice}", digests_of_labels, dataset, config)
 
 
-def add_segmentation(found: Found, dataset: Any) -> None:
+def add_segmentation(collector: DigestCollector, dataset: Any) -> None:
     """Add digests of the targets of segmentation, which need the images from above."""
     from deepaccident_devkit.motion import bev_segmentation
 
     for token in some_samples(dataset, 6):
-        found.add(f"labels/segmentation/{token}", bev_segmentation, dataset, token)
+        collector.add(f"labels/segmentation/{token}", bev_segmentation, dataset, token)
 
 
 def digests_of_labels(dataset: Any, config: Any) -> Digests:
-    """All arrays of the labels of some samples."""
+    """Return a digest of each array of the labels of some samples."""
     from deepaccident_devkit.motion import motion_labels
 
-    made = [motion_labels(dataset, token, config) for token in some_samples(dataset, 12)]
+    labels = [motion_labels(dataset, token, config) for token in some_samples(dataset, 12)]
     fields = (
         "segmentation",
         "instance",
@@ -400,7 +391,7 @@ def digests_of_labels(dataset: Any, config: Any) -> Digests:
         "valid",
         "id_map",
     )
-    return {field: digest([getattr(each, field) for each in made]) for field in fields}
+    return {field: digest([getattr(label, field) for label in labels]) for field in fields}
 
 
 def some_samples(dataset: Any, count: int) -> list[str]:
@@ -434,7 +425,7 @@ class Evaluated:
 
 
 def baselines() -> dict[str, Any]:
-    """Return the baselines whose predictions are evaluated."""
+    """Return the baselines to evaluate."""
     from deepaccident_devkit.v2x import Link
 
     baseline = plugin("baselines").Baseline
@@ -447,7 +438,7 @@ def baselines() -> dict[str, Any]:
     }
 
 
-def add_evaluations(found: Found, evaluated: Evaluated) -> None:
+def add_evaluations(collector: DigestCollector, evaluated: Evaluated) -> None:
     """Add digests of predictions, and of evaluations by each protocol of each task."""
     from deepaccident_devkit.evaluation import read_results
     from deepaccident_devkit.evaluation.runs.setups import TASKS
@@ -461,18 +452,16 @@ def add_evaluations(found: Found, evaluated: Evaluated) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         tokens = predicted_samples(evaluated, kind)
         results = read_results(predict_results(dataset, kind, tokens, path, baseline, workers=1))
-        found.add(f"predicted/{label}", map, results.prediction, tokens)
+        collector.add(f"predicted/{label}", map, results.prediction, tokens)
         if kind == "motion":
-            found.add(f"predicted/{label}, as forecasts", motion_forecasts, dataset, results)
+            collector.add(f"predicted/{label}, as forecasts", motion_forecasts, dataset, results)
         for task, protocol in protocols_of(tasks, kind):
             digest_name = f"evaluate/{task}/{protocol}/{label}"
-            found.add(digest_name, digests_of_evaluation, evaluated, results, task, protocol)
+            collector.add(digest_name, digests_of_evaluation, evaluated, results, task, protocol)
 
 
 def result_kinds(task: Any) -> tuple[str, ...]:
-    """Return the kinds of results that a task is evaluated from; checkouts before November 30
-    called them `kinds`.
-    """
+    """Return the kinds of results that a task is evaluated from (once called `kinds`)."""
     kinds: tuple[str, ...] = task.result_kinds if hasattr(task, "result_kinds") else task.kinds
     return kinds
 
@@ -525,20 +514,20 @@ def digests_of_evaluation(evaluated: Evaluated, results: Any, task: Any, protoco
     run = run.broken_down(None, resampling)
     if (task, protocol) == ("warning", "clean"):
         run = plugin("safety.prevention").with_prevented(run, dataset, resampling)
-    summary = {name: each for name, each in run.summary().items() if name not in KEYS_LEFT_OUT}
+    summary = {name: value for name, value in run.summary().items() if name not in KEYS_LEFT_OUT}
     breakdowns = summary.pop("breakdowns")
     return {
         **dict(leaves(summary)),
-        **{f"breakdowns/{by}": digest(each) for by, each in breakdowns.items()},
+        **{f"breakdowns/{name}": digest(table) for name, table in breakdowns.items()},
         "counts of samples": digest(dict(run.evaluator.counts)),
     }
 
 
-def add_studies(found: Found, folder: Path) -> None:
+def add_studies(collector: DigestCollector, folder: Path) -> None:
     """Add digests of studies without models, and of the recipes that ship."""
     for name in STUDIES:
-        found.add(f"study/{name}", digests_of_study, name, folder)
-    found.add("recipe", digests_of_recipes)
+        collector.add(f"study/{name}", digests_of_study, name, folder)
+    collector.add("recipe", digests_of_recipes)
 
 
 def digests_of_study(name: str, folder: Path) -> Digests:
@@ -580,26 +569,30 @@ def digests_of_recipes() -> Digests:
     return digests
 
 
-def add_nuscenes(found: Found, here: Path) -> None:
+def add_nuscenes(collector: DigestCollector, folder: Path) -> None:
     """Add digests of exports to nuScenes' format, opened as releases."""
     for name, options in NUSCENES_EXPORTS.items():
-        dataroot = here / "nuscenes" / name
-        release = here / "releases" / name
+        dataroot = folder / "nuscenes" / name
+        release = folder / "releases" / name
         command("export", "nuscenes", str(release), "--out", str(dataroot), *options)
         dataset, label = plugin("nuscenes").open_nuscenes(dataroot), f"nuscenes {name}"
-        add_tables(found, label, dataset)
+        add_tables(collector, label, dataset)
         every_box = f"tables/{label}/annotation with ignored"
-        found.add(every_box, digests_of_tables, dataset.with_ignored, "annotation")
-        add_labels(found, label, dataset)
-        found.add(f"check/{label}", plugin("nuscenes.check").check_source, dataset)
+        collector.add(every_box, digests_of_tables, dataset.with_ignored, "annotation")
+        add_labels(collector, label, dataset)
+        collector.add(f"check/{label}", plugin("nuscenes.check").check_source, dataset)
         if name == "sensors":
             for token in some_samples(dataset, 6):
-                found.add(f"sensors/{label}/{token}", digests_of_sensors, dataset, token)
+                collector.add(f"sensors/{label}/{token}", digests_of_sensors, dataset, token)
         else:
-            add_nuscenes_evaluations(found, label, dataset, dataroot.with_name(f"{name} predicted"))
+            add_nuscenes_evaluations(
+                collector, label, dataset, dataroot.with_name(f"{name} predicted")
+            )
 
 
-def add_nuscenes_evaluations(found: Found, name: str, dataset: Any, folder: Path) -> None:
+def add_nuscenes_evaluations(
+    collector: DigestCollector, name: str, dataset: Any, folder: Path
+) -> None:
     """Add digests of evaluations on nuScenes, and of detections in nuScenes' own format."""
     split = folder / SPLIT
     write_split(split, dataset)
@@ -613,10 +606,10 @@ def add_nuscenes_evaluations(found: Found, name: str, dataset: Any, folder: Path
         tasks=NUSCENES_TASKS,
         scope="all",  # none of its scenarios is designed to end in an accident
     )
-    add_evaluations(found, evaluated)
+    add_evaluations(collector, evaluated)
     results = folder / "constant velocity" / "detection.json"
     own_format = f"predicted/{name}/constant velocity, nuScenes' detections"
-    found.add(own_format, nuscenes_detections, dataset, results)
+    collector.add(own_format, nuscenes_detections, dataset, results)
 
 
 def nuscenes_detections(dataset: Any, results: Path) -> bytes:
@@ -650,69 +643,69 @@ def write_split(path: Path, dataset: Any) -> None:
     path.write_text("".join(lines))
 
 
-def digests_of_export(name: str, here: Path) -> Digests:
-    """The files that an export writes."""
+def digests_of_export(name: str, folder: Path) -> Digests:
+    """Return digests of the files that an export writes."""
     release, words = EXPORTS[name]
-    out = here / "exported" / name / ("scene.mcap" if name == "mcap" else "out")
+    out = folder / "exported" / name / ("scene.mcap" if name == "mcap" else "out")
     out.parent.mkdir(parents=True)
-    split = [str(here / SPLIT)] if words[-1] == "--split" else []
-    command(*words, *split, str(here / "releases" / release), "--out", str(out))
+    split = [str(folder / SPLIT)] if words[-1] == "--split" else []
+    command(*words, *split, str(folder / "releases" / release), "--out", str(out))
     return digests_of_files(out.parent)
 
 
-def digests_of_generated(here: Path) -> Digests:
-    """The files of a release that this checkout makes."""
-    command("synth", str(here / "generated"), *GENERATED)
-    return digests_of_files(here / "generated")
+def digests_of_generated(folder: Path) -> Digests:
+    """Return digests of the files of a release that this checkout makes."""
+    command("synth", str(folder / "generated"), *GENERATED)
+    return digests_of_files(folder / "generated")
 
 
-def work(out: Path) -> None:
-    """Find all digests of the checkout on the path, from the releases in this folder, and write
-    them.
-    """
+def write_digests(out: Path) -> None:
+    """Write all digests of the checkout on the path, from the releases in this folder."""
     import deepaccident_devkit
     from deepaccident_devkit import DeepAccident
 
     print(f"  {deepaccident_devkit.__file__}", flush=True)
-    here, found = Path.cwd(), Found()
+    folder, collector = Path.cwd(), DigestCollector()
     dataset, sensors = (
-        DeepAccident("v1", here / "releases" / name, verbose=False) for name in RELEASES
+        DeepAccident("v1", folder / "releases" / name, verbose=False) for name in RELEASES
     )
-    write_split(here / SPLIT, dataset)
+    write_split(folder / SPLIT, dataset)
 
     def labels() -> None:
-        add_labels(found, "labelled", dataset)
-        add_segmentation(found, sensors)
+        add_labels(collector, "labelled", dataset)
+        add_segmentation(collector, sensors)
 
     def evaluations() -> None:
         evaluated = Evaluated(
             name="labelled",
             dataset=dataset,
-            split=here / SPLIT,
-            folder=here / "predicted",
+            split=folder / SPLIT,
+            folder=folder / "predicted",
             baselines=baselines(),
         )
-        add_evaluations(found, evaluated)
+        add_evaluations(collector, evaluated)
 
     def exports() -> None:
         for name in EXPORTS:
-            found.add(f"export/{name}", digests_of_export, name, here)
+            collector.add(f"export/{name}", digests_of_export, name, folder)
 
     sections: dict[str, Callable[[], None]] = {
-        "synth": lambda: found.add("synth", digests_of_generated, here),
-        "tables of labels": lambda: add_tables(found, "labelled", dataset),
-        "tables with sensors": lambda: add_tables(found, "sensors", sensors),
+        "synth": lambda: collector.add("synth", digests_of_generated, folder),
+        "tables of labels": lambda: add_tables(collector, "labelled", dataset),
+        "tables with sensors": lambda: add_tables(collector, "sensors", sensors),
         "labels": labels,
         "evaluations": evaluations,
-        "studies": lambda: add_studies(found, here / "studies"),
+        "studies": lambda: add_studies(collector, folder / "studies"),
         "exports": exports,
-        "nuScenes": lambda: add_nuscenes(found, here),
+        "nuScenes": lambda: add_nuscenes(collector, folder),
     }
     for name, section in sections.items():
-        before = len(found.digests)
-        found.add(f"all {name}", section)
-        print(f"  {name}: {len(found.digests) - before:,} digests", flush=True)
-    out.write_text(json.dumps(found.digests, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
+        before = len(collector.digests)
+        collector.add(f"all {name}", section)
+        print(f"  {name}: {len(collector.digests) - before:,} digests", flush=True)
+    out.write_text(
+        json.dumps(collector.digests, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+    )
 
 
 def run_in(checkout: Path, python: str, *arguments: str, folder: Path) -> None:
@@ -727,7 +720,7 @@ def run_in(checkout: Path, python: str, *arguments: str, folder: Path) -> None:
 
 
 def digests_in(checkout: Path, python: str, releases: Path, folder: Path) -> Digests:
-    """What a worker in a checkout finds; the folder is made anew."""
+    """Return the digests that a worker in a checkout computes in a new folder."""
     shutil.rmtree(folder, ignore_errors=True)
     without_index = shutil.ignore_patterns(".deepaccident")
     shutil.copytree(
@@ -735,12 +728,12 @@ def digests_in(checkout: Path, python: str, releases: Path, folder: Path) -> Dig
     )
     out = folder / "digests.json"
     run_in(checkout, python, __file__, "--worker", str(out), folder=folder)
-    found: Digests = json.loads(out.read_text())
-    return found
+    digests: Digests = json.loads(out.read_text())
+    return digests
 
 
 def make_releases(checkout: Path, python: str, folder: Path) -> None:
-    """Make the releases by a checkout."""
+    """Make the releases with a checkout."""
     for name, words in RELEASES.items():
         call = (
             f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from "
@@ -759,36 +752,35 @@ def make_releases(checkout: Path, python: str, folder: Path) -> None:
 
 
 def differences(before: Digests, after: Digests) -> dict[str, str]:
-    """Name → how it differs."""
-    return {
-        **{name: f"went (was {each})" for name, each in before.items() if name not in after},
-        **{name: f"came ({each})" for name, each in after.items() if name not in before},
-        **{
-            name: f"changed: {each} → {after[name]}"
-            for name, each in before.items()
-            if name in after and after[name] != each
-        },
-    }
+    """Return name → how its digest differs."""
+    changes = {}
+    for name, old_digest in before.items():
+        if name not in after:
+            changes[name] = f"went (was {old_digest})"
+        elif after[name] != old_digest:
+            changes[name] = f"changed: {old_digest} → {after[name]}"
+    for name, new_digest in after.items():
+        if name not in before:
+            changes[name] = f"came ({new_digest})"
+    return changes
 
 
-def report(found: Mapping[str, str], title: str) -> None:
-    """Print names and how they differ; of a section with many, some and the number of the
-    others.
-    """
-    print(f"{title}: {len(found):,}")
-    printed: Counter[str] = Counter()
-    for name, how in sorted(found.items()):
+def print_differences(changes: Mapping[str, str], title: str) -> None:
+    """Print names and how they differ; of a long section only some, and how many more it has."""
+    print(f"{title}: {len(changes):,}")
+    counts: Counter[str] = Counter()
+    for name, change in sorted(changes.items()):
         section = "/".join(name.split("/")[:3])
-        printed[section] += 1
-        if printed[section] <= SHOWN:
-            print(f"  {name}: {how}")
-    for section, number in printed.items():
-        if number > SHOWN:
-            print(f"  {section}/…: {number - SHOWN:,} more")
+        counts[section] += 1
+        if counts[section] <= MAX_PRINTED:
+            print(f"  {name}: {change}")
+    for section, count in counts.items():
+        if count > MAX_PRINTED:
+            print(f"  {section}/…: {count - MAX_PRINTED:,} more")
 
 
-def parsed() -> argparse.Namespace:
-    """The arguments."""
+def parse_arguments() -> argparse.Namespace:
+    """Return the arguments of the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument(
         "checkouts", nargs="*", type=Path, metavar="CHECKOUT", help="two folders: BEFORE and AFTER"
@@ -801,48 +793,50 @@ def parsed() -> argparse.Namespace:
     )
     parser.add_argument("--python", default=sys.executable, help="interpreter of both workers")
     parser.add_argument(
-        "--keep", type=Path, help="folder for releases and digests, in place of a temporary one"
+        "--keep", type=Path, help="folder for releases and digests, instead of a temporary one"
     )
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.worker is None and len(given.checkouts) != 2:
+    arguments = parser.parse_args()
+    if arguments.worker is None and len(arguments.checkouts) != 2:
         parser.error("give two checkouts")
-    return given
+    return arguments
+
+
+def compare(arguments: argparse.Namespace, folder: Path) -> tuple[Digests, Digests]:
+    """Return the digests of the two checkouts; also write them into a folder."""
+    (folder / "releases").mkdir(parents=True, exist_ok=True)
+    before, after = (checkout.resolve() for checkout in arguments.checkouts)
+    releases = folder / "releases"
+    if arguments.release is not None:
+        releases = arguments.release.resolve()
+    else:
+        make_releases(before, arguments.python, releases)
+    results = []
+    for name, checkout in (("before", before), ("after", after)):
+        print(f"{name}: {checkout}", flush=True)
+        digests = digests_in(checkout, arguments.python, releases, folder / "run")
+        text = json.dumps(digests, indent=1, sort_keys=True, ensure_ascii=False)
+        (folder / f"{name}.json").write_text(text)
+        results.append(digests)
+    return results[0], results[1]
 
 
 def main() -> int:
-    """Compare; returns the exit status."""
-    given = parsed()
-    if given.worker is not None:
-        work(given.worker)
+    """Compare two checkouts; return the exit status."""
+    arguments = parse_arguments()
+    if arguments.worker is not None:
+        write_digests(arguments.worker)
         return 0
     with tempfile.TemporaryDirectory() as temporary:
-        folder = (given.keep or Path(temporary)).resolve()
-        (folder / "releases").mkdir(parents=True, exist_ok=True)
-        before, after = (checkout.resolve() for checkout in given.checkouts)
-        releases = given.release.resolve() if given.release else folder / "releases"
-        if given.release is None:
-            make_releases(before, given.python, releases)
-        found = []
-        for name, checkout in (("before", before), ("after", after)):
-            print(f"{name}: {checkout}", flush=True)
-            found.append(digests_in(checkout, given.python, releases, folder / "run"))
-            (folder / f"{name}.json").write_text(
-                json.dumps(found[-1], indent=1, sort_keys=True, ensure_ascii=False)
-            )
-        different = differences(*found)
-    expected = {
-        n: how
-        for n, how in different.items()
-        if any(fnmatchcase(n, pattern) for pattern in given.expect)
-    }
-    unexpected = {name: how for name, how in different.items() if name not in expected}
-    print(
-        f"{sum(name in found[1] for name in found[0]) - sum('changed' in how for how in different.values()):,} "  # noqa: E501
-        f"equal"
-    )
-    report(expected, "as expected")
-    report(unexpected, "unexpected")
+        before, after = compare(arguments, (arguments.keep or Path(temporary)).resolve())
+    expected, unexpected = {}, {}
+    for name, change in differences(before, after).items():
+        is_expected = any(fnmatchcase(name, pattern) for pattern in arguments.expect)
+        (expected if is_expected else unexpected)[name] = change
+    equal_count = sum(before[name] == after.get(name) for name in before)
+    print(f"{equal_count:,} equal")
+    print_differences(expected, "as expected")
+    print_differences(unexpected, "unexpected")
     return int(bool(unexpected))
 
 

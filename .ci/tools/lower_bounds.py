@@ -1,10 +1,12 @@
-"""The lower bounds of what a user or the tests install, for pip: `name==1.2.*` of each `name>=1.2`
-in pyproject.toml.
+"""Print the lower bounds of what a user or the tests install, as requirements for pip.
+
+Each `name>=1.2` in pyproject.toml becomes `name==1.2.*`; of several bounds of a name the largest
+counts.
 
     pip install '.[test]' $(python .ci/tools/lower_bounds.py)
     pip install '.[synth]' $(python .ci/tools/lower_bounds.py synth)
 
-The extra is `test` without a word. Of several bounds of a name the largest counts.
+Without an argument the extra is `test`.
 """
 
 import re
@@ -20,21 +22,19 @@ with (Path(__file__).parents[2] / "pyproject.toml").open("rb") as file:
     project = tomllib.load(file)["project"]
 extras = project["optional-dependencies"]
 extra = extras[sys.argv[1] if len(sys.argv) > 1 else "test"]
-others = [
-    name
-    for each in extra
-    if each.startswith("deepaccident_devkit[")
-    for name in re.findall(r"\w+", each)[1:]
-]
+requirements = [*project["dependencies"], *extra]
+for requirement in extra:
+    if requirement.startswith("deepaccident_devkit["):
+        for name in re.findall(r"\w+", requirement)[1:]:
+            requirements += extras[name]
 bounds: dict[str, tuple[int, ...]] = {}
-for requirement in [
-    *project["dependencies"],
-    *extra,
-    *(each for name in others for each in extras[name]),
-]:
-    found = re.match(r"([\w-]+)>=([\d.]+)", requirement)
-    if found:
-        bound = tuple(map(int, found[2].split(".")))
-        bounds[found[1]] = max(bounds.get(found[1], ()), bound if len(bound) > 1 else (*bound, 0))
+for requirement in requirements:
+    match = re.match(r"([\w-]+)>=([\d.]+)", requirement)
+    if match:
+        name, version = match.groups()
+        bound = tuple(map(int, version.split(".")))
+        if len(bound) == 1:
+            bound = (*bound, 0)
+        bounds[name] = max(bounds.get(name, ()), bound)
 for name, bound in bounds.items():
     print(f"{name}=={'.'.join(map(str, bound))}.*")

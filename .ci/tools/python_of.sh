@@ -1,4 +1,5 @@
-# A Python of this version: on the path, where pyenv's may stand and not run, or pyenv's own; $PYTHON if there is none.
+# Prints a Python of this version that runs, from the path (where pyenv's shims may fail) or from pyenv; otherwise
+# prints $PYTHON.
 python_of() {
   local candidate
   for candidate in "python$1" "$HOME"/.pyenv/versions/"$1".*/bin/python3; do
@@ -7,6 +8,6 @@ python_of() {
       return
     fi
   done
-  echo "no Python $1 at hand: $PYTHON ($("$PYTHON" --version)) takes its place" >&2
+  echo "no Python $1 at hand: $PYTHON ($("$PYTHON" --version)) is used instead" >&2
   printf '%s\n' "$PYTHON"
 }

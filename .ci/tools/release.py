@@ -1,4 +1,4 @@
-"""The version of a release: set it, check that all files agree on it, print its notes.
+"""Set the version of a release, check that all files agree on it, or print its notes.
 
     python .ci/tools/release.py set 1.1.0       write it and its date wherever a release states them
     python .ci/tools/release.py check v1.1.0    compare these places with the tag
@@ -23,7 +23,7 @@ PLACES = {
     "CITATION.cff": r"(?m)^version: (.*)$",
     "CHANGELOG.md": r"(?m)^## \[(\d.*?)\]",
 }
-"""Where the version stands, and how to find it; the first is the source."""
+"""File that states the version → pattern that finds it; the first file is the source."""
 
 
 def main(arguments: list[str], top: Path) -> int:
@@ -41,9 +41,7 @@ def main(arguments: list[str], top: Path) -> int:
 
 
 def set_version(top: Path, version: str) -> int:
-    """Write a version, today's date, the matching classifier and the addresses of the
-    repository.
-    """
+    """Write a version, today's date, the classifier, and the addresses of the repository."""
     if not VERSION.fullmatch(version):
         print(f"{version} is no version such as 1.1.0 or 1.1.0rc1", file=sys.stderr)
         return 2
@@ -67,9 +65,7 @@ def set_version(top: Path, version: str) -> int:
 
 
 def check(top: Path, tag: str | None = None) -> int:
-    """Print what disagrees with the version of the package, or with the tag; return 1 if anything
-    does.
-    """
+    """Print what disagrees with the version of the package or with the tag; return 1 if any."""
     faults = list(disagreements(top, tag))
     print("\n".join(faults) or f"all files state version {version_of(top)}")
     return 1 if faults else 0
@@ -82,12 +78,13 @@ def print_notes(top: Path) -> int:
 
 
 def disagreements(top: Path, tag: str | None) -> Iterator[str]:
-    """What a release would state wrongly, a line each."""
+    """Yield one line for each thing that a release would state wrongly."""
     version = version_of(top)
     for name, pattern in PLACES.items():
-        found = re.search(pattern, (top / name).read_text(encoding="utf-8"))
-        if not found or found[1] != version:
-            yield f"{name}: {found[1] if found else 'no version'}, but the package is {version}"
+        match = re.search(pattern, (top / name).read_text(encoding="utf-8"))
+        stated = match[1] if match else "no version"
+        if stated != version:
+            yield f"{name}: {stated}, but the package is {version}"
     if f'"{status_of(version)}"' not in (top / "pyproject.toml").read_text(encoding="utf-8"):
         yield f"pyproject.toml: the classifier of {version} is {status_of(version)!r}"
     if tag is not None and tag != f"v{version}":
@@ -97,20 +94,20 @@ def disagreements(top: Path, tag: str | None) -> Iterator[str]:
 
 
 def version_of(top: Path) -> str:
-    """The version of the package."""
+    """Return the version of the package."""
     name, pattern = next(iter(PLACES.items()))
     return re.findall(pattern, (top / name).read_text(encoding="utf-8"))[0]
 
 
 def owner_of(top: Path) -> str:
-    """The owner of the repository on GitHub; empty where none is set."""
+    """Return the owner of the repository on GitHub; empty if none is set."""
     return re.findall(
         r"(?m)^    owner = *(\S*)$", (top / "RELEASING.md").read_text(encoding="utf-8")
     )[0]
 
 
 def notes_of(top: Path) -> str:
-    """The section of the changelog on this version, without its heading."""
+    """Return the section of the changelog on this version, without its heading."""
     sections = re.split(
         r"(?m)^## \[(.*?)\].*\n", (top / "CHANGELOG.md").read_text(encoding="utf-8")
     )
@@ -118,14 +115,12 @@ def notes_of(top: Path) -> str:
 
 
 def status_of(version: str) -> str:
-    """The classifier on PyPI of a version."""
+    """Return the PyPI classifier of a version."""
     return STABLE if version.replace(".", "").isdigit() else BETA
 
 
 def write_addresses(top: Path, repository: str) -> None:
-    """Write the addresses on GitHub into the metadata of the package, the citation and the chooser
-    of issues.
-    """
+    """Write the GitHub addresses into the metadata, the citation and the chooser of issues."""
     issues, advisories = f"{repository}/issues", f"{repository}/security/advisories/new"
     urls = f'[project.urls]\nRepository = "{repository}"\nIssues = "{issues}"\n\n'
     links = (
@@ -146,16 +141,16 @@ def write_addresses(top: Path, repository: str) -> None:
 def replace(path: Path, pattern: str, value: str) -> None:
     """Replace the first group of the only match."""
     text = path.read_text(encoding="utf-8")
-    [found] = re.finditer(pattern, text)
-    path.write_text(text[: found.start(1)] + value + text[found.end(1) :], encoding="utf-8")
+    [match] = re.finditer(pattern, text)
+    path.write_text(text[: match.start(1)] + value + text[match.end(1) :], encoding="utf-8")
 
 
 def write_section(path: Path, pattern: str, section: str, *, before: str) -> None:
     """Replace a section, or insert it above the line that reads `before`."""
     text, count = re.subn(pattern, section, path.read_text(encoding="utf-8"))
-    path.write_text(
-        text if count else text.replace(f"\n{before}", f"\n{section}{before}", 1), encoding="utf-8"
-    )
+    if not count:
+        text = text.replace(f"\n{before}", f"\n{section}{before}", 1)
+    path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

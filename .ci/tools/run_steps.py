@@ -1,9 +1,8 @@
-"""`.ci/run [STEP ...]`: run steps of the checks, two at a time, and report every failure at the
-end.
+"""Run steps of the checks, two at a time, and report every failure at the end.
 
-A step is a script `.ci/steps/NAME.sh`. It runs in a copy of the working tree of its own and goes on
-when one of its checks fails. Without names all steps run, except those that take too long and are
-run by hand.
+A step is a script `.ci/steps/NAME.sh`. It runs in its own copy of the working tree, and goes on
+when one of its checks fails. Without names all steps run, except the ones that take so long that
+they are run by hand.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ from pathlib import Path
 TOP = Path(__file__).resolve().parents[2]
 SCRIPTS = TOP / ".ci" / "steps"
 STEPS = ("quick", "slow", "torch", "newest", "oldest", "clients", "browser", "package", "site")
-"""In the order in which they start: the quickest answer first, then the longest."""
-AT_A_TIME = 2
+"""Steps in the order in which they start: the quickest answer first, then the longest."""
+MAX_RUNNING_STEPS = 2
 _POLL_S = 0.5
 _REPORTED_LINES = 400
 
 
 @dataclass(frozen=True)
 class Check:
-    """A command of a step: whether it passed, how many seconds it took, and where its output is."""
+    """A command of a step that has ended."""
 
     name: str
     passed: bool
@@ -62,7 +61,7 @@ class Run:
         )
 
     def new_checks(self) -> list[Check]:
-        """The checks that ended since the last call."""
+        """Return the checks that ended since the last call."""
         path = self.folder / "checks.tsv"
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         rows = [line.split("\t") for line in lines[len(self.checks) :]]
@@ -115,30 +114,28 @@ def _options() -> argparse.Namespace:
 
 
 def _description(script: Path) -> str:
-    """The first comment of a step's script."""
+    """Return the first comment of a step's script."""
     return script.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")
 
 
 def _run_all(names: Sequence[str], work: Path, environments: Path) -> list[Run]:
-    """Run steps in this order, `AT_A_TIME` of them at any moment; they share the machine's
-    cores.
-    """
+    """Run steps in this order, some at the same time; they share the machine's cores."""
     environments.mkdir(parents=True, exist_ok=True)
     source = work / "source"
     _copy_tree(source)
-    at_once = min(AT_A_TIME, len(names))
+    num_parallel = min(MAX_RUNNING_STEPS, len(names))
     variables = {
         **{name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
         "CI_TOP": str(TOP),
         "CI_ENVIRONMENTS": str(environments),
         "CI_SOURCE_HASH": _hash_of(source),
-        "CI_WORKERS": str(max(1, len(os.sched_getaffinity(0)) // at_once)),
+        "CI_WORKERS": str(max(1, len(os.sched_getaffinity(0)) // num_parallel)),
         "PYTHON": sys.executable,
     }
     waiting, running, ended = list(names), [], []
     try:
         while waiting or running:
-            while waiting and len(running) < at_once:
+            while waiting and len(running) < num_parallel:
                 running.append(_start(waiting.pop(0), work, variables))
             time.sleep(_POLL_S)
             for run in list(running):
@@ -161,10 +158,10 @@ def _run_all(names: Sequence[str], work: Path, environments: Path) -> list[Run]:
 
 
 def _copy_tree(target: Path) -> None:
-    """Copy what git tracks or would track."""
+    """Copy the files that git tracks or would track."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    listed = subprocess.run(command, cwd=TOP, check=True, capture_output=True).stdout.decode()
-    for name in {*listed.split("\0")} - {""}:
+    output = subprocess.run(command, cwd=TOP, check=True, capture_output=True).stdout.decode()
+    for name in {*output.split("\0")} - {""}:
         if (TOP / name).is_file():
             copy = target / name
             copy.parent.mkdir(parents=True, exist_ok=True)
@@ -172,34 +169,32 @@ def _copy_tree(target: Path) -> None:
 
 
 def _hash_of(folder: Path) -> str:
-    """A hash of the names and contents of all files in a folder."""
-    content = hashlib.sha256()
+    """Return a hash of the names and contents of all files in a folder."""
+    sha = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        content.update(f"{path.relative_to(folder)}\0".encode() + path.read_bytes())
-    return content.hexdigest()
+        sha.update(f"{path.relative_to(folder)}\0".encode() + path.read_bytes())
+    return sha.hexdigest()
 
 
 def _start(name: str, work: Path, variables: dict[str, str]) -> Run:
-    own = work / name
-    shutil.copytree(work / "source", own / "source", symlinks=True)
-    with (own / "script.log").open("wb") as log:
+    folder = work / name
+    shutil.copytree(work / "source", folder / "source", symlinks=True)
+    with (folder / "script.log").open("wb") as log:
         process = subprocess.Popen(
             ["bash", str(SCRIPTS / f"{name}.sh")],
-            cwd=own / "source",
-            env={**variables, "CI_LOGS": str(own)},
+            cwd=folder / "source",
+            env={**variables, "CI_LOGS": str(folder)},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
     print(f"== {name} begins", flush=True)
-    return Run(name, own, process, time.monotonic())
+    return Run(name, folder, process, time.monotonic())
 
 
 def _report(runs: Sequence[Run], seconds: float) -> None:
-    """Print a table of the steps, then the output of each failure, then the summary of all
-    tests.
-    """
+    """Print a table of the steps, the output of each failure, and the summary of all tests."""
     print("\nstep            result  seconds")
     for run in runs:
         print(f"{run.name:<15} {_result(run.passed):<7} {run.seconds:7.0f}")
@@ -216,42 +211,38 @@ def _report(runs: Sequence[Run], seconds: float) -> None:
 
 
 def _failures(run: Run) -> Iterator[tuple[str, str]]:
-    """The name of each check that failed, with its output; the script itself where it ended for
-    another reason.
-    """
+    """Yield the name and output of each failed check, or of a script that failed without one."""
     for check in run.checks:
         if not check.passed:
             yield check.name, _excerpt(check.log)
     if not run.passed and all(check.passed for check in run.checks):
-        reason = (
-            f"the script ended with {run.process.returncode}"
-            if run.checks
-            else "the script made no check"
-        )
+        reason = "the script made no check"
+        if run.checks:
+            reason = f"the script ended with {run.process.returncode}"
         yield reason, _excerpt(run.folder / "script.log")
 
 
 def _excerpt(log: Path) -> str:
-    """Of pytest's output what begins with the errors and failures, of other output the last
-    lines.
-    """
+    """Return the end of an output; of pytest's, from its errors and failures on."""
     text = log.read_text(encoding="utf-8", errors="replace")
-    found = re.search(r"^=+ (ERRORS|FAILURES) =+$", text, re.MULTILINE)
-    lines = text[found.start() if found else 0 :].splitlines()
-    return "\n".join(lines[-_REPORTED_LINES:])
+    heading = re.search(r"^=+ (ERRORS|FAILURES) =+$", text, re.MULTILINE)
+    if heading:
+        text = text[heading.start() :]
+    return "\n".join(text.splitlines()[-_REPORTED_LINES:])
 
 
 def _test_summary(run: Run) -> Iterator[str]:
-    """The lines of pytest's short summaries, and how many tests passed and failed in each check."""
+    """Yield the failed tests of each check, and how many of its tests passed and failed."""
     for check in run.checks:
         lines = check.log.read_text(encoding="utf-8", errors="replace").splitlines()
-        yield from (line for line in lines if re.match(r"(FAILED|ERROR) \S+", line))
-        totals = [
-            line.strip("= ")
-            for line in lines
-            if re.search(r"\d (passed|failed|error)\b.* in [\d.]+s", line)
-        ]
-        yield from (f"{run.name}, {check.name}: {total}" for total in totals[-1:])
+        total = None
+        for line in lines:
+            if re.match(r"(FAILED|ERROR) \S+", line):
+                yield line
+            elif re.search(r"\d (passed|failed|error)\b.* in [\d.]+s", line):
+                total = line.strip("= ")
+        if total:
+            yield f"{run.name}, {check.name}: {total}"
 
 
 def _result(passed: bool) -> str:

@@ -1,13 +1,15 @@
-# What the steps share. .ci/tools/run_steps.py sets CI_*, starts each step in a copy of the tree, and reports its checks.
+# Functions of all steps. .ci/tools/run_steps.py sets CI_*, starts each step in a copy of the tree, and reports its
+# checks.
 set -euo pipefail
 export PIP_DISABLE_PIP_VERSION_CHECK=1 MPLBACKEND=Agg PYTEST_XDIST_AUTO_NUM_WORKERS="$CI_WORKERS"
-# A CPU build; `torch` alone would download gigabytes of CUDA. Where PyPI has only that:
+# A CPU build; plain `torch` would download gigabytes of CUDA. Where PyPI offers only that:
 # TORCH='torch --index-url https://download.pytorch.org/whl/cpu' .ci/run
 TORCH="${TORCH:-torch==2.13.0}"
-OLDEST="${OLDEST:-3.10}" NEWEST="${NEWEST:-3.13}" # Pythons
+# versions of Python
+OLDEST="${OLDEST:-3.10}" NEWEST="${NEWEST:-3.13}"
 source .ci/tools/python_of.sh
 
-# check NAME COMMAND...: runs a command. Its failure is reported, and the step goes on. A step with checks in the
+# check NAME COMMAND...: runs a command. If it fails, this is reported and the step goes on. A step with checks in the
 # background ends with `wait`.
 check() {
   local name="$1" began=$SECONDS log status
@@ -24,15 +26,15 @@ check() {
   printf '%s\t%s\t%s\t%s\n' "$name" $result $((SECONDS - began)) "$log" >>"$CI_LOGS/checks.tsv"
 }
 
-# need NAME COMMAND...: like check, but the step ends where it fails.
+# need NAME COMMAND...: like check, but the step ends if the command fails.
 need() {
   check "$@"
   if [ $result = failed ]; then exit 1; fi
 }
 
-# environment NAME PYTHON REQUIREMENTS...: a virtual environment at $CI_ENVIRONMENTS/NAME, which several steps may use.
-# Each argument is what one pip installs, in this order. One that is there for the same requirements is taken again,
-# with the package of this tree.
+# environment NAME PYTHON REQUIREMENTS...: makes a virtual environment at $CI_ENVIRONMENTS/NAME, which several steps may
+# use. One call of pip installs each argument, in this order. An environment with the same requirements is reused, and
+# gets the package of this tree.
 environment() {
   local home="$CI_ENVIRONMENTS/$1" python="$2" requirements words made_for
   shift 2
@@ -54,7 +56,7 @@ environment() {
   exec 9>&-
 }
 
-# system COMMAND PACKAGE...: Debian's packages, where the command that they bring is missing.
+# system COMMAND PACKAGE...: installs packages of Debian if the command that they contain is missing.
 system() {
   command -v "$1" >/dev/null && return
   shift
@@ -64,22 +66,22 @@ system() {
   ) 9>"$CI_ENVIRONMENTS/system.lock"
 }
 
-# The command of README.md that installs this extra and then runs something.
+# readme_command EXTRA: prints the command of README.md that installs this extra and then runs something.
 readme_command() {
-  local found
-  found="$(sed -n "s/^    \(pip install '\.\[$1\]'.*\)$/\1/p" README.md)"
-  [ -n "$found" ] || { echo "README.md has no command line with .[$1]" >&2; return 1; }
-  printf '%s\n' "$found"
+  local command_line
+  command_line="$(sed -n "s/^    \(pip install '\.\[$1\]'.*\)$/\1/p" README.md)"
+  [ -n "$command_line" ] || { echo "README.md has no command line with .[$1]" >&2; return 1; }
+  printf '%s\n' "$command_line"
 }
 
-# client NAME: another reader, in its own environment without this package, opens the folder that is made for it.
+# client NAME: makes a folder for another reader, which opens it in its own environment without this package.
 client() {
   mkdir "$CI_LOGS/$1"
   "$CI_ENVIRONMENTS/core/bin/python" -m "tests.clients.make_$1" "$CI_LOGS/$1"
   "$CI_ENVIRONMENTS/$1/bin/python" "tests/clients/$1.py" "$CI_LOGS/$1"
 }
 
-# The real scenario that tests/real read, where it lies beside the checkout.
+# The real scenario that tests/real reads, if it lies beside the checkout.
 if [ -d "$CI_TOP/../shared/real" ]; then
   DEEPACCIDENT_REAL="$(realpath "$CI_TOP/../shared/real")"
   export DEEPACCIDENT_REAL

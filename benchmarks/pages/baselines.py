@@ -1,10 +1,12 @@
-"""What the baselines foresee, by who cooperates; by the functions of the commands."""
+"""Write what the baselines foresee, by the agents that cooperate; with the functions of the
+commands.
+"""
 
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.measure import temporary_folder
 from benchmarks.pages.marks import put, table
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.breakdowns import Group
@@ -32,74 +34,70 @@ EVALUATIONS = {
     "boxes": ("accident", EvaluationSetup(task="accident", protocol="boxes")),
     "detection": ("detection", EvaluationSetup(task="detection", protocol="paper")),
 }
-"""Name → the predictions that are evaluated, and by which rules."""
+"""Name → kind of predictions, and rules by which they are evaluated."""
 NUMBERS = {
-    "IoU 30x30": ("motion", "ranges/30x30/iou"),
-    "IoU 100x100": ("motion", "ranges/100x100/iou"),
-    "VPQ 100x100": ("motion", "ranges/100x100/pq"),
+    "IoU, 30 m × 30 m": ("motion", "ranges/30x30/iou"),
+    "IoU, 100 m × 100 m": ("motion", "ranges/100x100/iou"),
+    "VPQ": ("motion", "ranges/100x100/pq"),
     "APA": ("maps", "apa"),
     "APA boxes": ("boxes", "apa"),
     "mAP": ("detection", "mean_average_precision"),
 }
-"""Name → its evaluation and its path in the result."""
-SHOWN = ("VPQ 100x100", "APA", "mAP")
+"""Name of a number → its evaluation and its path in the result."""
+TABLE_NUMBERS = ("VPQ", "APA", "mAP")
+BASE = "single"
+"""The agents that the others are compared with."""
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A baseline's evaluations: the bundles, and of each the result of all samples with its
-    intervals.
-    """
+    """A baseline's evaluations: the folder of their bundles, and their results for all samples."""
 
     folder: Path
     groups: Mapping[str, Group]
 
     def text(self, name: str) -> str:
-        """A number with its interval, if it has one."""
+        """Return a number as text."""
         evaluation, path = NUMBERS[name]
-        ends = self.groups[evaluation].intervals.get(path)
         digits = 2 if path == "apa" else 1
-        sure = "" if ends is None else f" [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
-        return f"{numbers_of(self.groups[evaluation].result)[path]:.{digits}f}{sure}"
+        return f"{numbers_of(self.groups[evaluation].result)[path]:.{digits}f}"
 
 
 Views = Mapping[str, Mapping[str, Evaluated]]
-"""View → agents → evaluations."""
+"""Evaluations by view and by agents."""
+Decided = Mapping[tuple[str, str], Mapping[str, str]]
+"""Number and view → agents whose difference from the base is decided → `more` or `less`."""
 
 
 def main(_release: Path | None = None) -> None:
     """Write all tables."""
-    with tempfile.TemporaryDirectory() as made:
-        folder = Path(made)
-        views = {name: evaluated_view(folder / name, config) for name, config in RELEASES.items()}
+    with temporary_folder() as folder:
+        views = {view: evaluate_view(folder / view, config) for view, config in RELEASES.items()}
         put("size", size_text(views))
-        put("configurations", numbers_table(views, SHOWN, list(AGENT_CONFIGS)))
-        put(
-            "decided",
-            decided_table(views, {name: "single" for name in AGENT_CONFIGS if name != "single"}),
-        )
+        decided = decided_differences(views, BASE)
+        put("configurations", numbers_table(views, TABLE_NUMBERS, decided))
+        put("decided", decided_text(decided))
 
 
-def evaluated_view(folder: Path, config: SynthConfig) -> dict[str, Evaluated]:
-    """What all sets of agents foresee in a release."""
+def evaluate_view(folder: Path, config: SynthConfig) -> dict[str, Evaluated]:
+    """Return the evaluations of all sets of agents in a release, which is made if need be."""
     root = folder / "release"
     if not root.exists():
         make_release(root, config)
     dataset = DeepAccident("v1", root, verbose=False)
-    baselines = {name: Baseline(agents=name) for name in AGENT_CONFIGS}
     return {
-        name: evaluated(dataset, baseline, folder / name) for name, baseline in baselines.items()
+        agents: evaluate_baseline(dataset, Baseline(agents=agents), folder / agents)
+        for agents in AGENT_CONFIGS
     }
 
 
-def evaluated(dataset: DeepAccident, baseline: Baseline, folder: Path) -> Evaluated:
+def evaluate_baseline(dataset: DeepAccident, baseline: Baseline, folder: Path) -> Evaluated:
     """Predict, evaluate, and write bundles below a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     groups = {}
-    for name, (task, setup) in EVALUATIONS.items():
-        path = predict_results(
-            dataset, task, SELECTION.tokens(dataset), folder / f"{task}_results", baseline
-        )
+    for name, (kind, setup) in EVALUATIONS.items():
+        tokens = SELECTION.tokens(dataset)
+        path = predict_results(dataset, kind, tokens, folder / f"{kind}_results", baseline)
         run = evaluate_results(dataset, path, setup, SELECTION).broken_down(("all",))
         save_run(run, folder / name)
         groups[name] = run.breakdowns[0].groups[0]
@@ -107,51 +105,72 @@ def evaluated(dataset: DeepAccident, baseline: Baseline, folder: Path) -> Evalua
 
 
 def size_text(views: Views) -> str:
-    """How much the tables are of."""
-    groups = {view: found["single"].groups["motion"] for view, found in views.items()}
-    parts = [
-        f"{group.samples} samples of {group.scenarios} accidents ({group.clusters} "
-        f"clusters) in the {view} view"
-        for view, group in groups.items()
-    ]
-    return f"The tables are of {', '.join(parts[:-1])} and {parts[-1]}."
+    """Return how many samples and accidents the table is made from."""
+    sizes = {}
+    for view, evaluations in views.items():
+        group = evaluations[BASE].groups["motion"]
+        sizes[view] = (
+            f"{group.samples} samples of {group.scenarios} accidents ({group.clusters} clusters)"
+        )
+    if len(set(sizes.values())) == 1:
+        return f"Each view has {sizes.popitem()[1]}."
+    return " ".join(f"The {view} view has {size}." for view, size in sizes.items())
 
 
-def numbers_table(views: Views, names: Iterable[str], rows: Iterable[str]) -> str:
-    """The views beside each other."""
-    shown = [(name, view) for name in names for view in views]
-    lines = [[f"`{row}`", *(views[view][row].text(name) for name, view in shown)] for row in rows]
-    return table(["agents", *(", ".join(each) for each in shown)], lines)
+def numbers_table(views: Views, names: Iterable[str], decided: Decided) -> str:
+    """Return numbers of all views, a column for each number and view, a row for each set of
+    agents; a number is bold if its difference from the base is decided.
+    """
+    columns = [(name, view) for name in names for view in views]
+    rows = []
+    for agents in AGENT_CONFIGS:
+        row = [f"`{agents}`"]
+        for name, view in columns:
+            text = views[view][agents].text(name)
+            row.append(f"**{text}**" if agents in decided[name, view] else text)
+        rows.append(row)
+    return table(["agents", *map(", ".join, columns)], rows)
 
 
-def decided_table(views: Views, bases: Mapping[str, str]) -> str:
-    """Which rows have surely more or less of a number than their base."""
-    lines = []
-    for view, found in views.items():
-        differences = {row: compared(found[base], found[row]) for row, base in bases.items()}
+def decided_differences(views: Views, base: str) -> Decided:
+    """Return for which agents the interval of the difference from the base does not contain 0."""
+    decided: dict[tuple[str, str], dict[str, str]] = {}
+    for view, evaluations in views.items():
         for name in NUMBERS:
-            sides: dict[str, list[str]] = {"more": [], "less": [], "not decided": []}
-            for row, ends in differences.items():
-                low, high = ends[name]
-                sides["more" if low > 0 else "less" if high < 0 else "not decided"].append(
-                    f"`{row}`"
-                )
-            words = [
-                "every one" if len(each) == len(bases) else ", ".join(each) or "–"
-                for each in sides.values()
-            ]
-            lines.append([name, view, *words])
-    return table(["number", "view", "more", "less", "not decided"], lines)
+            decided[name, view] = {}
+        for agents, evaluated in evaluations.items():
+            if agents == base:
+                continue
+            for name, (low, high) in compare(evaluations[base], evaluated).items():
+                if low > 0:
+                    decided[name, view][agents] = "more"
+                elif high < 0:
+                    decided[name, view][agents] = "less"
+    return decided
 
 
-def compared(base: Evaluated, other: Evaluated) -> dict[str, tuple[float, float]]:
-    """The intervals of the differences of all numbers; (0, 0) for none."""
-    numbers = {
-        name: {
-            each.number: each
-            for each in compare_bundles(base.folder / name, other.folder / name).numbers
-        }
-        for name in EVALUATIONS
-    }
-    found = {name: numbers[evaluation][path] for name, (evaluation, path) in NUMBERS.items()}
-    return {name: (each.low or 0.0, each.high or 0.0) for name, each in found.items()}
+def decided_text(decided: Decided) -> str:
+    """Return the decided differences of the numbers that the table leaves out."""
+    lines = []
+    for (name, view), side_by_agents in decided.items():
+        if name in TABLE_NUMBERS:
+            continue
+        for side in ("more", "less"):
+            members = [f"`{agents}`" for agents, word in side_by_agents.items() if word == side]
+            if members:
+                lines.append(f"- {name}, {view} view: {side} with {', '.join(members)}")
+    return "\n".join(lines)
+
+
+def compare(base: Evaluated, other: Evaluated) -> dict[str, tuple[float, float]]:
+    """Return the intervals of the differences of all numbers; (0, 0) where there is none."""
+    comparisons = {}
+    for evaluation in EVALUATIONS:
+        comparison = compare_bundles(base.folder / evaluation, other.folder / evaluation)
+        for difference in comparison.numbers:
+            comparisons[evaluation, difference.number] = difference
+    intervals = {}
+    for name, key in NUMBERS.items():
+        difference = comparisons[key]
+        intervals[name] = (difference.low or 0.0, difference.high or 0.0)
+    return intervals

@@ -1,45 +1,44 @@
-"""The rows of docs/benchmark.md: `python -m benchmarks.pages.benchmark RELEASE` predicts, evaluates
-and keeps them.
+"""Predict, evaluate and store the rows of docs/benchmark.md: `python -m benchmarks.pages.benchmark
+RELEASE`.
 
 Each row is a folder of benchmarks/v1: `results.tar.xz`, and a bundle of each task without its
 pictures, which `deepaccident check bundle` repeats. `python docs/make_tables.py benchmark` makes
-the page's table of the bundles that are kept. With `--published RELEASE` what is published of the
-release itself is written (`synth/benchmark.py`), with `--lock` the lock file.
+the page's table from the stored bundles. `--published RELEASE` writes what is published of the
+release itself (`synth/benchmark.py`), `--lock` writes the lock file.
 """
 
 import json
 import lzma
 import shutil
 import sys
-import tempfile
 from importlib.metadata import distributions
 from pathlib import Path
 
 from click.testing import CliRunner
 
+from benchmarks.measure import temporary_folder
 from benchmarks.pages.marks import TOP, put, table
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.evaluation.runs.bundles import FILES_FILE, SUMMARY_FILE, checksums_of
 from deepaccident_devkit.plugins.synth.benchmark import described_release
 
-KEPT = TOP / "benchmarks" / "v1"
+ROWS_FOLDER = TOP / "benchmarks" / "v1"
 PUBLISHED = TOP / "deepaccident_devkit" / "plugins" / "synth" / "benchmark_v1.json.xz"
 ROWS = {
     f"{model}_{agents}": (model, agents)
     for model in ("constant_velocity", "tiny", "tiny_lidar")
     for agents in ("single", "all")
 }
-"""Row → what predicts, and which agents cooperate."""
+"""Row → model, and agents that cooperate."""
 TASKS = {"motion": "motion", "accident": "motion", "detection": "detection.json"}
-"""Task → its results."""
+"""Task → its results in the folder of results."""
 NUMBERS = {
-    "IoU 30x30 (%)": ("motion", "ranges/30x30/iou", 1),
-    "IoU 100x100 (%)": ("motion", "ranges/100x100/iou", 1),
-    "VPQ 100x100 (%)": ("motion", "ranges/100x100/pq", 1),
+    "IoU, 100 m × 100 m (%)": ("motion", "ranges/100x100/iou", 1),
+    "VPQ, 100 m × 100 m (%)": ("motion", "ranges/100x100/pq", 1),
     "APA": ("accident", "apa", 2),
     "mAP (%)": ("detection", "mean_average_precision", 1),
 }
-"""Column → task, path in the result, decimals."""
+"""Column → task, path in the result, number of decimals."""
 
 
 def run(*words: str) -> None:
@@ -50,72 +49,61 @@ def run(*words: str) -> None:
         raise SystemExit(result.output)
 
 
-def keep(release: Path, name: str) -> None:
-    """Make a row: its results and its bundles."""
+def store_row(release: Path, name: str) -> None:
+    """Make the results and the bundles of a row, and store them."""
     model, agents = ROWS[name]
-    with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / name
-        run(
-            "predict",
-            model,
-            str(release),
-            "--agents",
-            agents,
-            "--split",
-            "test",
-            "--out",
-            str(made / "results"),
-        )
-        round_numbers(made / "results" / TASKS["detection"])
-        for task, results in TASKS.items():
-            given = (
-                "--results",
-                str(made / "results" / results),
-                "--split",
-                "test",
-                "--out",
-                str(made / task),
-            )
-            run("evaluate", task, str(release), "--protocol", "paper", *given)
-            slim(made / task)
-        shutil.make_archive(str(made / "results"), "xztar", made, "results")
-        shutil.rmtree(made / "results")
-        kept = KEPT / name
-        shutil.rmtree(kept, ignore_errors=True)
-        shutil.copytree(made, kept)
+    row = ROWS_FOLDER / name
+    with temporary_folder() as folder:
+        new_row = folder / name
+        results = new_row / "results"
+        split = ("--split", "test")
+        run("predict", model, str(release), "--agents", agents, *split, "--out", str(results))
+        round_numbers(results / TASKS["detection"])
+        for task, file in TASKS.items():
+            evaluation = ("evaluate", task, str(release), "--protocol", "paper")
+            paths = ("--results", str(results / file), *split, "--out", str(new_row / task))
+            run(*evaluation, *paths)
+            slim_down(new_row / task)
+        shutil.make_archive(str(results), "xztar", new_row, "results")
+        shutil.rmtree(results)
+        shutil.rmtree(row, ignore_errors=True)
+        shutil.copytree(new_row, row)
 
 
 def round_numbers(path: Path) -> None:
-    """Write a JSON file anew with four decimals, which is half as much to keep."""
-    told = json.loads(
-        path.read_text(encoding="utf-8"), parse_float=lambda word: round(float(word), 4)
-    )
-    path.write_text(json.dumps(told, ensure_ascii=False, separators=(",", ":")), encoding="utf-8")
+    """Write a JSON file again with four decimals, which halves its size."""
+    text = path.read_text(encoding="utf-8")
+    content = json.loads(text, parse_float=lambda number: round(float(number), 4))
+    rounded = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
+    path.write_text(rounded, encoding="utf-8")
 
 
-def slim(bundle: Path) -> None:
-    """Remove a bundle's figures and report, and where its release and results were; its list of
-    files says so.
+def slim_down(bundle: Path) -> None:
+    """Remove a bundle's figures and report, and the places of its release and results; its list of
+    files is updated.
     """
     shutil.rmtree(bundle / "figures", ignore_errors=True)
     (bundle / "report.html").unlink(missing_ok=True)
-    told = json.loads((bundle / SUMMARY_FILE).read_text(encoding="utf-8"))
-    told["release"]["dataroot"], told["results"]["path"] = "v1", "results"
-    (bundle / SUMMARY_FILE).write_text(
-        json.dumps(told, indent=1, ensure_ascii=False), encoding="utf-8"
-    )
-    listed = json.loads((bundle / FILES_FILE).read_text(encoding="utf-8"))
-    listed["files"] = checksums_of(bundle)
-    (bundle / FILES_FILE).write_text(json.dumps(listed, indent=1), encoding="utf-8")
+    summary_path = bundle / SUMMARY_FILE
+    summary = json.loads(summary_path.read_text(encoding="utf-8"))
+    summary["release"]["dataroot"] = "v1"
+    summary["results"]["path"] = "results"
+    summary_text = json.dumps(summary, indent=1, ensure_ascii=False)
+    summary_path.write_text(summary_text, encoding="utf-8")
+    files_path = bundle / FILES_FILE
+    files = json.loads(files_path.read_text(encoding="utf-8"))
+    files["files"] = checksums_of(bundle)
+    files_path.write_text(json.dumps(files, indent=1), encoding="utf-8")
 
 
 def text(name: str, column: str) -> str:
-    """A cell: a number with its interval."""
+    """Return a cell of the page's table: a number with its interval."""
     task, path, digits = NUMBERS[column]
-    told = json.loads((KEPT / name / task / SUMMARY_FILE).read_text(encoding="utf-8"))
-    (value,) = [each["value"] for each in told["headlines"] if each["path"] == path]
-    low, high = told["breakdowns"]["all"]["groups"][0]["intervals"][path]
-    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    summary_path = ROWS_FOLDER / name / task / SUMMARY_FILE
+    summary = json.loads(summary_path.read_text(encoding="utf-8"))
+    values = {headline["path"]: headline["value"] for headline in summary["headlines"]}
+    low, high = summary["breakdowns"]["all"]["groups"][0]["intervals"][path]
+    return f"{values[path]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
 def main(_release: Path | None = None) -> None:
@@ -123,27 +111,35 @@ def main(_release: Path | None = None) -> None:
     rows = [
         (f"`{name}`", *(text(name, column) for column in NUMBERS))
         for name in ROWS
-        if (KEPT / name).is_dir()
+        if (ROWS_FOLDER / name).is_dir()
     ]
     put("benchmark", table(("row", *NUMBERS), rows))
 
 
+def write_lock() -> None:
+    """Write the installed packages into the lock file."""
+    packages = [
+        f"{package.name}=={package.version}"
+        for package in distributions()
+        if package.name != "deepaccident_devkit"
+    ]
+    lines = [f"# Python {sys.version.split()[0]}", *sorted(packages), ""]
+    (ROWS_FOLDER / "lock.txt").write_text("\n".join(lines), encoding="utf-8")
+
+
+def write_published(release: Path) -> None:
+    """Write what is published of a release."""
+    content = described_release(release, progress=True)
+    compact = json.dumps(content, separators=(",", ":"), sort_keys=True)
+    PUBLISHED.write_bytes(lzma.compress(compact.encode(), preset=9))
+
+
 if __name__ == "__main__":
-    what, *rest = sys.argv[1:]
-    if what == "--lock":
-        lines = sorted(
-            f"{each.name}=={each.version}"
-            for each in distributions()
-            if each.name != "deepaccident_devkit"
-        )
-        (KEPT / "lock.txt").write_text(
-            "\n".join([f"# Python {sys.version.split()[0]}", *lines, ""]), encoding="utf-8"
-        )
-    elif what == "--published":
-        told = json.dumps(
-            described_release(Path(rest[0]), progress=True), separators=(",", ":"), sort_keys=True
-        )
-        PUBLISHED.write_bytes(lzma.compress(told.encode(), preset=9))
+    mode, *arguments = sys.argv[1:]
+    if mode == "--lock":
+        write_lock()
+    elif mode == "--published":
+        write_published(Path(arguments[0]))
     else:
-        for name in rest or ROWS:
-            keep(Path(what).resolve(), name)
+        for row_name in arguments or ROWS:
+            store_row(Path(mode).resolve(), row_name)

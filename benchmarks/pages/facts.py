@@ -1,11 +1,11 @@
-"""What others measured of the real release, beside a synthetic one without sensors, or beside a
-release given.
+"""Compare what others measured of the real release with a synthetic one without sensors, or with a
+given release.
 """
 
-import tempfile
 from pathlib import Path
 
-from benchmarks.pages.marks import put, table
+from benchmarks.measure import temporary_folder
+from benchmarks.pages import synth
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.statistics import ReleaseFacts, release_facts
@@ -14,17 +14,27 @@ RELEASE = SynthConfig(scenarios=180, frames=None, seed=5, sensors=False)
 
 
 def main(release: Path | None) -> None:
-    """Measure, and write the table into docs/synth.md; without a release, some ten minutes."""
-    with tempfile.TemporaryDirectory() as folder:
-        root = release or make_release(Path(folder) / "release", RELEASE, workers=2)
-        report = release_facts(
-            DeepAccident(dataroot=root, index_dir=Path(folder) / "index", verbose=False)
-        )
-    put("facts", page_text(report))
+    """Measure, keep the facts in synth.json, and write the tables of docs/synth.md.
+
+    Without a release this takes about ten minutes.
+    """
+    with temporary_folder() as folder:
+        root = release or make_release(folder / "release", RELEASE, workers=2)
+        index = folder / "index"
+        dataset = DeepAccident(dataroot=root, index_dir=index, verbose=False)
+        report = release_facts(dataset)
+    content = synth.measured()
+    content["facts"] = kept_facts(report)
+    synth.save(content)
 
 
-def page_text(report: ReleaseFacts) -> str:
-    """The rows that others measured, as Markdown."""
-    rows = [fact.texts() for fact in report.facts if fact.source]
-    head = ("fact", "others", f"here, {report.scenarios} scenarios", "verdict")
-    return f"\n{table(head, ((name, others, here, verdict) for name, _, others, here, _, verdict in rows))}\n"  # noqa: E501
+def kept_facts(report: ReleaseFacts) -> synth.MeasuredFacts:
+    """Return the values of the facts that others measured on the real release."""
+    values = {}
+    for fact in report.facts:
+        if fact.source and fact.here is not None:
+            ends = None if fact.ends is None else list(fact.ends)
+            values[synth.fact_name(fact)] = synth.MeasuredFact(
+                here=fact.here, ends=ends, verdict=fact.verdict
+            )
+    return synth.MeasuredFacts(scenarios=report.scenarios, values=values)

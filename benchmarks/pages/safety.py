@@ -1,26 +1,26 @@
-"""What the commands of docs/safety.md print, and its pictures, of which that of the report needs
-chromium.
+"""Write what the commands of docs/safety.md print, and its pictures; the picture of the report
+needs chromium.
 """
 
 import os
 import re
 import shlex
-import tempfile
 from collections.abc import Callable
-from itertools import dropwhile, takewhile
+from itertools import takewhile
 from pathlib import Path
 from textwrap import fill
 
 from click.testing import CliRunner
 from PIL import Image
 
+from benchmarks.measure import temporary_folder
 from benchmarks.pages.marks import DOCS
 from deepaccident_devkit.cli import deepaccident
 
 PAGE = DOCS / "safety.md"
 IMAGES = PAGE.parent / "images"
 RELEASE, OUT = "accidents", "out"
-"""What DATAROOT and OUT on the page are here."""
+"""Values of DATAROOT and OUT on the page."""
 PIECE = re.compile(
     r"^ {4}deepaccident (?P<command>\S[^\n]*)$|^<!-- output -->$.*?^<!-- end of output -->$",
     re.MULTILINE | re.DOTALL,
@@ -30,106 +30,118 @@ PICTURES = {
     "safety_avoidability.webp": "avoidability_vehicles.png",
     "safety_report.webp": "report.html",
 }
-"""Picture on the page → the file in OUT that it shows."""
+"""Picture on the page → file in OUT that it shows."""
 WIDTH, LINE = 1200, 118
 """Pixels of a figure; letters of a line of prose."""
-SHOWN = 3
-"""Rows of a long table that the page has."""
+MAX_ROWS = 1
+"""Rows of a long table that the page shows."""
 
 
 def main(release: Path | None = None) -> None:
-    """Write the outputs and the pictures; a release is one that the page's first command made."""
-    with tempfile.TemporaryDirectory() as name:
-        os.chdir(name)
+    """Write the outputs and the pictures; `release` is one that the page's first command made."""
+    with temporary_folder() as folder:
+        os.chdir(folder)
         if release is not None:
             Path(RELEASE).symlink_to(release.resolve(), target_is_directory=True)
-        page = with_outputs(PAGE.read_text(encoding="utf-8"), made=release is not None)
+        page = with_outputs(PAGE.read_text(encoding="utf-8"), has_release=release is not None)
         for picture, source in PICTURES.items():
             keep(Path(OUT, source), IMAGES / picture)
         os.chdir(PAGE.parent)
     PAGE.write_text(page, encoding="utf-8")
 
 
-def with_outputs(page: str, *, made: bool = False) -> str:
-    """The page with what its commands print now, run in their order in the working folder; `made`:
-    the release is.
+def with_outputs(page: str, *, has_release: bool = False) -> str:
+    """Return the page with the current output of its commands, run in their order in the working
+    folder; the release is not made if `has_release`.
     """
     printed = ""
 
-    def replaced(piece: re.Match[str]) -> str:
+    def replace_output(piece: re.Match[str]) -> str:
         nonlocal printed
         command = piece["command"]
         if command is None:
             return f"<!-- output -->\n```text\n{printed}\n```\n<!-- end of output -->"
-        if not (made and command.startswith("synth ")):
+        if not (has_release and command.startswith("synth ")):
             printed = output(command)
         return piece[0]
 
-    return PIECE.sub(replaced, page)
+    return PIECE.sub(replace_output, page)
 
 
 def output(command: str) -> str:
-    """What a command prints of which the page has the output, cut to what it shows."""
-    words = [{"DATAROOT": RELEASE, "OUT": OUT}.get(word, word) for word in shlex.split(command)]
+    """Return the output of a command, cut to what the page shows."""
+    values = {"DATAROOT": RELEASE, "OUT": OUT}
+    words = [values.get(word, word) for word in shlex.split(command)]
     print(f"deepaccident {shlex.join(words)}", flush=True)
     result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
     if result.exit_code:
         raise SystemExit(f"{command}: {result.output}")
-    text = result.stdout.replace(f"{Path.cwd()}/", "").replace(
-        f"{Path(RELEASE).resolve()}", RELEASE
-    )
-    cut = next((each for name, each in CUTS.items() if f" {name} " in f" {command} "), str)
-    return cut(text).rstrip()
-
-
-def fewer_rows(text: str) -> str:
-    """Without the rows of accidents after the first ones."""
-    lines: list[str] = []
-    rows = 0
-    for line in text.splitlines():
-        rows += line.startswith("type")
-        if rows <= SHOWN or not line.startswith("type"):
-            lines.append(line)
-        elif rows == SHOWN + 1:
-            lines.append("…")
-    return "\n".join(lines)
+    text = result.stdout.replace(f"{Path.cwd()}/", "")
+    text = text.replace(f"{Path(RELEASE).resolve()}", RELEASE)
+    for name, cut in CUTS.items():
+        if f" {name} " in f" {command} ":
+            return cut(text).rstrip()
+    return text.rstrip()
 
 
 def one_story(text: str) -> str:
-    """The first scenario and its story."""
+    """Return the first scenario and its story."""
     scenario, story = text.splitlines()[:2]
     indent = story[: len(story) - len(story.lstrip())]
-    return "\n".join(
-        [scenario, fill(story.strip(), LINE, initial_indent=indent, subsequent_indent=indent), "…"]
-    )
+    filled = fill(story.strip(), LINE, initial_indent=indent, subsequent_indent=indent)
+    return "\n".join([scenario, filled, "…"])
 
 
-def paragraph(begin: str) -> Callable[[str], str]:
-    """A function that takes the lines from the one that begins so, or from the first, to the next
-    empty one.
+def paragraph(begin: str, hidden: str = r"wrote ") -> Callable[[str], str]:
+    """Return a function that cuts an output to one paragraph.
+
+    The paragraph is from the line that begins with `begin`, or from the first line, to the next
+    empty line; of the rows of single accidents, the first ones stay.
+
+    Args:
+        begin: Beginning of the first line.
+        hidden: Regular expression; lines with such a beginning are left out.
     """
 
-    def found(text: str) -> str:
+    def cut(text: str) -> str:
         lines = text.splitlines()
-        first, *rest = [*dropwhile(lambda line: not line.startswith(begin), lines)] or lines
-        return "\n".join([first, *takewhile(str.strip, rest)])
+        numbers = (number for number, line in enumerate(lines) if line.startswith(begin))
+        first = next(numbers, 0)
+        rest = takewhile(str.strip, lines[first + 1 :])
+        shown_lines = [line for line in [lines[first], *rest] if not re.match(hidden, line)]
+        return "\n".join(fewer_rows(shown_lines))
 
-    return found
+    return cut
+
+
+def fewer_rows(lines: list[str]) -> list[str]:
+    """Return the lines without the rows of accidents after the first ones."""
+    result: list[str] = []
+    rows = 0
+    for line in lines:
+        rows += line.startswith("type")
+        if rows <= MAX_ROWS or not line.startswith("type"):
+            result.append(line)
+        elif rows == MAX_ROWS + 1:
+            result.append("…")
+    return result
 
 
 CUTS: dict[str, Callable[[str], str]] = {
-    "lead-time": fewer_rows,
-    "twins": fewer_rows,
+    "lead-time": paragraph("means in seconds", "wrote |accidents in which both"),
+    "avoidability": paragraph("vehicles: ", r"(first|second|both) +[48] |other road users"),
+    "twins": paragraph("accident "),
     "describe": one_story,
-    "--statistics": paragraph("least TTC"),
     "info": lambda text: text.splitlines()[0],
-    "warning": paragraph("prevented accidents"),
+    "warning": paragraph(
+        "prevented accidents", r" +(never|random per (frame  |recording)|TTC|this model, any)"
+    ),
 }
-"""Verb or option → what the page shows of its output; of others all."""
+"""Verb → function that cuts its output; other outputs are shown as they are."""
 
 
 def keep(source: Path, picture: Path) -> None:
-    """A figure, or the table of accidents on the report's page, as a small WebP."""
+    """Save a figure, or the table of accidents on the report's page, as a small WebP."""
     if source.suffix == ".html":
         from docs.make_pictures import page_picture  # selenium, which tests of the text do without
 

@@ -1,52 +1,53 @@
-"""What the generator makes: pairs of each design, what agents see of them, and a release like the
-real scenario.
+"""Measure what the generator makes: pairs of each design, what agents see of them, and a release
+like the real scenario.
 
-The measured values are kept in synth.json; `main` measures again, the real scenario only where it
-is given.
+The measured values are stored in synth.json; `main` measures again, the real scenario only if it is
+given.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
-from statistics import median
 from typing import TypedDict
 
 import numpy as np
 
 from benchmarks.pages import synth_beside
-from benchmarks.pages.marks import put
+from benchmarks.pages.marks import put, table, wrapped
 from deepaccident_devkit.plugins.synth import SynthConfig
 from deepaccident_devkit.plugins.synth.plan import plan_scenarios
 from deepaccident_devkit.plugins.synth.scenario import Scenario, build_scenario
 from deepaccident_devkit.plugins.synth.sensors.rig import make_rig
-from deepaccident_devkit.plugins.synth.spec import DESIGN_NUMBERS, read_design
+from deepaccident_devkit.plugins.synth.spec import DESIGN_NUMBERS
 from deepaccident_devkit.plugins.synth.traffic.simulate import gap, separation
 from deepaccident_devkit.release import Labels
+from deepaccident_devkit.statistics import FACTS, Fact
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.build import accident_type
-from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, VEHICLE_AGENTS, frame_timestamp
+from deepaccident_devkit.taxonomy import AGENTS, INFRASTRUCTURE, frame_timestamp
 from deepaccident_devkit.v2x import accident_visible_mask, pair_in_view
 
 MEASURED = Path(__file__).with_suffix(".json")
 SEEDS = 20
-"""Pairs of each design."""
+"""Number of pairs of each design."""
 STEP, EVALUATED, OBSERVED = 5, 4, 3
-"""Frames between two observations; number of evaluated moments before the last frame; observations
-for each of them.
+"""Frames between two observations; number of evaluated moments before the last frame; number of
+observations for each of them.
 """
-RELEASED_SCENARIOS, RELEASED_FRAMES = 691, 57_000
-"""Numbers of its authors (paper, abstract: 57K frames)."""
 WORKERS = 2
+PAGE_FACTS = ("foreseen_all_1 area", "ade mean")
+"""Names of the facts that the page shows."""
 
 
 class Pair(TypedDict):
     """The measured values of an accident and its normal twin.
 
-    `views` has for each agent one letter for each of 2, 1.5, 1 and 0.5 s before the impact: `v`, it
-    sees the accident by the released rule; `c`, it does not, but the five together see the pair;
-    `u`, the five do not see it either. `sees_both` is for 1 s before the impact. `twin_gap` is the
-    least distance between any two of the four vehicle agents, metres.
+    `views` has one letter per agent for each of 2, 1.5, 1 and 0.5 s before the impact: `v` if the
+    agent sees the accident by the released rule; `c` if it does not, but the five together see the
+    pair; `u` if the five do not see it either. `sees_both` is for 1 s before the impact. `twin_gap`
+    is the smallest distance between any two of the four vehicle agents, metres.
     """
 
     design: int
@@ -62,73 +63,93 @@ class Pair(TypedDict):
     views: dict[str, str]
 
 
+class MeasuredFact(TypedDict):
+    """The value of one of `statistics.FACTS` in a generated release, its interval, and whether it
+    agrees with the real release.
+    """
+
+    here: float
+    ends: list[float] | None
+    verdict: str
+
+
+class MeasuredFacts(TypedDict):
+    """The facts of a generated release, by `fact_name`, and its number of scenarios."""
+
+    scenarios: int
+    values: Mapping[str, MeasuredFact]
+
+
 class Measured(TypedDict):
-    """All measured values: of a real scenario, of similar generated ones, and of pairs of all
-    designs.
+    """All measured values: of a real scenario, of similar generated ones, of the facts of a
+    generated release (`benchmarks.pages.facts` measures them), and of pairs of all designs.
     """
 
     real: synth_beside.Numbers
     generated: synth_beside.Numbers
+    facts: MeasuredFacts
     pairs: list[Pair]
 
 
-_WATCHING = (VEHICLE_AGENTS[1], VEHICLE_AGENTS[3], INFRASTRUCTURE)
-
-
 def config(pairs: int) -> SynthConfig:
-    """The release that is measured: only designed accidents, with all their frames."""
+    """Return the configuration of the measured release: only designed accidents, with all their
+    frames.
+    """
     return SynthConfig(
         scenarios=2 * pairs, frames=None, unplanned=0.0, sensors=False, designed=True
     )
 
 
 def measure(number: int, *, views: bool = True) -> Pair:
-    """Make a pair, and measure it; without `views` the results do not say what agents see."""
-    whole = config(number + 1)
-    accident, twin = (build_scenario(whole, plan) for plan in plan_scenarios(whole)[-2:])
-    assert accident.meta.collision is not None
-    rows = [accident.actors.row_of(actor) for actor in accident.meta.collision.ids]
+    """Make and measure a pair; without `views` the result lacks what agents see."""
+    release = config(number + 1)
+    plans = plan_scenarios(release)[-2:]
+    accident, twin = (build_scenario(release, plan) for plan in plans)
+    meta = accident.meta
+    assert meta.collision is not None
+    rows = [accident.actors.row_of(actor) for actor in meta.collision.ids]
     end = accident.actors.at(frame_timestamp(accident.frames))
     turn = float(np.subtract(*end.poses[rows, 2]))
-    labels = _labels(accident, whole.seed) if views else {}
+    angle = abs(np.degrees(np.angle(np.exp(1j * turn))))
+    speeds = np.hypot(*end.velocities[rows].T)
+    labels = _observe(accident, release.seed) if views else {}
+    sees_both = {}
+    for agent, of_agent in labels.items():
+        sees_both[agent] = _in_view(accident, [of_agent[-2]], [agent], agent)
     twin_gap, twin_touches = _nearest(twin)
     return Pair(
         design=accident.plan.design or 0,
-        type=accident_type(accident.meta, signalized=accident.plan.traits.subtype == 1),
+        type=accident_type(meta, signalized=accident.plan.traits.subtype == 1),
         draws=accident.draws,
-        angle=round(abs(np.degrees(np.angle(np.exp(1j * turn)))), 1),
-        speeds=sorted(np.hypot(*end.velocities[rows].T).round(1).tolist()),
+        angle=round(angle, 1),
+        speeds=sorted(speeds.round(1).tolist()),
         frames=accident.frames,
         twin_frames=twin.frames,
         twin_gap=round(twin_gap, 2),
         twin_touches=twin_touches,
-        sees_both={
-            agent: _in_view(accident, [of_agent[-2]], [agent], agent)
-            for agent, of_agent in labels.items()
-        },
+        sees_both=sees_both,
         views={agent: _letters(accident, labels, agent) for agent in labels},
     )
 
 
 def _nearest(scenario: Scenario) -> tuple[float, bool]:
-    """How near two of the vehicle agents come to each other, metres, and whether any two road users
-    ever touch.
+    """Return the smallest distance between two of the vehicle agents, metres, and whether any two
+    road users ever touch.
     """
-    actors, size = scenario.actors, scenario.actors.size[:, :2]
-    poses = np.stack(
-        [actors.at(frame_timestamp(frame)).poses for frame in range(1, scenario.frames + 1)]
-    )
+    actors = scenario.actors
+    size = actors.size[:, :2]
+    timestamps = [frame_timestamp(frame) for frame in range(1, scenario.frames + 1)]
+    poses = np.stack([actors.at(timestamp).poses for timestamp in timestamps])
     first, second = np.triu_indices(len(size), 1)
-    touching = (separation(poses[:, first], size[first], poses[:, second], size[second]) <= 0).any()
+    separations = separation(poses[:, first], size[first], poses[:, second], size[second])
     agents = np.array([actors.row_of(actor) for actor in scenario.agents.values()])
-    first, second = (agents[rows] for rows in np.triu_indices(len(agents), 1))
-    return float(gap(poses[:, first], size[first], poses[:, second], size[second]).min()), bool(
-        touching
-    )
+    first, second = agents[np.stack(np.triu_indices(len(agents), 1))]
+    gaps = gap(poses[:, first], size[first], poses[:, second], size[second])
+    return float(gaps.min()), bool((separations <= 0).any())
 
 
-def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
-    """Every agent's labels at the observed moments, the last one `STEP` frames before the
+def _observe(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
+    """Return every agent's labels at the observed moments; the last one is `STEP` frames before the
     impact.
     """
     sky = (scenario.spec.weather, scenario.spec.time_of_day)
@@ -142,7 +163,7 @@ def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
         seed=noise,
         images=False,
     )
-    labels: dict[str, list[Labels]] = {agent: [] for agent in AGENTS}
+    labels = {agent: [] for agent in AGENTS}
     for back in range(EVALUATED + OBSERVED - 1, 0, -1):
         frame = scenario.frames - STEP * back
         scene = rig.scene(frame_timestamp(frame))
@@ -152,147 +173,106 @@ def _labels(scenario: Scenario, seed: int) -> dict[str, list[Labels]]:
 
 
 def _in_view(scenario: Scenario, labels: Sequence[Labels], agents: Sequence[str], own: str) -> bool:
-    """Whether some agents together have the pair in view; the agent `own` itself does not count."""
+    """Return whether some agents together have the pair in view; the agent `own` itself does not
+    count.
+    """
     assert scenario.meta.collision is not None
-    seen = [
-        visible_mask(
-            each.center[:, :2],
-            each.category,
-            each.num_lidar_pts,
-            each.camera_visible,
+    masks = []
+    for agent, of_agent in zip(agents, labels, strict=True):
+        mask = visible_mask(
+            of_agent.center[:, :2],
+            of_agent.category,
+            of_agent.num_lidar_pts,
+            of_agent.camera_visible,
             infrastructure=agent == INFRASTRUCTURE,
         )
-        for agent, each in zip(agents, labels, strict=True)
-    ]
-    ids = np.concatenate([each.actor_id for each in labels])
-    own_id = next((actor for agent, actor in scenario.agents.items() if agent == own), None)
-    return pair_in_view(np.concatenate(seen), ids, scenario.meta.collision.ids, own_id)
+        masks.append(mask)
+    is_visible = np.concatenate(masks)
+    ids = np.concatenate([of_agent.actor_id for of_agent in labels])
+    own_id = scenario.agents.get(own)
+    return pair_in_view(is_visible, ids, scenario.meta.collision.ids, own_id)
 
 
 def _letters(scenario: Scenario, labels: dict[str, list[Labels]], agent: str) -> str:
-    alone = [_in_view(scenario, [each], [agent], agent) for each in labels[agent]]
+    """Return the letters of `Pair.views` for an agent."""
+    in_own_view = [_in_view(scenario, [observed], [agent], agent) for observed in labels[agent]]
     letters = ""
-    for moment in range(OBSERVED - 1, len(alone)):
-        if accident_visible_mask(alone[moment - OBSERVED + 1 : moment + 1]):
+    for moment in range(OBSERVED - 1, len(in_own_view)):
+        if accident_visible_mask(in_own_view[moment - OBSERVED + 1 : moment + 1]):
             letters += "v"
         else:
-            together = _in_view(scenario, [labels[each][moment] for each in AGENTS], AGENTS, agent)
-            letters += "c" if together else "u"
+            of_all = [labels[name][moment] for name in AGENTS]
+            letters += "c" if _in_view(scenario, of_all, AGENTS, agent) else "u"
     return letters
 
 
-def designs_table(pairs: Sequence[Pair]) -> str:
-    """One row for each design."""
-    head = "| design | collide at the first draw | draws | type in meta is the design | angle (°) "
-    head += (
-        "| slower, faster (m/s) | frames | follower of ego, of other, "
-        "infrastructure: each sees both "
-    )
-    head += "| twins without contact | least gap of agents in twins (m) |"
-    lines = [head, "|---" * (head.count("|") - 1) + "|"]
-    for design in DESIGN_NUMBERS:
-        of_design = [pair for pair in pairs if pair["design"] == design]
-        speeds = np.median([pair["speeds"] for pair in of_design], axis=0)
-        cells = (
-            f"{design} {read_design(design).name}",
-            _share(pair["draws"] == 1 for pair in of_design),
-            sum(pair["draws"] for pair in of_design),
-            _share(pair["type"] == pair["design"] for pair in of_design),
-            _range([pair["angle"] for pair in of_design]),
-            f"{speeds[0]:.1f}, {speeds[1]:.1f}",
-            _range([pair["frames"] for pair in of_design]),
-            ", ".join(
-                _share(pair["sees_both"][agent] for pair in of_design) for agent in _WATCHING
-            ),
-            _share(not pair["twin_touches"] for pair in of_design),
-            f"{min(pair['twin_gap'] for pair in of_design):.1f}",
-        )
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines)
-
-
-def views_table(pairs: Sequence[Pair]) -> str:
-    """One row for each agent, and one for all."""
-    head = "| samples of | evaluated | accident-invisible | of these, the five together see it |"
-    lines = [head, "|---" * 4 + "|"]
-    for name, agents in {**{f"`{agent}`": (agent,) for agent in AGENTS}, "all": AGENTS}.items():
-        letters = "".join(pair["views"][agent] for pair in pairs for agent in agents)
-        unseen, together = len(letters) - letters.count("v"), letters.count("c")
-        shares = (
-            f"{100 * unseen / len(letters):.1f} %",
-            f"{100 * together / unseen:.1f} %" if unseen else "–",
-        )
-        lines.append(f"| {name} | {len(letters):,} | {shares[0]} | {shares[1]} |")
-    return "\n".join(lines)
-
-
-def lengths_table(pairs: Sequence[Pair]) -> str:
-    """Numbers of frames of scenarios, in the release and here."""
-    accidents, twins = [pair["frames"] for pair in pairs], [pair["twin_frames"] for pair in pairs]
-    rows = {
-        "the release": (
-            RELEASED_SCENARIOS,
-            f"{RELEASED_FRAMES / RELEASED_SCENARIOS:.0f}",
-            "40–100",
-        ),
-        "here": (2 * len(pairs), f"{np.mean(accidents + twins):.0f}", _ends(accidents + twins)),
-        "here, accidents": (len(pairs), f"{np.mean(accidents):.0f}", _ends(accidents)),
-        "here, normal twins": (len(pairs), f"{np.mean(twins):.0f}", _ends(twins)),
-    }
-    lines = ["| | scenarios | frames of a scenario, mean | least–most |", "|---" * 4 + "|"]
-    return "\n".join(
-        lines + [f"| {name} | {' | '.join(map(str, cells))} |" for name, cells in rows.items()]
+def pairs_text(pairs: Sequence[Pair]) -> str:
+    """Return how often the agents do not see the accidents of the designs."""
+    letters = "".join(pair["views"][agent] for pair in pairs for agent in AGENTS)
+    invisible = 100 * (1 - letters.count("v") / len(letters))
+    return wrapped(
+        "At 2, 1.5, 1 and 0.5 s before the impact, the accident is invisible in "
+        f"{invisible:.1f} % of all agents' samples."
     )
 
 
-def tables(measured: Measured) -> dict[str, str]:
-    """The tables between the page's markers."""
-    pairs = measured["pairs"]
+def fact_name(fact: Fact) -> str:
+    """Return the name of a fact in `MeasuredFacts.values`."""
+    return f"{fact.key} {fact.kind}"
+
+
+def fact_row(fact: Fact, facts: MeasuredFacts) -> tuple[str, ...]:
+    """Return the row of a fact: its name, the real value and the generated one."""
+    measured_fact = facts["values"][fact_name(fact)]
+    ends = None
+    if measured_fact["ends"] is not None:
+        low, high = measured_fact["ends"]
+        ends = (low, high)
+    cells = replace(fact, here=measured_fact["here"], ends=ends).texts()
+    return (fact.name, cells[2], cells[3])
+
+
+def comparison_table(content: Measured) -> str:
+    """Return a table of the real release and of generated ones, one number in each row."""
+    rows = [fact_row(fact, content["facts"]) for fact in FACTS if fact_name(fact) in PAGE_FACTS]
+    rows += synth_beside.comparison_rows(content["real"], content["generated"])
+    return table(("", "real", "generated"), rows)
+
+
+def texts(content: Measured) -> dict[str, str]:
+    """Return the texts between the page's markers, by marker."""
     return {
-        "designs": designs_table(pairs),
-        "views": views_table(pairs),
-        "lengths": lengths_table(pairs),
-        "beside": synth_beside.table(measured["real"], measured["generated"]),
+        "pairs": pairs_text(content["pairs"]),
+        "comparison": comparison_table(content),
     }
 
 
 def measured() -> Measured:
-    """The values of the last measurement."""
+    """Return the values of the last measurement."""
     content: Measured = json.loads(MEASURED.read_text(encoding="utf-8"))
     return content
 
 
 def save(content: Measured) -> None:
-    """Save the measured values, one pair on each line."""
-    beside = [f'"{key}": {json.dumps(content[key], indent=1)}' for key in ("real", "generated")]
-    pairs = ",\n".join(json.dumps(pair) for pair in content["pairs"])
-    MEASURED.write_text(
-        "{\n" + ",\n".join([*beside, f'"pairs": [\n{pairs}\n]']) + "\n}\n", encoding="utf-8"
-    )
-
-
-def _share(holds: Iterable[bool]) -> str:
-    return f"{100 * np.mean([float(each) for each in holds]):.0f} %"
-
-
-def _range(values: Sequence[float]) -> str:
-    return f"{median(values):.0f} ({_ends(values)})"
-
-
-def _ends(values: Sequence[float]) -> str:
-    return f"{min(values):.0f}–{max(values):.0f}"
+    """Save the measured values, one pair on each line, and write the page's texts."""
+    entries = []
+    for key in ("real", "generated", "facts"):
+        entries.append(f'"{key}": {json.dumps(content[key], indent=1)}')
+    pairs = ",\n".join(map(json.dumps, content["pairs"]))
+    entries.append(f'"pairs": [\n{pairs}\n]')
+    lines = ",\n".join(entries)
+    MEASURED.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+    for name, text in texts(content).items():
+        put(name, f"\n{text}\n")
 
 
 def main(release: Path | None = None) -> None:
-    """Measure, and write the tables."""
+    """Measure, and write the texts of the page."""
     content = measured()
     if release is not None:
         content["real"] = synth_beside.measure_real(release)
     content["generated"] = synth_beside.measure_generated()
     with ProcessPoolExecutor(WORKERS) as executor:
-        content["pairs"] = list(
-            executor.map(measure, range(SEEDS * len(DESIGN_NUMBERS)), chunksize=4)
-        )
+        numbers = range(SEEDS * len(DESIGN_NUMBERS))
+        content["pairs"] = list(executor.map(measure, numbers, chunksize=4))
     save(content)
-    for name, text in tables(content).items():
-        put(name, f"\n{text}\n")

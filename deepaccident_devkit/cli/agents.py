@@ -1,10 +1,10 @@
-"""Options that select agents and cooperating agents, and the links between them."""
+"""Options for selecting agents and cooperating agents, and for the links between these."""
 
 from collections.abc import Callable, Sequence
 
 import click
 
-from deepaccident_devkit.cli.options import words_of
+from deepaccident_devkit.cli.options import split_words
 from deepaccident_devkit.cli.verbs import Function, field_option, together
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import AGENTS
@@ -15,38 +15,38 @@ agents_parameter = click.option(
     "--agents",
     multiple=True,
     metavar="NAME[,NAME…]",
-    help="Only samples of these agents; it does not choose who cooperates.  [default: all]",
+    help="Use only samples of these agents; the cooperating agents stay the same.  [default: all]",
 )
 
 
 def agent_names(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return the agents of repeated --agents; without a text all.
+    """Return the agents that repeated --agents name; all agents without the option.
 
-    `all` and `available` also stand for all: this only selects among existing samples.
+    `all` and `available` also mean all agents, because this only selects from existing samples.
     """
-    names = [choice("--agents", name, (*AGENTS, *_ALL)) for name in words_of(texts)]
+    names = [choice("--agents", name, (*AGENTS, *_ALL)) for name in split_words(texts)]
     if not names or set(names) & set(_ALL):
         return AGENTS
     return tuple(names)
 
 
 def cooperating_parameter(meaning: str, default: str) -> Callable[[Function], Function]:
-    """Return an option --agents for cooperating agents (`names_or_configuration` reads it)."""
+    """Make the option --agents for cooperating agents; `names_or_configuration` reads it."""
     return click.option(
         "--agents",
         multiple=True,
         metavar="NAME[,NAME…]",
-        help=f"{meaning}: names, or one of {', '.join(AGENT_SETS)} (those that are there).  "
+        help=f"{meaning}: names, or one of {', '.join(AGENT_SETS)} (all in the release).  "
         f"[default: {default}]",
     )
 
 
 def names_or_configuration(texts: Sequence[str]) -> str | list[str] | None:
-    """Return the configuration or the names in repeated --agents for cooperating agents.
+    """Return the configuration or the agent names passed with repeated --agents.
 
-    The result is None if the option was not passed.
+    Return None if the option was not passed.
     """
-    names = words_of(texts)
+    names = split_words(texts)
     if len(names) != 1:
         return names or None
     name = choice("--agents", names[0], (*AGENT_SETS, *AGENTS))
@@ -58,7 +58,7 @@ def names_or_configuration(texts: Sequence[str]) -> str | list[str] | None:
 def link_parameters(
     latency: float = 0.0, pose_noise: float = 0.0
 ) -> Callable[[Function], Function]:
-    """Return options for errors in partners' data, with these defaults."""
+    """Make the options for errors in partners' data, with these defaults."""
     return together(
         field_option(Link, "latency", default=latency),
         field_option(Link, "pose_noise", default=pose_noise, type=float),

@@ -1,4 +1,4 @@
-"""`deepaccident cache`: resized images for training, in a folder."""
+"""`deepaccident cache`: resizes images for training, and stores them in a folder."""
 
 import re
 from typing import Any
@@ -6,17 +6,17 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.export import bulk_parameters, run_export
-from deepaccident_devkit.cli.options import channels_parameter, pixel_size, words_of
+from deepaccident_devkit.cli.options import channels_parameter, pixel_size, split_words
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.training.image_cache import CachedImages
 
 
-def _part(
+def _parse_crop(
     context: click.Context, parameter: click.Parameter, value: str | None
 ) -> tuple[int, int, int, int] | None:
-    """Parse `LEFT,TOP,WIDTH,HEIGHT` to (top, left, height, width); None stays."""
+    """Parse `LEFT,TOP,WIDTH,HEIGHT` as (top, left, height, width); None stays None."""
     if value is None:
         return None
     match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", value.replace(" ", ""))
@@ -38,11 +38,11 @@ def _part(
     required=True,
     callback=pixel_size,
     metavar="WxH",
-    help="Size of a whole image, such as 704x396.",
+    help="Size to which each image is resized before it is cropped, such as 704x396.",
 )
 @click.option(
     "--crop",
-    callback=_part,
+    callback=_parse_crop,
     metavar="LEFT,TOP,WIDTH,HEIGHT",
     help="Part of the resized image to keep.  [default: all]",
 )
@@ -57,13 +57,12 @@ def cache(
     codec: Any,
     **options: Any,
 ) -> None:
-    """Write the resized images of scenarios of the release in DATAROOT.
+    """Write resized images of the release in DATAROOT, for V2XConfig(images_cache=FOLDER).
 
-    They are for V2XConfig(images_cache=FOLDER). Give --split or --where: all images at 704x256 take
-    0.9 TB as raw pixels. --dry-run says how much yours take. If a run is interrupted, the same
-    command continues it.
+    Select scenarios with --split or --where: all images at 704x256 take 0.9 TB as raw pixels.
+    --dry-run prints the size of your selection. If a run is interrupted, the same command continues
+    it.
     """
-    images = ImageConfig(
-        resize=resize[::-1], crop=crop, cameras=tuple(words_of(channels)) or CAMERAS, decode=decode
-    )
+    cameras = tuple(split_words(channels)) or CAMERAS
+    images = ImageConfig(resize=resize[::-1], crop=crop, cameras=cameras, decode=decode)
     run_export(CachedImages, {"images": images, "codec": codec}, **options)

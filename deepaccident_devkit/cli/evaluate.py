@@ -2,12 +2,12 @@
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, get_args
 
 import click
 
@@ -15,19 +15,20 @@ from deepaccident_devkit.cli.agents import agent_names, agents_parameter
 from deepaccident_devkit.cli.options import (
     DATAROOT,
     PATH,
-    engine_of,
+    engine_options,
     engine_parameters,
     figure_style_parameter,
     json_parameter,
     on_error_parameter,
     open_release,
+    parse_switches,
     refuse_unused,
     release_of,
     release_parameters,
-    switches_of,
     version_parameter,
 )
 from deepaccident_devkit.cli.verbs import (
+    Function,
     LazyVerbs,
     WordChoice,
     advanced,
@@ -39,7 +40,7 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation import Resampling
 from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING, attribute_name
-from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
+from deepaccident_devkit.evaluation.intervals import MAX_RESAMPLES
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
@@ -71,59 +72,68 @@ from deepaccident_devkit.evaluation.runs.text import SHOWN_BREAKDOWNS
 from deepaccident_devkit.evaluation.warning import CleanWarnings, FieldWarnings
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
-from deepaccident_devkit.support.parallel import workers_kept
+from deepaccident_devkit.support.parallel import keep_workers
 from deepaccident_devkit.support.plugins import LazyVerb, Plugin
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
-# Exit status of a check that had nothing to compare.
+# Exit status of a check without anything to compare.
 _NOTHING_STATUS = 2
 _RELEASE_OPTIONS = ("version", "split", "samples", "scope", "agents", "horizon", "on_error")
-_selection_parameters = together(
-    click.option(
-        "--split",
-        default="val",
-        show_default=True,
-        help="train, val, test, train_mini, val_mini, all (every scenario that is here), or a "
-        "split file (.txt).",
-    ),
-    click.option(
-        "--samples",
-        type=WordChoice(get_args(SampleList)),
-        help="evaluate: samples within the horizon before the end. all: two samples per second of "
-        "each scenario.  [default: evaluate; for warnings, planning and forecasting: all]",
-    ),
-    click.option(
-        "--scope",
-        type=WordChoice(get_args(ScopeName)),
-        help="Accident scenarios only, or all scenarios.  [default: accident; with --samples all: "
-        "all]",
-    ),
-    agents_parameter,
-    click.option(
-        "--horizon",
-        default=2.0,
-        show_default=True,
-        help="How many seconds the predictions look ahead.",
-    ),
-)
+
+
+def _selection_parameters(task: str | None = None) -> Callable[[Function], Function]:
+    """Make the options that select samples, with help for one task, or for all tasks if None."""
+    samples_default = "evaluate; for warnings, planning and forecasting: all"
+    horizon_help = "How many seconds the predictions look ahead."
+    if task is not None:
+        evaluator = evaluator_class(task)
+        samples_default = "all" if evaluator.needs_whole_recordings else "evaluate"
+        if not evaluator.has_horizon:
+            horizon_help = (
+                "With --samples evaluate: how many seconds before the end of a scenario its "
+                "samples begin."
+            )
+    return together(
+        click.option(
+            "--split",
+            default="val",
+            show_default=True,
+            help="Split to evaluate: train, val, test, train_mini, val_mini, all (every scenario "
+            "in the release), or a split file (.txt).",
+        ),
+        click.option(
+            "--samples",
+            type=WordChoice(get_args(SampleList)),
+            help="Samples to evaluate. evaluate: samples within the horizon before the end of a "
+            f"scenario. all: two per second of each scenario.  [default: {samples_default}]",
+        ),
+        click.option(
+            "--scope",
+            type=WordChoice(get_args(ScopeName)),
+            help="Evaluate only accident scenarios, or all scenarios.  [default: accident; with "
+            "--samples all: all]",
+        ),
+        agents_parameter,
+        click.option("--horizon", default=2.0, show_default=True, help=horizon_help),
+    )
 
 
 _WARNING_OPTIONS = together(
     click.option(
         "--threshold-from",
         type=PATH,
-        help="Folder with an evaluation on another split; it sets the alarm threshold (protocol "
-        "clean only).",
+        help="Take the alarm threshold from the evaluation in this folder, which must be on "
+        "another split (protocol clean only).",
     ),
     advanced(
         "--threshold-by",
         type=WordChoice(get_args(Chooser)),
         default="best_f1",
         show_default=True,
-        help="best_f1: the threshold with the best F1. quiet: at most one second of false alarm "
-        "per minute. braking: at most one second of braking for false alarms per minute, "
-        "found by an evaluation with --prevented.",
+        help="How --threshold-from chooses the threshold. best_f1: the best F1. quiet: at most one "
+        "second of false alarm per minute. braking: at most one second of braking for false alarms "
+        "per minute, which needs an evaluation with --prevented.",
     ),
     click.option(
         "--prevented",
@@ -134,23 +144,23 @@ _WARNING_OPTIONS = together(
 )
 
 
-def _attributes(
+def _parse_attributes(
     context: click.Context, parameter: click.Parameter, names: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Return the attributes in repeated --by."""
+    """Return the attributes passed with repeated --by."""
     try:
         return tuple(map(attribute_name, names))
     except ChoiceError as error:
         raise click.BadParameter(str(error), context, parameter) from error
 
 
-def _task_verb(task: str) -> click.Command:
-    """Return the verb of a task."""
+def _make_task_verb(task: str) -> click.Command:
+    """Build the subcommand that evaluates a task."""
     evaluator = evaluator_class(task)
     protocols = list(evaluator.protocols)
     text = (
         f"{evaluator.description}\n\n"
-        "The predictions are compared with the labels of the release in DATAROOT."
+        "The command compares the predictions with the labels of the release in DATAROOT."
     )
 
     @verb(task, help=text)
@@ -158,7 +168,7 @@ def _task_verb(task: str) -> click.Command:
     @click.option(
         "--results", required=True, type=PATH, help="Results file or folder with the predictions."
     )
-    @_selection_parameters
+    @_selection_parameters(task)
     @click.option(
         "--protocol",
         type=WordChoice(protocols, label_rules(task)),
@@ -172,34 +182,34 @@ def _task_verb(task: str) -> click.Command:
         "switches",
         multiple=True,
         metavar="NAME=VALUE",
-        help="Change one field of the protocol; you can repeat this option.",
+        help="Change one field of the protocol. You can repeat this option.",
     )
     @advanced(
         "--allow-partial",
         is_flag=True,
-        help="Accept results that lack some samples (which marks every number as partial), or "
-        "leave out predictions of other samples.",
+        help="Accept results with missing samples (the numbers are then marked as partial), and "
+        "ignore predictions for samples outside the selection.",
     )
     @click.option(
         "--by",
         multiple=True,
-        callback=_attributes,
+        callback=_parse_attributes,
         metavar="NAME",
-        help="Also give the numbers for each value of this attribute; you can repeat this option. "
-        f"One of {', '.join(ATTRIBUTES)}.",
+        help="Also print the numbers for each value of this attribute: "
+        f"{', '.join(ATTRIBUTES)}. You can repeat this option.",
     )
-    @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
+    @field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MAX_RESAMPLES))
     @click.option(
         "--sanity",
         is_flag=True,
-        help="Look for classic mistakes, such as mirrored axes or another frame. Exit status 2: "
-        "there is nothing to compare.",
+        help="Look for classic mistakes, such as mirrored axes or a wrong frame. The command exits "
+        "with 2 if there is nothing to compare.",
     )
     @click.option(
-        "--out", type=PATH, help="Folder to write all numbers, figures and a report into."
+        "--out", type=PATH, help="Write all numbers, figures and a report into this folder."
     )
     @click.option(
-        "--overwrite", is_flag=True, help="Replace an evaluation that is already in --out."
+        "--overwrite", is_flag=True, help="Replace an evaluation that already exists in --out."
     )
     @figure_style_parameter
     @advanced(
@@ -212,85 +222,93 @@ def _task_verb(task: str) -> click.Command:
         results: Path, protocol: str, switches: tuple[str, ...], **options: Any
     ) -> None:
         setup = EvaluationSetup(
-            task=task, protocol=protocol, switches=switches_of(switches), horizon=options["horizon"]
+            task=task,
+            protocol=protocol,
+            switches=parse_switches(switches),
+            horizon=options["horizon"],
         )
         _evaluate(setup, results, **options)
 
     return evaluate_task
 
 
-@workers_kept()
+@keep_workers()
 def _evaluate(
     setup: EvaluationSetup, results: Path, *, by: tuple[str, ...], as_json: bool, **options: Any
 ) -> None:
     out: Path | None = options["out"]
     _refuse_unused(setup, options)
-    selection = _selection_of(setup, options)
-    opened = read_results(results)
+    selection = _select_samples(setup, options)
+    opened_results = read_results(results)
     requested = {
         **selection.as_dict(),
         "task": setup.task,
         "protocol": setup.protocol,
-        "results": str(opened.path),
+        "results": str(opened_results.path),
     }
-    if out is not None:  # before the release is indexed
+    if out is not None:  # fails before the release is indexed
         checked_target(out, overwrite=options["overwrite"], requested=requested)
-    dataset = open_release(**release_of(options), **engine_of(options))
+    dataset = open_release(**release_of(options), **engine_options(options))
     if options.get("threshold_from") is not None:
         threshold = chosen_threshold(
             options["threshold_from"], options["threshold_by"], selection.tokens(dataset)
         )
         setup = replace(setup, switches={**setup.switches, "threshold": threshold})
-    texts = {
-        name: str(value) for name, value in options.items() if name not in ("workers", "executor")
-    }
+    option_texts = {name: str(value) for name, value in options.items()}
+    for name in engine_options(options):  # workers do not affect the numbers
+        del option_texts[name]
     command = digest_of(
-        {"setup": setup.as_dict(), "results": opened.fingerprint, "by": by, "options": texts}
+        {
+            "setup": setup.as_dict(),
+            "results": opened_results.fingerprint,
+            "by": by,
+            "options": option_texts,
+        }
     )
     with nullcontext() if out is None else evaluation_store(out, command).shared() as turn:
-        if out is not None:  # another process may just have finished
+        if out is not None:  # another process may have finished in the meantime
             checked_target(out, overwrite=options["overwrite"])
         run = evaluate_results(
             dataset,
-            opened,
+            opened_results,
             setup,
             selection,
             allow_partial=options["allow_partial"],
             out=out,
             progress=True,
-            **engine_of(options),
+            **engine_options(options),
         )
         if turn is None or out is None or turn.alone():
-            summary, text = _complete(run, dataset, opened, by, options)
-        else:  # another process with the same command has written it
-            summary, text = read_bundle(out).summary, ""
+            summary, text = _complete_run(run, dataset, opened_results, by, options)
+        else:  # another process with the same command has written the folder
+            summary = read_bundle(out).summary
+            text = ""
     if as_json:
         click.echo(json.dumps(summary, indent=1))
     else:
         click.echo(f"{summary_text(summary, by or SHOWN_BREAKDOWNS)}\n\n{text}".strip())
     if out is not None:
-        click.echo(f"written: {out}", err=as_json)
+        click.echo(f"wrote {out}", err=as_json)
     if options["sanity"] and not summary["sanity"]["sought"]:
         sys.exit(_NOTHING_STATUS)
 
 
-def _complete(
+def _complete_run(
     run: EvaluationRun,
     dataset: DeepAccident,
     results: Results,
     by: tuple[str, ...],
     options: dict[str, Any],
 ) -> tuple[Mapping[str, Any], str]:
-    """Complete a run, and save it if requested.
+    """Add breakdowns and checks to a run, and save it if requested.
 
     Returns:
-        Its summary, and the text of the sanity check.
+        Summary of the run, and the text of the sanity check.
     """
-    engine = engine_of(options)
+    engine = engine_options(options)
     resampling = Resampling(resamples=options["resamples"])
-    run = run.broken_down(
-        (EVERYTHING, *(by or breakdowns_of(run.setup.task))), resampling, **engine
-    )
+    attributes = by or breakdowns_of(run.setup.task)
+    run = run.broken_down((EVERYTHING, *attributes), resampling, **engine)
     if options.get("prevented"):
         run = with_further(run, "prevented", dataset, resampling, progress=True, **engine)
     text = ""
@@ -298,7 +316,8 @@ def _complete(
         sanity = check_sanity(dataset, results, run.setup, sorted(run.evaluator.tokens), **engine)
         if run.partial is not None:
             text = f"{run.partial.text()}\n"
-        run, text = replace(run, sanity=sanity.as_dict()), f"{text}{sanity.to_text()}"
+        text += sanity.to_text()
+        run = replace(run, sanity=sanity.as_dict())
     if options["out"] is not None:
         from deepaccident_devkit.render.evaluation import save_report
 
@@ -314,36 +333,35 @@ def _complete(
 
 
 def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
-    """Raise a usage error for an option that changes nothing here, or that needs another one."""
+    """Raise a usage error for an option that has no effect here, or that needs another option."""
     if options["out"] is None:
-        refuse_unused("without --out", "overwrite", "include_results", "style")
+        refuse_unused("without --out", "overwrite", "include_results", "style", "no_title")
     if options.get("threshold_from") is None:
         refuse_unused("without --threshold-from", "threshold_by")
     elif "threshold" in setup.switches:
         raise click.UsageError(
-            "--threshold-from sets the threshold that --switch threshold=… sets; give one of them"
+            "--threshold-from and --switch threshold=… both set the threshold; give only one"
         )
     if options.get("prevented"):
         if not isinstance(setup.rules, CleanWarnings):
             raise click.UsageError(
-                "--prevented needs the scores of whole recordings, which --protocol "
-                f"{setup.protocol} does not have; give --protocol clean"
+                "--prevented needs scores of whole recordings, and --protocol "
+                f"{setup.protocol} has none; use --protocol clean"
             )
-        extra_result("prevented")  # before long work, as its plug-in may be missing
+        extra_result("prevented")  # before the long work, because its plug-in may be missing
     if isinstance(setup.rules, FieldWarnings) and options["resamples"]:
-        refuse_unused("with --protocol field, which has no intervals", "resamples")
-    if (
-        not evaluator_class(setup.task).has_horizon
-        and _selection_of(setup, options).samples == "all"
-    ):
-        why = "the protocol has its own"
+        refuse_unused("with --protocol field, which has no confidence intervals", "resamples")
+    if evaluator_class(setup.task).has_horizon:
+        return
+    if _select_samples(setup, options).samples == "all":
+        reason = "the protocol sets its own horizon"
         if setup.task == "detection":
-            why = "detections are of the present"
-        refuse_unused(f"with --samples all: {why}", "horizon")
+            reason = "detections are only of the present"
+        refuse_unused(f"with --samples all, as {reason}", "horizon")
 
 
-def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:
-    """Return the samples that a verb's options select."""
+def _select_samples(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:
+    """Return the selection of samples that a subcommand's options describe."""
     agents = agent_names(options["agents"])
     return default_selection(
         setup,
@@ -356,66 +374,70 @@ def _selection_of(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleS
 
 @verb("results")
 @click.argument("results", type=PATH)
-@click.option(
-    "--dataroot", type=DATAROOT, help="Also compare the samples with those of this release."
-)
+@click.option("--dataroot", type=DATAROOT, help="Also compare with the samples of this release.")
 @version_parameter
-@_selection_parameters
+@_selection_parameters()
 @engine_parameters
 @on_error_parameter
 def check_results(results: Path, dataroot: Dataroot | None, version: str, **options: Any) -> None:
     """Check every entry of the results file or folder RESULTS, and print a summary.
 
-    With --dataroot, also look for the mistakes of `evaluate … --sanity`.
-    Exit status 1: with --dataroot, samples of --split are missing, or RESULTS has others. 2: an
-    entry is wrong, or there is nothing to compare.
+    With --dataroot, also look for the mistakes of `evaluate … --sanity`. The command then exits
+    with 1 if samples of --split are missing, or if RESULTS has samples outside of it. It exits with
+    2 if an entry is wrong, or if there is nothing to compare.
     """
     if dataroot is None:
         refuse_unused("without --dataroot", *_RELEASE_OPTIONS)
-    opened, engine = read_results(results), engine_of(options)
-    opened.check(**engine, progress=True)
-    click.echo(results_text(opened))
+    opened_results = read_results(results)
+    engine = engine_options(options)
+    opened_results.check(**engine, progress=True)
+    click.echo(results_text(opened_results))
     if dataroot is None:
         return
     dataset = open_release(dataroot, version=version, on_error=options["on_error"], **engine)
-    protocol = next(iter(evaluator_class(opened.task).protocols))
-    if opened.task == "accident":
-        protocol = "boxes"  # the protocol that takes explicit accidents
-    setup = EvaluationSetup(task=opened.task, protocol=protocol, horizon=options["horizon"])
-    selection = _selection_of(setup, options)
-    check_recordings(opened, dataset)
-    covered = coverage(dataset, opened.tokens, selection)
-    click.echo(f"{selection.text()}: {covered.to_text()}")
-    shared = sorted(set(opened.tokens).intersection(selection.tokens(dataset)))
-    sanity = check_sanity(dataset, opened, setup, shared, **engine)
+    task = opened_results.task
+    protocol = next(iter(evaluator_class(task).protocols))
+    if task == "accident":
+        protocol = "boxes"  # the protocol for explicit accidents
+    setup = EvaluationSetup(task=task, protocol=protocol, horizon=options["horizon"])
+    selection = _select_samples(setup, options)
+    check_recordings(opened_results, dataset)
+    sample_coverage = coverage(dataset, opened_results.tokens, selection)
+    click.echo(f"{selection.text()}: {sample_coverage.to_text()}")
+    selected_tokens = selection.tokens(dataset)
+    common_tokens = sorted(set(opened_results.tokens).intersection(selected_tokens))
+    sanity = check_sanity(dataset, opened_results, setup, common_tokens, **engine)
     click.echo(sanity.to_text())
     if not sanity.sought:
         sys.exit(_NOTHING_STATUS)
-    if not covered.is_complete:
+    if not sample_coverage.is_complete:
         sys.exit(_FINDINGS_STATUS)
 
 
-def _compare() -> click.Command:
-    # here, since it draws, and so imports matplotlib
+def _load_compare_verb() -> click.Command:
+    # imported here because it draws, and so imports matplotlib
     from deepaccident_devkit.cli.evaluate_bundles import compare
 
     return compare
 
 
-def _task_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
-    """Return the verbs of a plug-in's tasks."""
+def _read_task_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
+    """Return the subcommands for a plug-in's tasks."""
     return {
-        name: LazyVerb(task.summary, partial(_task_verb, name))
+        name: LazyVerb(task.summary, partial(_make_task_verb, name))
         for name, task in plugin.tasks.items()
     }
 
 
-_VERBS: Final = {
-    **{name: LazyVerb(task.description, partial(_task_verb, name)) for name, task in TASKS.items()},
-    "compare": LazyVerb("Compare two evaluations, and test the differences.", _compare),
+_VERBS = {
+    **{
+        name: LazyVerb(task.description, partial(_make_task_verb, name))
+        for name, task in TASKS.items()
+    },
+    "compare": LazyVerb("Compare two evaluations, and test the differences.", _load_compare_verb),
 }
 
 
-@click.group(cls=LazyVerbs, verbs=_VERBS, read_plugin=_task_verbs)
+@click.group(cls=LazyVerbs, verbs=_VERBS, read_plugin=_read_task_verbs)
 def evaluate() -> None:
     """Evaluate results files; compare evaluations."""

@@ -14,11 +14,12 @@ from deepaccident_devkit.cli.options import (
     index_dir_parameter,
     json_parameter,
     on_error_parameter,
+    print_report,
 )
 from deepaccident_devkit.cli.verbs import advanced, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation import Resampling
-from deepaccident_devkit.evaluation.intervals import MOST_RESAMPLES
+from deepaccident_devkit.evaluation.intervals import MAX_RESAMPLES
 from deepaccident_devkit.evaluation.runs import (
     Comparison,
     OverBytes,
@@ -37,7 +38,7 @@ from deepaccident_devkit.render.figures import PICTURE_SUFFIXES, save_picture
 from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reports import write_csv
-from deepaccident_devkit.tables import place_outside
+from deepaccident_devkit.tables import choose_outside_index_dir
 from deepaccident_devkit.taxonomy import OnError
 
 _FINDINGS_STATUS = 1
@@ -47,13 +48,9 @@ _DPI = 130
 
 @verb("bundle")
 @click.argument("folder", metavar="DIR", type=PATH)
-@click.option(
-    "--dataroot", type=DATAROOT, help="Folder of the release; without it, nothing is done."
-)
-@click.option(
-    "--results", type=PATH, help="Results file or folder.  [default: the copy in DIR, if any]"
-)
-@click.option("--split", help="Split file, if the evaluation in DIR is of one.")
+@click.option("--dataroot", type=DATAROOT, help="Folder of the release; the command needs it.")
+@click.option("--results", type=PATH, help="Results file or folder.  [default: the copy in DIR]")
+@click.option("--split", help="Split file, if the evaluation in DIR used one.")
 @index_dir_parameter
 @engine_parameters
 @on_error_parameter
@@ -70,21 +67,22 @@ def verify(
 ) -> None:
     """Repeat the evaluation in the folder DIR and list all differences.
 
-    DIR may come from anyone: paths that it names are opened only if you give them, as the error
-    explains; links in it are not followed; nothing is written into the release.
+    You need not trust the author of DIR: the command opens only the paths that you give, follows no
+    links in DIR, and writes nothing into the release.
 
-    Exit status 0: there is no difference. 1: there are differences. 2: nothing could be compared.
+    It exits with 0 if there is no difference, with 1 if there are differences, and with 2 if
+    nothing could be compared.
     """
     bundle = read_bundle(folder)
     check_repeated(bundle, {"dataroot": dataroot, "results": results, "split": split})
     root = open_dataroot(dataroot or bundle.dataroot, index_dir, outside=True, on_error=on_error)
     layout = find_release(root, bundle.release_version)
-    index_path = index_dir or place_outside(layout)
+    index_path = index_dir or choose_outside_index_dir(layout)
     dataset = DeepAccident(layout.version, layout.root, index_path, on_error=on_error, **engine)
     verification = verify_bundle(
         folder, dataset, results=results, split=split, progress=True, **engine
     )
-    click.echo(verification.to_json() if as_json else verification.to_text())
+    print_report(verification, as_json=as_json)
     if not verification.is_same:
         sys.exit(_FINDINGS_STATUS)
 
@@ -94,13 +92,13 @@ def verify(
 @click.argument("b", type=PATH)
 @click.argument("more", type=PATH, nargs=-1)
 @click.option("--common", is_flag=True, help="Compare only the samples that all evaluations have.")
-@field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MOST_RESAMPLES))
+@field_option(Resampling, "resamples", option=advanced, type=click.IntRange(0, MAX_RESAMPLES))
 @click.option(
     "--out",
     multiple=True,
     type=PATH,
-    help="File to write all numbers into (.csv or .json), or a figure "
-    f"({', '.join(PICTURE_SUFFIXES)}); you can repeat this option.",
+    help="Write all numbers to this file (.csv or .json), or draw a figure "
+    f"({', '.join(PICTURE_SUFFIXES)}). You can repeat this option.",
 )
 @figure_style_parameter
 @json_parameter
@@ -115,9 +113,9 @@ def compare(
 ) -> None:
     """Compare the evaluations in the folders A and B, and test which differences are significant.
 
-    With MORE evaluations, show the main numbers of all over the bytes that partners send.
-    Evaluations of different sources, which have no scenario in common, are shown side by side, each
-    by its own rules.
+    With MORE evaluations, show the main numbers of all evaluations over the bytes that partners
+    send. Evaluations that have no scenario in common, such as those of different datasets, are
+    shown side by side, each by its own rules.
     """
     for path in out:
         if path.suffix.lower() not in _SUFFIXES:
@@ -125,26 +123,30 @@ def compare(
                 f"--out: expected a file that ends in {', '.join(_SUFFIXES)}, found {str(path)!r}"
             )
     comparison: SideBySide | OverBytes | Comparison
-    bundles = list(map(read_bundle, (a, b, *more)))
-    if not common and not set.intersection(*(set(bundle.scenarios()) for bundle in bundles)):
+    bundles = [read_bundle(folder) for folder in (a, b, *more)]
+    are_disjoint = False
+    if not common:
+        scenario_sets = [set(bundle.scenarios()) for bundle in bundles]
+        are_disjoint = not set.intersection(*scenario_sets)
+    if are_disjoint:
         comparison = side_by_side(bundles)
         if any(path.suffix.lower() in PICTURE_SUFFIXES for path in out):
             raise click.BadParameter(
-                "--out: these evaluations have no sample in common; give a file .csv or .json"
+                "--out: these evaluations have no sample in common; give a .csv or .json file"
             )
     elif more:
         comparison = over_bytes([a, b, *more], Resampling(resamples=resamples), common=common)
     else:
         comparison = compare_bundles(a, b, Resampling(resamples=resamples), common=common)
     for path in out:
-        _write(comparison, path)
-    click.echo(comparison.to_json() if as_json else comparison.to_text())
+        _write_comparison(comparison, path)
+    print_report(comparison, as_json=as_json)
     for path in out:
-        click.echo(f"written: {path}", err=as_json)
+        click.echo(f"wrote {path}", err=as_json)
 
 
-def _write(comparison: SideBySide | OverBytes | Comparison, path: Path) -> None:
-    """Write a comparison into a file, as its suffix requests."""
+def _write_comparison(comparison: SideBySide | OverBytes | Comparison, path: Path) -> None:
+    """Write a comparison to a file, in the format that the file's suffix means."""
     suffix = path.suffix.lower()
     if suffix == ".csv":
         write_csv(path, comparison.named_tables()["numbers"])
@@ -152,4 +154,5 @@ def _write(comparison: SideBySide | OverBytes | Comparison, path: Path) -> None:
         write_bytes(path, comparison.to_json().encode())
     else:
         draw: Any = render_over_bytes if isinstance(comparison, OverBytes) else render_comparison
-        save_picture(draw(comparison), path, dpi=None if current_style().few else _DPI)
+        dpi = None if current_style().shows_few_panels else _DPI
+        save_picture(draw(comparison), path, dpi=dpi)

@@ -1,10 +1,10 @@
-"""`deepaccident export`: data in other tools' formats. Only the written format is imported."""
+"""`deepaccident export`: data in other tools' formats. Only the chosen format is imported."""
 
 import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
@@ -17,12 +17,12 @@ from deepaccident_devkit.cli.agents import (
 from deepaccident_devkit.cli.options import (
     PATH,
     channels_parameter,
-    engine_of,
+    engine_options,
     frame_range_parameter,
     refuse_unused,
     release_parameters,
+    split_words,
     where_parameter,
-    words_of,
 )
 from deepaccident_devkit.cli.verbs import (
     LazyVerbs,
@@ -43,21 +43,22 @@ from deepaccident_devkit.v2x.collisions import default_scenario
 if TYPE_CHECKING:
     from deepaccident_devkit.export.bulk import Tally
 
-_CONTINUED: Final = "If a run is interrupted, the same command continues it."
-_LINK_NAMES: Final = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
+_Parameter: TypeAlias = Callable[[Any], Any]
+_CONTINUED = "If a run is interrupted, the same command continues it."
+_LINK_NAMES = {"hard": "hard links", "symbolic": "symbolic links", "copy": "copies"}
 link_parameter = advanced(
     "--link",
     type=WordChoice(_LINK_NAMES),
     default="hard",
     show_default=True,
-    help="How images are put there: hard links, else symbolic ones, else copies.",
+    help="How to place images: as hard links, symbolic links or copies; the next is the fallback.",
 )
 
 
-def bulk_parameters(agents: Callable[[Any], Any] = agents_parameter) -> Callable[[Any], Any]:
+def bulk_parameters(agents: _Parameter = agents_parameter) -> _Parameter:
     """Return a release's parameters, --out, --split, --where, --agents and --dry-run.
 
-    `agents` adds --agents to a verb that gives it another meaning.
+    `agents` is the parameter --agents, which some subcommands replace by one with another meaning.
     """
     return together(
         release_parameters,
@@ -66,17 +67,18 @@ def bulk_parameters(agents: Callable[[Any], Any] = agents_parameter) -> Callable
         ),
         click.option(
             "--split",
-            help="Only this split: train, val, test, …, or a split file (.txt).  [default: all]",
+            help="Export only this split: train, val, test, …, or a split file (.txt).  [default: "
+            "all]",
         ),
         where_parameter,
         agents,
-        click.option("--dry-run", is_flag=True, help="Only say how much would be written."),
+        click.option("--dry-run", is_flag=True, help="Only print how much would be written."),
     )
 
 
 def run_export(
     kind: Callable[..., Any],
-    own: dict[str, Any],
+    settings: dict[str, Any],
     *,
     out: Path,
     split: str | None,
@@ -86,61 +88,68 @@ def run_export(
     dry_run: bool,
     **release: Any,
 ) -> None:
-    """Export in a format with its `own` settings.
+    """Export a release to a format; `settings` are the options that only this format has.
 
-    Prints an estimate of the size, then what was written and left out.
+    The estimated size is printed first, then what was written and what was left out.
     """
     from deepaccident_devkit.export.bulk import export_release
 
-    # before the release is indexed
-    form = kind(split=split, where=where, agents=agent_names(agents), link=link, **own)
+    # checked before the release is indexed
+    export_format = kind(
+        split=split, where=where, agents=agent_names(agents), link=link, **settings
+    )
     dataset = DeepAccident(**release)
-    estimate = export_release(dataset, out, form, dry_run=True)
+    estimate = export_release(dataset, out, export_format, dry_run=True)
     if estimate.written:
         _print_estimate(estimate.tally, estimate.folder, out)
     if dry_run:
         return
-    done = export_release(dataset, out, form, **engine_of(release), progress=True)
-    linked_text = "".join(
-        f", {count:,} files as {_LINK_NAMES[name]}"
-        for name, count in sorted(done.tally.linked.items())
-    )
-    units = f"{counted(done.written, form.unit_word)} written now, {done.kept:,} were there already"
-    click.echo(f"{done.folder}: {_counts(done.tally, 'written')}{linked_text}; {units}")
-    for name, count in sorted(done.tally.left_out.items()):
-        click.echo(f"left out: {count:,} {name}")
+    outcome = export_release(dataset, out, export_format, **engine_options(release), progress=True)
+    counts = _format_counts(outcome.tally)
+    for name, count in sorted(outcome.tally.linked.items()):
+        counts += f", {counted(count, 'file')} as {_LINK_NAMES[name]}"
+    units = counted(outcome.written, export_format.unit_word)
+    click.echo(f"wrote {outcome.folder}: {counts} ({units} new, {outcome.kept:,} already there)")
+    for name, count in sorted(outcome.tally.left_out.items()):
+        click.echo(f"excluded: {name} ({count:,})")
 
 
 def _print_estimate(tally: "Tally", folder: Path, out: Path) -> None:
-    """Print the size of an export; raises ExportError if the disk has too little room."""
+    """Print the size of an export; raise ExportError if the disk has too little space."""
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(existing).free
-    counts = _counts(tally, "to write")
-    linked = sum(tally.linked.values())  # other links may be possible than in a temporary folder
+    counts = _format_counts(tally)
+    linked = sum(tally.linked.values())  # a temporary folder may allow other links than `out`
     if linked:
-        counts += f", {linked:,} files to link"
-    click.echo(f"about {tally.samples:,} samples: {counts}; {size_text(free)} free")
+        counts += f", {counted(linked, 'file')} to link"
+    samples = counted(tally.samples, "sample")
+    free_text = size_text(free)
+    click.echo(f"estimate for about {samples}: {counts}; {free_text} free")
     if tally.bytes > free:
+        needed_text = size_text(tally.bytes)
         raise ExportError(
-            f"{out}: there is too little room; choose another disk, or fewer scenarios or agents"
+            f"{out}: not enough free space ({needed_text} needed, {free_text} free); choose "
+            "another disk, or fewer scenarios or agents"
         )
 
 
-def _counts(tally: "Tally", done: str) -> str:
-    files = f"{tally.files:,}" if tally.files else "a few"
-    return f"{files} files {done} ({size_text(tally.bytes)})"
+def _format_counts(tally: "Tally") -> str:
+    files = "a few files"
+    if tally.files:
+        files = counted(tally.files, "file")
+    return f"{files} ({size_text(tally.bytes)})"
 
 
-def _of_format(
-    kind: type[Any], *options: Callable[[Any], Any], summary: str = "", text: str = ""
+def _make_format_verb(
+    kind: type[Any], *options: _Parameter, summary: str = "", text: str = ""
 ) -> click.Command:
-    """Return the verb of a format, with options that set fields of the format.
+    """Build the subcommand for a format, with options that set the format's fields.
 
     Args:
-        kind: The format.
-        *options: Options of its own.
-        summary: Line in the list of formats; empty for the one in `_VERBS`.
-        text: Help; empty for the summary.
+        kind: Class of the format.
+        *options: Options that only this format has.
+        summary: Line in the list of formats; if empty, the line in `_VERBS`.
+        text: Help of the subcommand; if empty, the summary.
     """
     summary = summary or _VERBS[kind.name].summary
 
@@ -148,41 +157,42 @@ def _of_format(
     @bulk_parameters()
     @together(*options)
     def export_format(**options: Any) -> None:
-        run_export(kind, _own(kind, options), **options)
+        run_export(kind, _pop_own_fields(kind, options), **options)
 
     return export_format
 
 
-def _own(kind: type[Any], options: dict[str, Any]) -> dict[str, Any]:
-    """Remove the fields that only this format has from a verb's options, and return them."""
+def _pop_own_fields(kind: type[Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Remove the fields that only this format has from the options, and return them."""
     from deepaccident_devkit.export.bulk import Format
 
     fields = kind.__dataclass_fields__.keys() - Format.__dataclass_fields__.keys()
     return {name: options.pop(name) for name in fields & options.keys()}
 
 
-def _nuscenes_options() -> tuple[Callable[[Any], Any], ...]:
+def _make_nuscenes_options() -> tuple[_Parameter, ...]:
     from deepaccident_devkit.export.nuscenes import NuScenes
 
-    fields = ("van", "lidar_axes", "sweeps")
-    return link_parameter, *(field_option(NuScenes, name, option=advanced) for name in fields)
+    names = ("van", "lidar_axes", "sweeps")
+    options = [field_option(NuScenes, name, option=advanced) for name in names]
+    return link_parameter, *options
 
 
-def _nuscenes() -> click.Command:
+def _load_nuscenes_verb() -> click.Command:
     from deepaccident_devkit.export.nuscenes import NuScenes
 
-    return _of_format(
+    return _make_format_verb(
         NuScenes,
-        *_nuscenes_options(),
-        text="Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all that "
-        "reads nuScenes.\n\nKeyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, "
-        "clouds are written: those of a whole release take about 210 GB, and 42 GB with "
-        "--no-sweeps; the nuScenes devkit holds its tables in 6 GB of memory, or 4 GB. "
-        f"--dry-run says how large yours are. {_CONTINUED}",
+        *_make_nuscenes_options(),
+        text="Write scenarios of the release in DATAROOT for the nuScenes devkit 1.2 and all other "
+        "tools that read nuScenes.\n\nKeyframes are at 2 Hz, sweeps at 10 Hz. Images are linked, "
+        "and point clouds are written. The clouds of the whole release take about 210 GB, or 42 GB "
+        "with --no-sweeps; the nuScenes devkit needs 6 GB or 4 GB of memory for its tables. "
+        f"--dry-run prints the size of your export. {_CONTINUED}",
     )
 
 
-def _mmdet3d() -> click.Command:
+def _load_mmdet3d_verb() -> click.Command:
     from deepaccident_devkit.export.mmdet3d import Mmdet3d
     from deepaccident_devkit.export.nuscenes import NuScenes
     from deepaccident_devkit.export.released_infos import ReleasedInfos
@@ -199,18 +209,18 @@ def _mmdet3d() -> click.Command:
         type=WordChoice(("nuscenes", "released")),
         default="nuscenes",
         show_default=True,
-        help="nuscenes: for mmdet3d from 1.1 on. released: as the released code's converter makes "
-        "them.",
+        help="nuscenes: infos for mmdet3d 1.1 and later. released: the infos that the released "
+        "code's converter makes.",
     )
-    @together(*_nuscenes_options(), *released)
+    @together(*_make_nuscenes_options(), *released)
     def mmdet3d(style: str, **options: Any) -> None:
         """Write infos for mmdet3d's NuScenesDataset, and a nuScenes export if there is none yet.
 
         With --style released, write carla_infos_train.pkl and carla_infos_val.pkl, which the
         released code's two dataset classes read together with the release itself.
         """
-        released_fields = _own(ReleasedInfos, options)
-        nuscenes_fields = _own(NuScenes, options)
+        released_fields = _pop_own_fields(ReleasedInfos, options)
+        nuscenes_fields = _pop_own_fields(NuScenes, options)
         if style == "released":
             refuse_unused("with --style released", *nuscenes_fields, "link")
             run_export(ReleasedInfos, released_fields, **options)
@@ -222,7 +232,7 @@ def _mmdet3d() -> click.Command:
     return mmdet3d
 
 
-def _opencood() -> click.Command:
+def _load_opencood_verb() -> click.Command:
     from deepaccident_devkit.export.opencood import OpenCood
 
     classes = field_option(
@@ -232,30 +242,30 @@ def _opencood() -> click.Command:
         default=",".join(OpenCood.classes),
         callback=lambda _context, _option, value: tuple(value.split(",")),
         metavar="NAME[,NAME…]",
-        help=f"Which boxes become vehicles: {', '.join(CATEGORIES)}.",
+        help=f"Classes of boxes that become vehicles: {', '.join(CATEGORIES)}.",
     )
-    return _of_format(
+    return _make_format_verb(
         OpenCood,
         link_parameter,
         classes,
         field_option(OpenCood, "ego", type=WordChoice(VEHICLE_AGENTS)),
         field_option(OpenCood, "without_clouds", option=advanced),
-        text="Write scenarios of the release in DATAROOT as OPV2V has them: a folder each, with "
-        f"yaml, json and pcd files.\n\n{_CONTINUED}",
+        text="Write scenarios of the release in DATAROOT in the format of OPV2V: one folder per "
+        f"scenario, with yaml, json and pcd files.\n\n{_CONTINUED}",
     )
 
 
-def _parquet() -> click.Command:
+def _load_parquet_verb() -> click.Command:
     from deepaccident_devkit.export.parquet import Parquet
 
-    return _of_format(
+    return _make_format_verb(
         Parquet,
         text="Write all tables of the release in DATAROOT as Parquet files by split, with tokens "
-        f"in place of row numbers.\n\n{_CONTINUED}",
+        f"instead of row numbers.\n\n{_CONTINUED}",
     )
 
 
-def _webdataset() -> click.Command:
+def _load_webdataset_verb() -> click.Command:
     from deepaccident_devkit.export.webdataset import WebDataset
 
     size = advanced(
@@ -265,9 +275,9 @@ def _webdataset() -> click.Command:
         show_default=True,
         callback=lambda _context, _option, value: value * 10**6,
         metavar="MB",
-        help="Size of a tar file, about.",
+        help="Approximate size of a tar file.",
     )
-    return _of_format(
+    return _make_format_verb(
         WebDataset,
         field_option(WebDataset, "frames"),
         size,
@@ -276,21 +286,21 @@ def _webdataset() -> click.Command:
     )
 
 
-def _questions() -> click.Command:
+def _load_questions_verb() -> click.Command:
     from deepaccident_devkit.export.questions import Questions, WindowRules
 
-    observing = together(
+    agent_parameters = together(
         cooperating_parameter("Agents that observe together with each ego", "single"),
         click.option(
             "--ego",
             multiple=True,
             metavar="NAME[,NAME…]",
-            help="Agents that ask, each with questions of its own, or all.  [default: ego_vehicle]",
+            help="Agents to write questions for, or all.  [default: ego_vehicle]",
         ),
     )
 
     @verb(short_help=_VERBS["questions"].summary)
-    @bulk_parameters(observing)
+    @bulk_parameters(agent_parameters)
     @field_option(WindowRules, "observe")
     @field_option(WindowRules, "ahead", type=click.IntRange(min=1))
     @field_option(WindowRules, "stride", option=advanced)
@@ -300,14 +310,14 @@ def _questions() -> click.Command:
         type=WordChoice(("none", "link", "copy")),
         default="none",
         show_default=True,
-        help="Whether pictures go with the questions, under neutral names. link: as hard links, "
-        "else copies.",
+        help="Add images to the questions, under neutral names. link: as hard links, or copies "
+        "where links are impossible.",
     )
     @click.option(
         "--channels",
         multiple=True,
         metavar="NAME[,NAME…]",
-        help=f"With --images: whose pictures, or all.  [default: {CAMERAS[0]}]",
+        help=f"With --images: cameras whose images to add, or all.  [default: {CAMERAS[0]}]",
     )
     @field_option(Questions, "seed", metavar="TEXT")
     def questions(
@@ -317,25 +327,29 @@ def _questions() -> click.Command:
         channels: tuple[str, ...],
         **options: Any,
     ) -> None:
-        """Write questions about the release in DATAROOT: whether an accident follows observations.
+        """Write questions about the release in DATAROOT: does an accident follow the observations?
 
-        FOLDER/questions holds all that a model may see, FOLDER/truth.jsonl the answers.
-        `deepaccident results` makes a results file of what a model answers. If a run is
+        FOLDER/questions contains everything that a model may see, FOLDER/truth.jsonl the answers.
+        `deepaccident results` makes a results file from a model's answers. If a run is
         interrupted, the same command continues it.
         """
         if images == "none":
             refuse_unused("without --images", "channels")
-        own = {
+        window = WindowRules(
+            observe=options.pop("observe"),
+            ahead=options.pop("ahead"),
+            stride=options.pop("stride"),
+        )
+        settings = {
             "observers": names_or_configuration(agents) or "single",
-            "window": WindowRules(
-                **{name: options.pop(name) for name in ("observe", "ahead", "stride")}
-            ),
-            "cameras": () if images == "none" else _camera_names(channels),
-            **{name: options.pop(name) for name in ("seen", "seed")},
+            "window": window,
+            "cameras": () if images == "none" else _choose_cameras(channels),
+            "seen": options.pop("seen"),
+            "seed": options.pop("seed"),
         }
         run_export(
             Questions,
-            own,
+            settings,
             agents=agent_names(ego or ("ego_vehicle",)),
             link="copy" if images == "copy" else "hard",
             **options,
@@ -344,8 +358,9 @@ def _questions() -> click.Command:
     return questions
 
 
-def _camera_names(texts: tuple[str, ...]) -> tuple[str, ...]:
-    names = [choice("--channels", name, (*CAMERAS, "all")) for name in words_of(texts)]
+def _choose_cameras(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the cameras passed with repeated --channels; by default, the front camera."""
+    names = [choice("--channels", name, (*CAMERAS, "all")) for name in split_words(texts)]
     if "all" in names:
         return CAMERAS
     return tuple(names) or CAMERAS[:1]
@@ -366,10 +381,10 @@ def _camera_names(texts: tuple[str, ...]) -> tuple[str, ...]:
     metavar="N",
     default=1,
     show_default=True,
-    help="Only every N-th point of a cloud.",
+    help="Write only every N-th point of a cloud.",
 )
 @click.option(
-    "--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels by this preset."
+    "--motion-labels", type=WordChoice(PRESETS), help="Also write motion labels of this preset."
 )
 @click.option(
     "--results", type=PATH, metavar="FILE", help="Also write the predictions of this results file."
@@ -394,55 +409,62 @@ def _mcap(
     names = agent_names(agents)
     choices = {name: options.pop(name) for name in ("frames", "points", "motion_labels")}
     choices["agents"] = None if names == AGENTS else names
-    choices["channels"] = words_of(channels) if channels else None
-    config = McapConfig.of(**choices)  # before the release is indexed
+    choices["channels"] = split_words(channels) if channels else None
+    config = McapConfig.of(**choices)  # fails before the release is indexed
     if LIDAR not in (config.channels or ()):
         refuse_unused(f"without the channel {LIDAR}", "points")
     prediction = None if results is None else read_results(results)
     dataset = DeepAccident(**options)
     token = scenario or default_scenario(dataset)
     path = export_mcap(dataset, token, out, prediction=prediction, progress=True, **choices)
-    size, script = f"{path.stat().st_size / 1e6:.1f} MB", path.with_suffix(".rerun.py")
-    click.echo(f"{path}: {token}, {size}; open it in Foxglove, or with: python {script}")
+    size = size_text(path.stat().st_size)
+    script = path.with_suffix(".rerun.py")
+    click.echo(f"wrote {path} ({token}, {size}); open it in Foxglove, or with: python {script}")
 
 
-def _town_maps() -> click.Command:
+def _load_town_maps_verb() -> click.Command:
     from deepaccident_devkit.cli.town_maps import town_maps
 
     return town_maps
 
 
-# Format → its line in the list of formats, and the function that makes its verb.
-_VERBS: Final = {
+# Format → its line in the list of formats, and the function that builds its subcommand.
+_VERBS = {
     "mcap": LazyVerb("Write a scenario as an interactive 3D scene (MCAP).", lambda: _mcap),
-    "mmdet3d": LazyVerb("Write infos for mmdet3d, or for the released code.", _mmdet3d),
-    "nuscenes": LazyVerb("Write nuScenes tables and their sensor files.", _nuscenes),
+    "mmdet3d": LazyVerb("Write infos for mmdet3d, or for the released code.", _load_mmdet3d_verb),
+    "nuscenes": LazyVerb("Write nuScenes tables and their sensor files.", _load_nuscenes_verb),
     "opencood": LazyVerb(
-        "Write OPV2V's folders, for OpenCOOD, V2X-ViT, CoAlign and HEAL.", _opencood
+        "Write folders like OPV2V's, for OpenCOOD, V2X-ViT, CoAlign and HEAL.", _load_opencood_verb
     ),
     "parquet": LazyVerb(
-        "Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.", _parquet
+        "Write all tables as Parquet files, for datasets, DuckDB, Polars and pandas.",
+        _load_parquet_verb,
     ),
-    "questions": LazyVerb("Write questions on what happens next, for language models.", _questions),
-    "town-maps": LazyVerb("Write the roads and sidewalks of each town as GeoJSON.", _town_maps),
+    "questions": LazyVerb(
+        "Write questions about what happens next, for language models.", _load_questions_verb
+    ),
+    "town-maps": LazyVerb(
+        "Write the roads and sidewalks of each town as GeoJSON.", _load_town_maps_verb
+    ),
     "webdataset": LazyVerb(
-        "Write samples with images, LiDAR and boxes as tar files, for webdataset.", _webdataset
+        "Write samples with images, LiDAR and boxes as tar files, for webdataset.",
+        _load_webdataset_verb,
     ),
 }
 
 
-def _format_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
-    """Return the verbs of a plug-in's formats; fields of these have no options of their own."""
+def _read_format_verbs(plugin: Plugin) -> dict[str, LazyVerb]:
+    """Return the subcommands for a plug-in's formats, without options for the formats' fields."""
     return {
-        name: LazyVerb(export_format.summary, partial(_plugin_format, export_format))
+        name: LazyVerb(export_format.summary, partial(_load_plugin_verb, export_format))
         for name, export_format in plugin.export_formats.items()
     }
 
 
-def _plugin_format(export_format: LazyFormat) -> click.Command:
-    return _of_format(export_format.load(), link_parameter, summary=export_format.summary)
+def _load_plugin_verb(export_format: LazyFormat) -> click.Command:
+    return _make_format_verb(export_format.load(), link_parameter, summary=export_format.summary)
 
 
-@click.group(cls=LazyVerbs, verbs=_VERBS, read_plugin=_format_verbs)
+@click.group(cls=LazyVerbs, verbs=_VERBS, read_plugin=_read_format_verbs)
 def export() -> None:
-    """Write data in the formats of other tools."""
+    """Export data to the formats of other tools."""

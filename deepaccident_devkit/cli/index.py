@@ -1,10 +1,10 @@
-"""`deepaccident index` and `deepaccident check index`: make, refresh, check or remove an index."""
+"""`deepaccident index` and `deepaccident check index`: make, update, check or remove an index."""
 
 from typing import Any
 
 import click
 
-from deepaccident_devkit.cli.options import engine_of, refuse_unused, release_parameters
+from deepaccident_devkit.cli.options import engine_options, refuse_unused, release_parameters
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
@@ -19,32 +19,33 @@ from deepaccident_devkit.taxonomy import OnError
     "--clear",
     is_flag=True,
     help="Remove the index instead, from its own folder and from your cache. The release itself "
-    "stays as it is.",
+    "stays unchanged.",
 )
 def index(dataroot: Dataroot, version: str, on_error: OnError, clear: bool, **options: Any) -> None:
-    """Make or update the index of the release in DATAROOT, and print where it is."""
+    """Create or update the index of the release in DATAROOT, and print where it is."""
     if clear:
-        refuse_unused("with --clear, which makes no index", "workers", "on_error")
+        refuse_unused("with --clear, which creates no index", "workers", "on_error")
         cleared = clear_index(dataroot, version=version, index_dir=options["index_dir"])
         lines = [f"removed {folder}" for folder in cleared]
         click.echo("\n".join(lines) or f"{dataroot}: no index to remove")
         return
-    _update(dataroot, version, on_error, check_files=False, **options)
+    _update_index(dataroot, version, on_error, check_files=False, **options)
 
 
 @verb("index")
 @release_parameters
 def check_index(dataroot: Dataroot, version: str, on_error: OnError, **options: Any) -> None:
-    """Compare the index of the release in DATAROOT with the content of its files, and mend it.
+    """Compare the index of the release in DATAROOT with the content of its files, and repair it.
 
-    These are all label, calib and meta files; `deepaccident index` compares their times instead.
+    The command reads all label, calib and meta files. `deepaccident index` compares only their
+    times.
     """
-    tables = _update(dataroot, version, on_error, check_files=True, **options)
+    tables = _update_index(dataroot, version, on_error, check_files=True, **options)
     scenarios = counted(len(tables.table("scenario")), "scenario")
-    click.echo(f"compared: the tables, and the label, calib and meta files of {scenarios}")
+    click.echo(f"compared the tables, and the label, calib and meta files of {scenarios}")
 
 
-def _update(
+def _update_index(
     dataroot: Dataroot, version: str, on_error: OnError, *, check_files: bool, **options: Any
 ) -> Tables:
     """Make or update an index, print where it is, and return its tables."""
@@ -54,7 +55,7 @@ def _update(
         refresh=True,
         on_error=on_error,
         progress=True,
-        **engine_of(options),
+        **engine_options(options),
     )
     index = open_index(
         find_release(root, version),

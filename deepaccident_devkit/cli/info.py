@@ -8,21 +8,27 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.options import (
-    engine_of,
+    engine_options,
+    figure_style_parameter,
     json_parameter,
     open_release,
+    print_report,
+    print_written_report,
     refuse_unused,
     release_parameters,
-    say_report,
     where_parameter,
     write_report,
 )
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.statistics.overview import overview, scenario_lines
+from deepaccident_devkit.support.text import counted
+
+# Parameters that need --statistics.
+_STATISTICS_PARAMETERS = ("interactions", "out", "style", "no_title")
 
 
-def _list_fields(context: click.Context, _parameter: click.Parameter, is_set: bool) -> None:
+def _print_fields(context: click.Context, _parameter: click.Parameter, is_set: bool) -> None:
     if is_set:
         from deepaccident_devkit.selection.fields import fields_text
 
@@ -38,10 +44,10 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, is_set: bo
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_list_fields,
-    help="List what --where takes: fields, their values and what they mean; without DATAROOT.",
+    callback=_print_fields,
+    help="List the fields that --where takes, with their values and meanings; needs no DATAROOT.",
 )
-@click.option("--statistics", is_flag=True, help="Print the paper's statistics by split instead.")
+@click.option("--statistics", is_flag=True, help="Print the paper's statistics of each split.")
 @click.option(
     "--interactions",
     is_flag=True,
@@ -50,25 +56,26 @@ def _list_fields(context: click.Context, _parameter: click.Parameter, is_set: bo
 @click.option(
     "--out",
     type=click.Path(),
-    help="With --statistics: folder to write statistics.json, one CSV file per table, and figures "
-    "into; earlier ones there are replaced.",
+    help="With --statistics: write statistics.json, one CSV file per table, and figures into this "
+    "folder. Existing files are replaced.",
 )
 @click.option(
     "--facts",
     is_flag=True,
-    help="Compare the release with what others measured of the real one instead; broken scenarios "
-    "are left out, and counted (docs/validation.md).",
+    help="Compare the release with published measurements of the real one. Broken scenarios are "
+    "excluded and counted (docs/validation.md).",
 )
 @click.option(
     "--croissant",
     is_flag=True,
-    help="Print the release's data card instead: Croissant metadata, as JSON-LD (docs/format.md).",
+    help="Print the release's data card: Croissant metadata as JSON-LD (docs/format.md).",
 )
 @click.option(
     "--licence",
     metavar="TEXT",
-    help="With --croissant: the licence that you have the data under, or its URL.",
+    help="With --croissant: the licence under which you have the data, or its URL.",
 )
+@figure_style_parameter
 @json_parameter
 def info(
     where: tuple[str, ...],
@@ -81,65 +88,62 @@ def info(
     as_json: bool,
     **release: Any,
 ) -> None:
-    """Print what the release in DATAROOT holds: tables, splits, agents, sensors, attributes.
+    """Print what the release in DATAROOT contains: tables, splits, agents, sensors, attributes.
 
-    With --where, list the scenarios that match all filters instead; with --json, their records.
+    With --where, list only the scenarios that match all filters; with --json, print their records.
     """
     if croissant:
         from deepaccident_devkit.validation import data_card
 
-        refuse_unused(
-            "with --croissant", "where", "statistics", "interactions", "out", "facts", "as_json"
-        )
+        unused = ("where", "statistics", "facts", "as_json", *_STATISTICS_PARAMETERS)
+        refuse_unused("with --croissant", *unused)
         card = data_card(open_release(**release), licence=licence)
         click.echo(json.dumps(card, indent=2, ensure_ascii=False))
         return
     refuse_unused("without --croissant", "licence")
-    if facts or not statistics:
-        refuse_unused(
-            "with --facts" if facts else "without --statistics",
-            "interactions",
-            "out",
-            *(["statistics"] if facts else []),
-        )
-    dataset = open_release(**(release | {"on_error": "skip"} if facts else release))
+    if facts:
+        refuse_unused("with --facts", "statistics", *_STATISTICS_PARAMETERS)
+        release["on_error"] = "skip"
+    elif not statistics:
+        refuse_unused("without --statistics", *_STATISTICS_PARAMETERS)
+    dataset = open_release(**release)
     scenarios = dataset.find(*where) if where else None
     if facts:
         from deepaccident_devkit.statistics import release_facts
 
-        report = release_facts(dataset, scenarios, **engine_of(release))
-        say_report(report, [], None, as_json=as_json)
+        report = release_facts(dataset, scenarios, **engine_options(release))
+        print_report(report, as_json=as_json)
         sys.exit(report.exit_status)
     if scenarios == [] and out is not None:
         raise click.UsageError(
             "no scenario matches --where, so there is nothing to write; change it or omit --out"
         )
     if statistics:
-        _statistics(
+        _print_statistics(
             dataset,
             scenarios,
             out,
             interactions=interactions,
             as_json=as_json,
-            **engine_of(release),
+            **engine_options(release),
         )
         return
     if scenarios is None:
         summary = overview(dataset)
-        click.echo(summary.to_json() if as_json else summary.to_text())
+        print_report(summary, as_json=as_json)
     elif as_json:
         click.echo(json.dumps(scenarios, indent=2, ensure_ascii=False))
     elif scenarios:
-        click.echo(f"{len(scenarios)} of {len(dataset.scenario)} scenarios match")
+        click.echo(f"{len(scenarios)} of {counted(len(dataset.scenario), 'scenario')} match")
         click.echo("\n".join(scenario_lines(scenarios)))
     else:
         click.echo(
-            f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists what "
-            "can be asked for"
+            f"no scenario matches {' and '.join(where)}; deepaccident info --fields lists the "
+            "possible filters"
         )
 
 
-def _statistics(
+def _print_statistics(
     dataset: DeepAccident,
     scenarios: list[Any] | None,
     out: str | None,
@@ -151,9 +155,11 @@ def _statistics(
     from deepaccident_devkit.statistics import dataset_statistics
     from deepaccident_devkit.support.files import writable_folder
 
+    if out is None:
+        refuse_unused("without --out", "style", "no_title")
     folder = None if out is None else writable_folder(out)
     statistics = dataset_statistics(dataset, scenarios, **engine)
     written: list[Path] = write_report(statistics, folder, "statistics.json")
     if folder:
         written += save_statistics(statistics, folder)
-    say_report(statistics, written, folder, as_json=as_json)
+    print_written_report(statistics, written, folder, as_json=as_json)

@@ -1,4 +1,4 @@
-"""`deepaccident labels`: the motion labels of a split, written into a folder."""
+"""`deepaccident labels`: writes the motion labels of a split into a folder."""
 
 from dataclasses import replace
 from typing import Any, get_args
@@ -6,7 +6,12 @@ from typing import Any, get_args
 import click
 
 from deepaccident_devkit.cli.agents import agent_names, agents_parameter
-from deepaccident_devkit.cli.options import engine_of, open_release, release_parameters, switches_of
+from deepaccident_devkit.cli.options import (
+    engine_options,
+    open_release,
+    parse_switches,
+    release_parameters,
+)
 from deepaccident_devkit.cli.verbs import WordChoice, advanced, field_option, verb
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.motion import (
@@ -23,19 +28,19 @@ from deepaccident_devkit.selection.samples import Purpose
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.v2x import AGENT_SETS
 
-_CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
-
 
 @verb()
 @release_parameters
 @click.option(
-    "--split", required=True, help="train, val, train_mini, val_mini, all, or a split file (.txt)."
+    "--split",
+    required=True,
+    help="Split to write: train, val, train_mini, val_mini, all, or a split file (.txt).",
 )
 @click.option(
     "--out",
     required=True,
     metavar="FOLDER",
-    help="Folder to write into: a new one, or one with labels of the same kind.",
+    help="Folder to write into: a new folder, or one with labels of the same kind.",
 )
 @agents_parameter
 @click.option(
@@ -44,8 +49,8 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
     type=WordChoice(get_args(Purpose)),
     default="every",
     show_default=True,
-    help="every: all samples (10 Hz). all, keyframes: two samples per second. train, evaluate: "
-    "those of training and evaluation.",
+    help="Samples to write. every: all samples (10 Hz). all, keyframes: two per second. train, "
+    "evaluate: those of training and of evaluation.",
 )
 @click.option(
     "--preset",
@@ -57,27 +62,27 @@ _CONFIG_OPTIONS = ("preset", "protocol", "switches", "seen_by", "only_vehicle")
 @click.option(
     "--protocol",
     type=WordChoice(LABEL_PROTOCOLS),
-    help="Rules of the labels.  [default: of the preset]",
+    help="Rules of the labels.  [default: those of the preset]",
 )
 @advanced(
     "--switch",
     "switches",
     multiple=True,
     metavar="NAME=yes|no",
-    help="Switch one quirk of the protocol on or off.",
+    help="Switch one quirk of the protocol on or off. You can repeat this option.",
 )
 @click.option(
     "--seen-by",
     type=WordChoice(AGENT_SETS),
-    help="Only actors that these agents see.  [default: all actors]",
+    help="Label only actors that these agents see.  [default: all actors]",
 )
 @field_option(MotionLabelConfig, "only_vehicle")
 @click.option(
     "--names",
     type=WordChoice(get_args(BatchNames)),
-    help="Write one plain npz file per sample, for loops without the devkit: the arrays that this "
-    "code's loader gives, with its names, axes, types and orientation. Takes some 0.1 MB per "
-    "sample, 25 times as much as label files.  [default: label files]",
+    help="Write one plain npz file per sample, for code without the devkit: the arrays that the "
+    "loader of this code returns, with its names, axes, types and orientation. A sample takes "
+    "about 0.1 MB, 25 times as much as in label files.  [default: label files]",
 )
 def labels(
     split: str,
@@ -89,55 +94,58 @@ def labels(
 ) -> None:
     """Write the motion labels of one split of the release in DATAROOT.
 
-    There is one file per scenario and agent. If a run is interrupted, the same command continues
-    it.
+    The command writes one file per scenario and agent. If a run is interrupted, the same command
+    continues it.
     """
-    config = _config(options)
+    config = _pop_config(options)
     agents = agent_names(agents)
-    LabelManifest.of(folder_path(out), config, names)  # before the release is indexed
+    LabelManifest.of(folder_path(out), config, names)  # fails before the release is indexed
     dataset = open_release(**options)
-    tokens = [
-        token for token in dataset.samples(split, purpose) if token.rsplit("/", 2)[1] in agents
-    ]
+    tokens = []
+    for token in dataset.samples(split, purpose):
+        _, agent, _ = token.rsplit("/", 2)
+        if agent in agents:
+            tokens.append(token)
     if not tokens:
         raise NotAvailableError(
-            f"{split}: has no labelled samples of {', '.join(agents)} for --samples {purpose}"
+            f"{split}: has no labelled samples of {', '.join(agents)} with --samples {purpose}"
         )
-    done = write_label_files(
+    outcome = write_label_files(
         dataset,
         out,
         tokens,
         config,
         names=names,
-        **engine_of(options),
+        **engine_options(options),
         progress=True,
     )
-    written = counted(done.written, "file")
-    click.echo(
-        f"{counted(done.samples, 'sample')} in {out}: {written} written, {done.kept} were there "
-        "already"
-    )
+    samples = counted(outcome.samples, "sample")
+    files = counted(outcome.written, "new file")
+    click.echo(f"wrote {out}: {samples} ({files}, {outcome.kept:,} already there)")
 
 
-def _config(options: dict[str, Any]) -> MotionLabelConfig:
-    """Remove the options of the label configuration from a verb's options, and return it."""
-    preset, protocol, switches, seen_by, only_vehicle = (
-        options.pop(name) for name in _CONFIG_OPTIONS
-    )
-    named = {"protocol": protocol, "agents": seen_by, "only_vehicle": only_vehicle or None}
-    changes: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+def _pop_config(options: dict[str, Any]) -> MotionLabelConfig:
+    """Remove the options for the label configuration from `options`; return the configuration."""
+    preset = options.pop("preset")
+    switches = options.pop("switches")
+    values = {
+        "protocol": options.pop("protocol"),
+        "agents": options.pop("seen_by"),
+        "only_vehicle": options.pop("only_vehicle") or None,
+    }
+    changes: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     config = MotionLabelConfig.preset(preset, **changes)
     if switches:
-        return replace(config, protocol=_switched(config.rules, switches))
+        return replace(config, protocol=_switch_rules(config.rules, switches))
     return config
 
 
-def _switched(rules: LabelProtocol, texts: tuple[str, ...]) -> LabelProtocol:
-    switches = switches_of(texts)
+def _switch_rules(rules: LabelProtocol, texts: tuple[str, ...]) -> LabelProtocol:
+    switches = parse_switches(texts)
     for name, value in switches.items():
         if name not in slip_names() or not isinstance(value, bool):
             names = ", ".join(slip_names())
             raise click.BadParameter(
-                f"--switch: expected yes or no for one of {names}; found {', '.join(texts)}"
+                f"--switch: expected yes or no for one of {names}, found {', '.join(texts)}"
             )
     return replace(rules, **switches)

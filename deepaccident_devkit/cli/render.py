@@ -1,4 +1,4 @@
-"""`deepaccident render`: pictures and videos of a release, one verb for each view."""
+"""`deepaccident render`: images and videos of a release; each view is a subcommand."""
 
 import logging
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from deepaccident_devkit.cli.options import (
     refuse_unused,
     release_parameters,
     seed_parameter,
-    words_of,
+    split_words,
 )
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
 from deepaccident_devkit.cli.verbs import Verb, WordChoice, advanced, together, verb
@@ -51,6 +51,7 @@ from deepaccident_devkit.render.samples import render_calibration, render_frame,
 from deepaccident_devkit.render.styles import current_style, style
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
+from deepaccident_devkit.support.text import size_text
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR, Frame, StyleName
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
@@ -63,7 +64,7 @@ _OUT_HELP = f"File to write ({', '.join(PICTURE_SUFFIXES)}), or a folder for sev
 
 
 def _with_link(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Turn a function that takes `link` into one that takes --latency, --pose-noise and --seed."""
+    """Wrap `draw` so that it takes --latency, --pose-noise and --seed instead of `link`."""
 
     def draw_with_link(
         dataset: Dataset,
@@ -89,7 +90,7 @@ def _draw_evaluation(dataset: Dataset, token: str, *, results: Path, **choices: 
 def _draw_sensor_file(
     dataset: Dataset, token: str, *, color_by: ColorBy | None = None, **choices: Any
 ) -> Any:
-    """Draw the data of a sensor, or with `color_by` the LiDAR points on its image."""
+    """Draw a sensor's data; with `color_by`, draw the LiDAR points onto the camera's image."""
     if color_by is None:
         return render_sample_data(dataset, token, **choices)
     refuse_unused("with --color-by, which shows the image and all points", "layers")
@@ -99,14 +100,14 @@ def _draw_sensor_file(
 def _draw_visibility(
     dataset: Dataset, token: str, *, style: str = _VISIBILITY_STYLES[0], **choices: Any
 ) -> Any:
-    """Draw which agents see which actors, from above or as a table."""
+    """Draw which agents see which actors, as a top view or as a table."""
     if style == _VISIBILITY_STYLES[0]:
         return render_visibility(dataset, token, **choices)
     refuse_unused(f"with --style {style}", "frame", "view_range", "layers")
     return render_visibility_matrix(dataset, token, **choices)
 
 
-def _seconds(
+def _parse_seconds(
     context: click.Context, parameter: click.Parameter, value: str | None
 ) -> list[float] | None:
     if value is None:
@@ -115,13 +116,13 @@ def _seconds(
         return list(map(float, value.split(",")))
     except ValueError:
         raise click.BadParameter(
-            f"expected seconds such as 2,1,0, found {value!r}", context, parameter
+            f"expected seconds, such as 2,1,0, found {value!r}", context, parameter
         ) from None
 
 
 _AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
 _VIEW_RANGE = click.option(
-    "--view-range", type=float, metavar="M", help="Metres to show on each side."
+    "--view-range", type=float, metavar="M", help="Metres to show in each direction."
 )
 _COORDINATES = advanced(
     "--frame",
@@ -129,30 +130,35 @@ _COORDINATES = advanced(
     help="Coordinate frame of the axes.  [default: ego]",
 )
 _BY_CLASS = click.option(
-    "--color-by", type=WordChoice(("class",)), help="Give boxes a hue for each class."
+    "--color-by", type=WordChoice(("class",)), help="Colour boxes by their class."
 )
 _LAYERS = click.option(
     "--layers",
     multiple=True,
     metavar="NAME[,NAME…]",
-    help=f"Only these layers. A view has some of {', '.join(LAYERS)}.",
+    help=f"Draw only these layers. Each view has some of {', '.join(LAYERS)}.",
 )
+_NO_TITLE = click.option(
+    "--no-title", is_flag=True, help="Draw no title, for figures with a caption."
+)
+# Options for views that show several agents.
+_AGENT_OPTIONS = (_AGENTS, _BY_CLASS, _LAYERS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Picture:
-    """A view that is drawn as a picture.
+    """A view that is drawn as an image.
 
     Attributes:
         draw: Function of the render package, or one that calls it.
-        table: Table with the rows that it draws.
-        canvas: `fig` if it draws into a figure, `ax` if into axes.
-        options: Options of this verb.
-        help: First line of the verb's help.
-        default: Row that is drawn without a token.
-        styles: Its own styles, the default first.
-        channels: Channels that it shows: in a partial download, a scenario stands for the moment
-            with most files of these.
+        table: Table whose rows it draws.
+        canvas: `fig` if it draws into a figure, `ax` if it draws into axes.
+        options: Options that only this subcommand has.
+        help: First line of the subcommand's help.
+        default: Row that is drawn if no token is passed.
+        styles: Styles of this view; the first is the default.
+        channels: Channels that it shows; in a partial download, the agent that is drawn for a
+            scenario is the one with the most files of these channels.
     """
 
     draw: Callable[..., Any]
@@ -172,12 +178,13 @@ class _Picture:
         dpi: float,
         choices: dict[str, Any],
     ) -> Any:
-        """Draw a row into a figure of a size in pixels, or of the view's own size."""
-        canvas = {}
-        if size is not None:
-            figure = figure_of_pixels(*size, dpi=dpi)
-            canvas[self.canvas] = figure if self.canvas == "fig" else figure.add_subplot()
-        return self.draw(dataset, row, **choices, **canvas)
+        """Draw a row into a figure, of `size` in pixels or of the view's default size."""
+        if size is None:
+            return self.draw(dataset, row, **choices)
+        canvas: Any = figure_of_pixels(*size, dpi=dpi)
+        if self.canvas == "ax":
+            canvas = canvas.add_subplot()
+        return self.draw(dataset, row, **choices, **{self.canvas: canvas})
 
 
 _PICTURES = {
@@ -185,7 +192,7 @@ _PICTURES = {
         draw=render_sample,
         table="sample",
         help="Render one sample: its six camera images, and its boxes and LiDAR points from above.",
-        options=(_AGENTS, _BY_CLASS, _LAYERS),
+        options=_AGENT_OPTIONS,
     ),
     "sample-data": _Picture(
         draw=_draw_sensor_file,
@@ -197,8 +204,8 @@ _PICTURES = {
             click.option(
                 "--color-by",
                 type=WordChoice((*get_args(ColorBy), "class")),
-                help="Show all LiDAR points on a camera image, with colours of this, also points "
-                "that are hidden behind objects; or class: a hue for each class of boxes.",
+                help="Colour all LiDAR points on a camera image by this value, including points "
+                "hidden behind objects. class: colour boxes by their class.",
             ),
             _LAYERS,
         ),
@@ -214,14 +221,14 @@ _PICTURES = {
         table="instance",
         help="Render one actor over time: its path, its camera images, its speed, and which "
         "agents see it.",
-        options=(_AGENTS, _BY_CLASS, _LAYERS),
+        options=_AGENT_OPTIONS,
     ),
     "frame": _Picture(
         draw=render_frame,
         table="frame",
         help="Render one moment of all agents side by side: front cameras, and boxes and LiDAR "
         "from above.",
-        options=(_AGENTS, _BY_CLASS, _LAYERS),
+        options=_AGENT_OPTIONS,
         channels=_FRONT_AND_POINTS,
     ),
     "bev": _Picture(
@@ -258,7 +265,7 @@ _PICTURES = {
     "visibility": _Picture(
         draw=_draw_visibility,
         table="frame",
-        help="Render who sees whom: from above, an actor with one dot for each agent that sees "
+        help="Render who sees whom: from above, with one dot per actor for each agent that sees "
         "it, or as a table.",
         canvas="ax",
         styles=_VISIBILITY_STYLES,
@@ -270,13 +277,13 @@ _PICTURES = {
         default="the first accident",
         table="scenario",
         help="Render the countdown to an accident: one column per moment, one row per agent. "
-        "Where there is little room, as on a slide, it shows the agents that see the pair "
-        "best; --agents all shows all.",
+        "Where space is limited, as on a slide, it shows only the agents that see the pair "
+        "best; --agents all shows all agents.",
         options=(
             _AGENTS,
             click.option(
                 "--seconds",
-                callback=_seconds,
+                callback=_parse_seconds,
                 help="Moments to show, in seconds before the impact.  "
                 f"[default: {','.join(f'{second:g}' for second in COUNTDOWN)}]",
                 metavar="S[,S…]",
@@ -292,7 +299,7 @@ _PICTURES = {
             click.option(
                 "--task",
                 type=WordChoice(["motion", "accident"]),
-                help="Verdict on motion, or on the accident in it.",
+                help="Judge the predicted motion, or the accident in it.",
             ),
             click.option(
                 "--protocol",
@@ -300,9 +307,9 @@ _PICTURES = {
             ),
             _LAYERS,
         ),
-        help="Render the label of a sample beside a model's prediction, with the verdict in "
+        help="Render the label of a sample next to a model's prediction, with the verdict in "
         "numbers.",
-        default="the first of the results",
+        default="the first sample of the results",
     ),
     "link": _Picture(
         draw=_with_link(render_link),
@@ -317,7 +324,7 @@ _PICTURES = {
         table="frame",
         help="Render LiDAR points and boxes of all agents in camera images, to check the "
         "calibration.",
-        options=(_AGENTS, _BY_CLASS, _LAYERS),
+        options=_AGENT_OPTIONS,
         channels=_FRONT_AND_POINTS,
     ),
 }
@@ -331,22 +338,31 @@ def render() -> None:
     """
 
 
-def _help_text(picture: _Picture) -> str:
+def _format_help(picture: _Picture) -> str:
     text = f"{picture.help}\n\nTOKEN is a row of the table {picture.table}."
     if picture.table not in ("scenario", "instance"):
-        text += " A scenario's token stands for the moment one second before its end"
-        if picture.channels:
-            text += ", or of a partial download the nearest one with most files"
-        text += "."
+        text += (
+            " A scenario's token stands for the moment two seconds before its end; in a partial "
+            "download, for the moment with the most sensor files up to then."
+        )
     return f"{text} Without TOKEN the command renders {picture.default}."
 
 
-def _verb(name: str, picture: _Picture) -> click.Command:
-    own_styles = (
-        f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}]; " if picture.styles else ""
+def _format_style_help(picture: _Picture) -> str:
+    text = "Style of the figure."
+    if picture.styles:
+        text = f"{' or '.join(picture.styles)}  [default: {picture.styles[0]}], and a figure style."
+    return (
+        f"{text} cvpr-…, ieee-…: as wide as a column or page of the paper, with small text, few "
+        "panels and no token. paper: one panel per column, several panels over a page (IEEE). "
+        "slide: 16:9, with large text."
     )
 
-    @verb(name, help=_help_text(picture), short_help=picture.help)
+
+def _make_verb(name: str, picture: _Picture) -> click.Command:
+    """Build the subcommand that draws a view."""
+
+    @verb(name, help=_format_help(picture), short_help=picture.help)
     @release_parameters
     @click.argument("tokens", nargs=-1, metavar="[TOKEN…]")
     @click.option("--out", type=PATH, required=True, metavar="FILE|FOLDER", help=_OUT_HELP)
@@ -359,18 +375,16 @@ def _verb(name: str, picture: _Picture) -> click.Command:
     @advanced(
         "--dpi",
         type=click.FloatRange(min=1),
-        help="Pixels per inch; the text grows with it.  [default: 100; papers: 300; slide: 240]",
+        help="Pixels per inch; text scales with it.  [default: 100; papers: 300; slide: 240]",
     )
     @click.option(
         "--style",
         "styles",
         multiple=True,
         type=WordChoice((*picture.styles, *get_args(StyleName))),
-        help=f"{own_styles}for papers as wide as a column or a page, with small text, few panels "
-        "and no token; paper: one panel in a column, several over a page (IEEE); slide: 16 "
-        "to 9, with large text.",
+        help=_format_style_help(picture),
     )
-    @click.option("--no-title", is_flag=True, help="No title: a caption says it.")
+    @_NO_TITLE
     @frame_range_parameter
     @together(*picture.options)
     def render_view(
@@ -387,46 +401,42 @@ def _verb(name: str, picture: _Picture) -> click.Command:
         options["agents"] = names_or_configuration(options.pop("agents", ()))
         if name == "bev" and options["agents"] in (None, "single"):
             refuse_unused(
-                "without --agents: it is about the data of partners",
+                "without --agents, as it changes only the data of partners",
                 "latency",
                 "pose_noise",
                 "seed",
             )
         if not options.get("pose_noise"):
             refuse_unused("without --pose-noise", "seed")
-        options["layers"] = words_of(options.pop("layers", ())) or None
+        options["layers"] = split_words(options.pop("layers", ())) or None
         choices = {option: value for option, value in options.items() if value is not None}
         if not tokens and "results" in choices:
             tokens = read_results(choices["results"]).tokens[:1]
         dataset = open_release(**release)
-        rows = rows_to_draw(
-            dataset,
-            picture.table,
-            tokens,
-            frames,
-            picture.channels,
-            latency=choices.get("latency", 0.0),
-        )
-        view_styles = [word for word in styles if word in picture.styles]
-        if view_styles:
-            choices["style"] = view_styles[-1]
-        figure_styles = [cast(StyleName, word) for word in styles if word not in picture.styles]
-        figure_style = figure_styles[-1] if figure_styles else None
-        # other values of --color-by are choices of the view
-        boxes_by: Any = choices.pop("color_by") if choices.get("color_by") == "class" else "role"
-        with style(figure_style, title=not no_title, color_by=boxes_by):
+        rows = rows_to_draw(dataset, picture.table, tokens, frames, picture.channels)
+        figure_style: Any = None
+        for word in styles:
+            if word in picture.styles:
+                choices["style"] = word
+            else:
+                figure_style = word
+        box_colors: Any = "role"
+        if choices.get("color_by") == "class":  # only the other values are passed to the view
+            box_colors = choices.pop("color_by")
+        with style(figure_style, title=not no_title, color_by=box_colors):
             for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
                 figure = picture.figure(dataset, row, size, dpi or current_style().dpi, choices)
                 save_picture(figure, path, dpi=dpi)
-                if missing := missing_words(figure):
+                missing = missing_words(figure)
+                if missing:
                     _logger.warning("%s: %s", path, "; ".join(missing))
-                click.echo(f"rendered: {row} in {path}")
+                click.echo(f"wrote {path} ({row})")
 
     return render_view
 
 
 for _name, _picture in _PICTURES.items():
-    render.add_command(_verb(_name, _picture))
+    render.add_command(_make_verb(_name, _picture))
 
 
 @render.command(cls=Verb, short_help="Write a scenario as a video of one or several views.")
@@ -455,8 +465,9 @@ for _name, _picture in _PICTURES.items():
     metavar="WxH",
     default="1280x720",
     show_default=True,
-    help="Size in pixels.",
+    help="Size in pixels; rounded down to even numbers for MP4.",
 )
+@_NO_TITLE
 @click.option(
     "--fps", default=10.0, show_default=True, help="Frames per second; the recordings have 10."
 )
@@ -466,28 +477,30 @@ def video(
     views: tuple[str, ...],
     agents: tuple[str, ...],
     layers: tuple[str, ...],
+    no_title: bool,
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as a video.
 
     Without SCENARIO the command takes the first accident, or if there is none, the first scenario.
-    MP4 needs the extra `video`; in a checkout: pip install '.[video]'.
+    MP4 needs the extra `video`: pip install '.[video]' in a checkout.
     """
     release = {option: options.pop(option) for option in _RELEASE_OPTIONS}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
     dataset = open_release(**release)
+    click.get_current_context().with_resource(style(title=not no_title))
     path = render_scenario_video(
         dataset,
         scenario or default_scenario(dataset),
         out,
-        views=words_of(views) or "frame",
+        views=split_words(views) or "frame",
         agents=names_or_configuration(agents),
-        layers=cast(list[Layer] | None, words_of(layers) or None),
+        layers=cast(list[Layer] | None, split_words(layers) or None),
         workers=release["workers"],
         executor=release["executor"],
         **options,
     )
-    click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB")
+    click.echo(f"wrote {path} ({size_text(path.stat().st_size)})")
 
 
 @render.command(cls=Verb, short_help="Write a scenario as one HTML file that plays.")
@@ -503,7 +516,7 @@ def video(
 @click.option(
     "--results",
     type=click.Path(),
-    help="Results file of motion or accidents, shown with its verdicts.",
+    help="Results file of motion or accidents, to show with its verdicts.",
 )
 @cooperating_parameter("Agents to show", "available")
 def replay(
@@ -524,4 +537,4 @@ def replay(
         agents=names_or_configuration(agents),
         progress=True,
     )
-    click.echo(f"written: {path}, {path.stat().st_size / 1e6:.1f} MB; open it in a browser")
+    click.echo(f"wrote {path} ({size_text(path.stat().st_size)}); open it in a browser")

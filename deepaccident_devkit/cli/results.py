@@ -1,4 +1,4 @@
-"""`deepaccident results`: results files, made from the output of other tools."""
+"""`deepaccident results`: makes results files from the output of other tools."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.argument("file", type=_FILE)
 @click.argument("dataroot", type=DATAROOT, required=False)
 @click.option(
-    "--truth", type=_FILE, metavar="FILE", help="truth.jsonl of the export of the questions."
+    "--truth", type=_FILE, metavar="FILE", help="The file truth.jsonl of the exported questions."
 )
 @release_options
 @click.option(
@@ -24,31 +24,31 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
     type=click.FloatRange(0, 1),
     default=0.5,
     show_default=True,
-    help="With --truth: probability from which a second is an alarm; 0 keeps all alarms, for "
-    "curves.",
+    help="With --truth: minimum probability of an alarm; 0 keeps all alarms, as curves need.",
 )
 @click.option(
     "--method",
     metavar="TEXT",
-    help="With --truth: name of the model, which the file and reports show.",
+    help="With --truth: name of the model in the results file and in reports.",
 )
 @click.option("--out", required=True, type=PATH, metavar="FILE", help="Results file to write.")
 def results(
     file: Path, truth: Path | None, out: Path, threshold: float, method: str | None, **release: Any
 ) -> None:
-    """Make a results file of what a model of another framework predicts.
+    """Convert the predictions of a model from another framework into a results file.
 
-    With DATAROOT, FILE has detections of a nuScenes export of that release: the JSON of a detector,
-    as the nuScenes devkit reads it. Boxes of classes that DeepAccident does not have are left out.
-    `deepaccident evaluate detection --samples all` evaluates what this writes.
+    With DATAROOT, FILE contains detections on a nuScenes export of that release, as JSON in the
+    format of the nuScenes devkit. Boxes of classes that DeepAccident does not have are excluded.
+    Evaluate the results file with `deepaccident evaluate detection --samples all`.
 
-    With --truth, FILE has answers to the questions of `deepaccident export questions`, one a line,
-    as README.md beside the questions describes. A question without an answer raises no alarm.
-    `deepaccident evaluate accident` and `deepaccident evaluate warning` take what this writes.
+    With --truth, FILE contains answers to the questions of `deepaccident export questions`, one per
+    line; the README.md next to the questions describes their format. A question without an answer
+    raises no alarm. Evaluate the results file with `deepaccident evaluate accident` or with
+    `deepaccident evaluate warning`.
     """
     if (truth is None) == (release["dataroot"] is None):
         raise click.UsageError(
-            "give DATAROOT for detections of a nuScenes export, or --truth for answers to questions"
+            "give DATAROOT for detections on a nuScenes export, or --truth for answers to questions"
         )
     if truth is None:
         refuse_unused("without --truth", "threshold", "method")
@@ -70,11 +70,10 @@ def _convert_detections(file: Path, out: Path, release: dict[str, Any]) -> None:
             writer.add(token, boxes)
     box_count = sum(map(len, detections.boxes.values()))
     samples = counted(len(detections.boxes), "sample")
-    click.echo(f"{out}: {box_count:,} boxes of {samples}")
+    click.echo(f"wrote {out} ({samples}, {counted(box_count, 'box')})")
     for name, count in detections.left_out.items():
-        click.echo(
-            f"left out: {count:,} boxes of the class {name}, which DeepAccident does not have"
-        )
+        excluded = counted(count, "box")
+        click.echo(f"excluded: {excluded} of class {name}, which DeepAccident does not have")
 
 
 def _convert_answers(
@@ -82,7 +81,10 @@ def _convert_answers(
 ) -> None:
     from deepaccident_devkit.export.questions import results_of_answers
 
-    read = results_of_answers(file, truth, out, threshold=threshold, meta=meta)
-    click.echo(f"{out}: {read.alarms:,} alarms in {read.answered:,} answers")
-    if read.missing:
-        click.echo(f"without an answer: {len(read.missing):,} questions, which raise no alarm")
+    answers = results_of_answers(file, truth, out, threshold=threshold, meta=meta)
+    alarms = counted(answers.alarms, "alarm")
+    answered = counted(answers.answered, "answer")
+    click.echo(f"wrote {out} ({alarms} in {answered})")
+    if answers.missing:
+        questions = counted(len(answers.missing), "question")
+        click.echo(f"warning: {questions} without an answer, counted as no alarm", err=True)

@@ -1,4 +1,4 @@
-"""`deepaccident split`: the official split, made again, or the scenarios that match filters."""
+"""`deepaccident split`: recomputes the official split, or lists scenarios that match filters."""
 
 from pathlib import Path
 from typing import Any
@@ -8,6 +8,7 @@ import click
 from deepaccident_devkit.cli.options import (
     PATH,
     json_parameter,
+    print_report,
     refuse_unused,
     release_parameters,
     where_parameter,
@@ -30,8 +31,9 @@ from deepaccident_devkit.selection.splits import (
 @click.option(
     "--out",
     type=PATH,
-    help="Folder to write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into; or "
-    "a file that ends in .txt: a split file of the scenarios that match --where, or of all.",
+    help="Write train.txt, val.txt, test.txt, train_mini.txt and val_mini.txt into this folder. If "
+    "the name ends in .txt, write one split file with the scenarios that match --where, or with "
+    "all scenarios.",
 )
 @where_parameter
 @click.option("--overwrite", is_flag=True, help="Replace files that already exist.")
@@ -44,28 +46,31 @@ def split(
     as_json: bool,
     **release: Any,
 ) -> None:
-    """Split the release in DATAROOT by the official procedure, and print how scenarios are spread.
+    """Split the release in DATAROOT by the official procedure, and print a table of the splits.
 
     With --where, report only the scenarios that match all filters.
     """
-    save = out if out is not None and out.suffix == ".txt" else None
-    if where and out and not save:
+    split_file = out if out is not None and out.suffix == ".txt" else None
+    if where and out and not split_file:
         raise click.UsageError(
-            f"--where chooses scenarios for a split file; give --out FILE.txt, found {out}"
+            f"--where selects scenarios for a split file; give --out FILE.txt, found {out}"
         )
-    if where or save:
-        refuse_unused("with --where or a split file: it is for the official split", "seed")
+    if where or split_file:
+        refuse_unused("with --where or a split file, which are not the official split", "seed")
     if not out:
         refuse_unused("without --out", "overwrite")
     dataset = DeepAccident(**release)
-    if where or save:
+    written_files = []
+    if where or split_file:
         tokens = [scenario["token"] for scenario in dataset.find(*where)]
-        written = [save_selection(tokens, save, overwrite=overwrite)] if save else []
+        if split_file:
+            written_files = [save_selection(tokens, split_file, overwrite=overwrite)]
         report = split_report(dataset, {"selection": tokens})
     else:
         splits = official_split(dataset, seed)
-        written = splits.save(out, overwrite=overwrite) if out else []
+        if out:
+            written_files = splits.save(out, overwrite=overwrite)
         report = split_report(dataset, splits)
-    click.echo(report.to_json() if as_json else report.to_text())
-    for path in written:
-        click.echo(f"written: {path}", err=as_json)
+    print_report(report, as_json=as_json)
+    for path in written_files:
+        click.echo(f"wrote {path}", err=as_json)

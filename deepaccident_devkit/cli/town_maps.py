@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from deepaccident_devkit.cli.options import (
-    engine_of,
+    engine_options,
     json_parameter,
     release_parameters,
     where_parameter,
@@ -27,42 +27,47 @@ from deepaccident_devkit.support.text import counted
 )
 @json_parameter
 def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -> None:
-    """Write a file FOLDER/TOWN.geojson for each town of the release in DATAROOT.
+    """Write one file FOLDER/TOWN.geojson for each town of the release in DATAROOT.
 
-    The maps are made from what the BEV cameras of all recordings saw. Coordinates are metres of the
-    simulator's world, right-handed: no longitude and latitude.
+    The maps combine what the BEV cameras of all recordings saw. Coordinates are metres in the
+    simulator's right-handed world, not longitude and latitude.
     """
-    folder, dataset = writable_folder(out), DeepAccident(**release)
+    folder = writable_folder(out)
+    dataset = DeepAccident(**release)
     scenarios = dataset.find(*where) if where else None
     if scenarios == []:
         raise click.UsageError(
-            "no scenario matches --where, so there is no map; change it or omit it"
+            "no scenario matches --where, so there is no map; change --where or omit it"
         )
     written: dict[str, dict[str, Any]] = {}
     for town in towns_of(dataset, scenarios):
         try:
             town_plan = town_map(
-                dataset, town, scenarios=scenarios, progress=True, **engine_of(release)
+                dataset, town, scenarios=scenarios, progress=True, **engine_options(release)
             )
         except NotAvailableError as error:
-            click.echo(f"left out: {error}", err=True)
+            click.echo(f"warning: {error}", err=True)
             continue
         path = town_plan.to_geojson(folder / f"{town_plan.town}.geojson")
         counts = {
             name: getattr(town_plan, name) for name in ("scenarios", "looks", "missing", "damaged")
         }
-        area = round(float(town_plan.drivable().sum()) * town_plan.resolution**2, 1)
+        drivable_cells = float(town_plan.drivable().sum())
+        area = round(drivable_cells * town_plan.resolution**2, 1)
         written[town_plan.town] = {"path": str(path), **counts, "drivable_square_metres": area}
     if not written:
-        raise NotAvailableError("no town has a map: there is no readable file of a BEV camera")
-    click.echo(
-        json.dumps(written, indent=2) if as_json else "\n".join(map(_town_line, written.values()))
-    )
+        raise NotAvailableError("no town has a map: the release has no readable BEV camera file")
+    if as_json:
+        click.echo(json.dumps(written, indent=2))
+    else:
+        click.echo("\n".join(map(_format_town, written.values())))
 
 
-def _town_line(facts: dict[str, Any]) -> str:
-    return (
-        f"{facts['path']}: {facts['drivable_square_metres']:,.0f} m² of road, from "
-        f"{facts['looks']:,} pictures of {counted(facts['scenarios'], 'scenario')} "
-        f"({facts['missing']:,} missing, {facts['damaged']:,} damaged)"
-    )
+def _format_town(facts: dict[str, Any]) -> str:
+    pictures = counted(facts["looks"], "picture")
+    scenarios = counted(facts["scenarios"], "scenario")
+    area = f"{facts['drivable_square_metres']:,.0f} m²"
+    text = f"wrote {facts['path']} ({area} of road, from {pictures} of {scenarios}"
+    if facts["missing"] or facts["damaged"]:
+        text += f"; {facts['missing']:,} missing, {facts['damaged']:,} damaged"
+    return f"{text})"

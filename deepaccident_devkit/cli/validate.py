@@ -10,6 +10,7 @@ from deepaccident_devkit.cli.options import (
     dataroot_argument,
     engine_parameters,
     json_parameter,
+    print_report,
     refuse_unused,
     version_parameter,
 )
@@ -26,33 +27,33 @@ from deepaccident_devkit.validation import release_completeness, validate_releas
     "--parts",
     type=PATH,
     metavar="FOLDER",
-    help="Folder to keep what is found in each scenario: the same command then goes on, and "
-    "several share the work.",
+    help="Keep the findings of each scenario in this folder. The same command then continues an "
+    "interrupted run, and several commands can share the work.",
 )
 @click.option(
     "--files",
     is_flag=True,
-    help="Only list folders: how many scenarios are whole, and how many files of each split, "
-    "agent and sensor are missing.",
+    help="Only list the folders, and open no file: print how many scenarios are complete, and how "
+    "many files of each split, agent and sensor are missing.",
 )
 @click.option(
     "--deep",
     is_flag=True,
-    help="Also decode each image and array, and compare them with the labels.",
+    help="Also decode every image and array, and compare them with the labels.",
 )
 @click.option(
     "--scenario",
     "scenarios",
     multiple=True,
     metavar="TOKEN",
-    help="Only this scenario; you can repeat this option.",
+    help="Validate only this scenario. You can repeat this option.",
 )
 @click.option(
     "--all",
     "all_findings",
     is_flag=True,
-    help="List all findings of each scenario, not only the first eight, and notes, which are no "
-    "errors or warnings.",
+    help="List all findings of each scenario instead of the first eight, including notes, which "
+    "are neither errors nor warnings.",
 )
 @json_parameter
 def validate(
@@ -63,25 +64,27 @@ def validate(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Print what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
+    """Report what is wrong, unusual or missing in the release in DATAROOT, worst scenario first.
 
-    The command reads the files and each scenario, and says where the index is out of date. Archives
-    that cannot be read are listed, and left out. The report ends with the files that are missing.
-    Exit status 0: there are only notes and known findings of the real release. 1: there are errors
-    or other warnings. 2: the release cannot be read, or has no file to compare. With --files: 1 if
-    an archive cannot be read, otherwise 0.
+    The command checks every scenario, and also reports an outdated index. Archives that cannot be
+    read are listed, and the check goes on without them. The report ends with the missing files.
+
+    The command exits with 0 if there are only notes and known findings of the real release, with 1
+    if there are errors or other warnings, and with 2 if the release cannot be read or contains
+    nothing to check. With --files, it exits with 1 if an archive cannot be read, otherwise with 0.
     """
     options |= {"scenarios": scenarios or None, "progress": sys.stderr.isatty()}
     if files:
         refuse_unused("with --files, which opens no file", "deep", "all_findings", "parts")
         del options["deep"], options["parts"]
         completeness = release_completeness(dataroot, **options)
-        click.echo(completeness.to_json() if as_json else completeness.to_text())
+        print_report(completeness, as_json=as_json)
         sys.exit(1 if completeness.unreadable_archives else 0)
     if as_json:
-        refuse_unused("with --json, which has all findings and notes", "all_findings")
+        refuse_unused("with --json, which always prints all findings and notes", "all_findings")
     report = validate_release(dataroot, **options)
-    click.echo(
-        report.to_json() if as_json else report.to_text(notes=all_findings, whole=all_findings)
-    )
+    if as_json:
+        click.echo(report.to_json())
+    else:
+        click.echo(report.to_text(notes=all_findings, whole=all_findings))
     sys.exit(report.exit_status)

@@ -1,4 +1,4 @@
-"""Building blocks of verbs: lazily loaded groups, advanced options, options of fields."""
+"""Building blocks of subcommands: lazy groups, advanced options, and options from fields."""
 
 import inspect
 import re
@@ -18,13 +18,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 if TYPE_CHECKING:
     _Choice = click.Choice[str]
 else:
-    _Choice = click.Choice  # click 8.1 has no `Choice[str]`
+    _Choice = click.Choice  # `Choice[str]` does not exist in click 8.1
 
 
 class LazyVerbs(click.Group):
-    """A group that loads its verbs on demand: only the imports of the running verb are needed.
+    """A group that loads its subcommands on demand, so that only the one that runs is imported.
 
-    The list of verbs imports none of them.
+    Listing the subcommands imports none of them.
     """
 
     def __init__(
@@ -38,47 +38,55 @@ class LazyVerbs(click.Group):
 
         Args:
             *arguments: Arguments of `click.Group`.
-            verbs: The group's own verbs by name.
-            read_plugin: Returns the verbs that a plug-in adds to the group.
+            verbs: The group's built-in subcommands by name.
+            read_plugin: Function that returns the subcommands that a plug-in adds to the group.
             **options: Options of `click.Group`.
         """
         super().__init__(*arguments, **options)
         self._verbs = verbs
         self._read_plugin = read_plugin
 
-    def _offers(self, *, own: bool = False) -> Offers[LazyVerb]:
-        """Return the verbs of plug-ins; with `own` only the devkit's, without entry points."""
+    def _collect_offers(self, *, own: bool = False) -> Offers[LazyVerb]:
+        """Return the subcommands of all plug-ins or, if `own`, of the devkit's plug-ins only."""
         return offers(self._read_plugin, self._verbs, own=own)
 
-    def _all_verbs(self) -> dict[str, LazyVerb]:
-        return {**self._verbs, **self._offers().by_name}
+    def _collect_verbs(self) -> dict[str, LazyVerb]:
+        return {**self._verbs, **self._collect_offers().by_name}
+
+    def _find_in_groups(self, ctx: click.Context, name: str) -> list[str]:
+        """Return the commands of a name in groups, such as `deepaccident evaluate compare`."""
+        commands = []
+        for group_name, group_verb in self._verbs.items():
+            group = group_verb.load()
+            if isinstance(group, click.Group) and name in group.list_commands(ctx):
+                commands.append(f"{ctx.command_path} {group_name} {name}")
+        return commands
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
-        """Return the verbs in alphabetical order, as click lists commands."""
-        return sorted(self._all_verbs())
+        """Return the names of the subcommands in alphabetical order, like click."""
+        return sorted(self._collect_verbs())
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
-        """Return the verb of a name; None if there is none."""
-        for verbs in (self._verbs, self._offers(own=True).by_name):
+        """Return the subcommand with a name; None if it does not exist."""
+        for verbs in (self._verbs, self._collect_offers(own=True).by_name):
             if cmd_name in verbs:
                 return verbs[cmd_name].load()
-        plugin_verb = self._offers().by_name.get(cmd_name)
+        plugin_verb = self._collect_offers().by_name.get(cmd_name)
         if plugin_verb is None:
             return None
         try:
             return plugin_verb.load()
         except Exception as error:
             raise MissingPluginError(
-                f"{cmd_name}: its plug-in fails with {type(error).__name__}: {error}"
+                f"{cmd_name}: its plug-in failed with {type(error).__name__}: {error}"
             ) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's signature
-        """Write the list of verbs, and which plug-ins were left out."""
+        """Write the list of subcommands, and which plug-ins were left out."""
+        verbs = sorted(self._collect_verbs().items())
         with formatter.section("Commands"):
-            formatter.write_dl(
-                [(name, verb.summary) for name, verb in sorted(self._all_verbs().items())]
-            )
-        refusals = self._offers().refusals_text()
+            formatter.write_dl([(name, verb.summary) for name, verb in verbs])
+        refusals = self._collect_offers().refusals_text()
         if refusals:
             formatter.write_paragraph()
             formatter.write_text(refusals)
@@ -86,10 +94,10 @@ class LazyVerbs(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the verb that the first word names.
+        """Return the subcommand that the first word names.
 
-        The error for an unknown word suggests the most similar verb, and names the plug-ins that
-        were left out.
+        If there is none, the error suggests the most similar name, otherwise subcommands of groups
+        with this name, and lists the plug-ins that were left out.
         """
         name = args[0]
         command = self.get_command(ctx, name)
@@ -97,9 +105,12 @@ class LazyVerbs(click.Group):
             return name, command, args[1:]
         if not ctx.resilient_parsing and name[:1].isalnum():
             message = f"No such command '{name}'."
-            for similar_name in get_close_matches(name, self._all_verbs(), n=1):
-                message += f" Did you mean '{similar_name}'?"
-            refusals = self._offers().refusals_text()
+            suggestions = get_close_matches(name, self._collect_verbs(), n=1)
+            if not suggestions and ctx.parent is None:
+                suggestions = self._find_in_groups(ctx, name)
+            if suggestions:
+                message += f" Did you mean {' or '.join(map(repr, suggestions))}?"
+            refusals = self._collect_offers().refusals_text()
             if refusals:
                 message += f"\n{refusals}"
             ctx.fail(message)
@@ -111,10 +122,10 @@ class Advanced(click.Option):
 
 
 class Verb(click.Command):
-    """A command with a help that lists advanced options under a separate heading."""
+    """A subcommand whose help lists advanced options under a separate heading."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options, and then the advanced ones."""
+        """Write the normal options, then the advanced ones."""
         for heading in ("Options", "Advanced"):
             records = []
             for option in self.get_params(ctx):
@@ -129,37 +140,37 @@ class Verb(click.Command):
 
 
 def verb(name: str | None = None, **options: Any) -> Callable[[Callable[..., Any]], Verb]:
-    """Return a decorator that makes a verb of a function; it takes arguments of `click.command`."""
+    """Return a decorator that makes a function a subcommand; takes `click.command` arguments."""
     return click.command(name, cls=Verb, **options)
 
 
 advanced = partial(click.option, cls=Advanced)
-"""Like `click.option`."""
+"""Decorator like `click.option`, for an advanced option."""
 
 
 def together(*parameters: Callable[[Any], Any]) -> Callable[[Function], Function]:
-    """Return a decorator that adds all these parameters to a verb, in this order."""
+    """Return a decorator that adds all these parameters to a subcommand, in this order."""
 
-    def add(function: Function) -> Function:
+    def add_parameters(function: Function) -> Function:
         for parameter in reversed(parameters):
             function = parameter(function)
         return function
 
-    return add
+    return add_parameters
 
 
 class WordChoice(_Choice):
-    """One of several words, in upper or lower case; errors suggest a similar word."""
+    """One of several words, in any case; errors suggest a similar word."""
 
     def __init__(
         self, words: Iterable[str], elsewhere: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Store the words, and hints for words that are valid elsewhere."""
+        """Store the words, and hints for words that are only valid elsewhere."""
         super().__init__(tuple(words), case_sensitive=False)
         self.elsewhere = elsewhere
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the word in its own spelling."""
+        """Return the word in the spelling in which it was defined."""
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter as error:
@@ -174,16 +185,16 @@ def field_option(
     option: Callable[..., Any] = click.option,
     **changes: Any,
 ) -> Callable[[Function], Function]:
-    """Return an option for a field of a dataclass, with the field's name, type and default.
+    """Make an option for a dataclass field, with the field's name, type and default.
 
-    Its help is the first sentence of the field's documentation.
+    The help is the first sentence of the field's documentation.
 
     Args:
         config: The dataclass.
         field: Name of the field.
-        *names: Names of the option, if they differ from the field's.
+        *names: Names of the option, if they differ from the name of the field.
         option: Function that makes the option.
-        **changes: Arguments of `click.option` that differ from the field.
+        **changes: Arguments of `click.option` that override those derived from the field.
     """
     default = changes.get("default", config.__dataclass_fields__[field].default)
     hint = get_type_hints(config)[field]
@@ -193,15 +204,18 @@ def field_option(
         "help": field_text(config, field),
         "show_default": default is not None and default is not False,
     }
-    hints = [part for part in get_args(hint) or (hint,) if part is not NoneType]
-    literals = [part for part in (hint, *hints) if get_origin(part) is Literal]
+    hints = [member for member in get_args(hint) or (hint,) if member is not NoneType]
+    literals = [member for member in (hint, *hints) if get_origin(member) is Literal]
     if literals:
         settings["type"] = WordChoice(get_args(literals[0]))
     elif hint is bool:
         settings["is_flag"] = True
+        settings["help"] = _capitalise(settings["help"].removeprefix("Whether to "))
     else:
         settings["type"] = hints[0]
-    flag = f"--{name}/--no-{name}" if default is True else f"--{name}"
+    flag = f"--{name}"
+    if default is True:
+        flag = f"--{name}/--no-{name}"
     decorator: Callable[[Function], Function] = option(
         *(names or (flag, field)), **{**settings, **changes}
     )
@@ -209,11 +223,15 @@ def field_option(
 
 
 def field_text(config: type[Any], field: str) -> str:
-    """Return the first sentence of a class's documentation of one of its attributes."""
+    """Return the first sentence of an attribute's documentation in a class."""
     pattern = rf"^    {field}: (.+?)(?=\n    \w|\n\n|\Z)"
     match = re.search(pattern, inspect.getdoc(config) or "", re.DOTALL | re.MULTILINE)
     if match is None:
         return ""
     text = " ".join(match[1].split())
     sentence: str = re.split(r"(?<=\.)\s+(?=[A-Z`])", text)[0]
+    return _capitalise(sentence)
+
+
+def _capitalise(sentence: str) -> str:
     return sentence[:1].upper() + sentence[1:]

@@ -1,12 +1,11 @@
-"""When replays of a pair first touch; no contact is missed, however short.
+"""Times at which replays of a pair first touch; no contact is missed, however short.
 
-A time interval is proven free of contact by the gaps at its ends and by how far the two actors can
-approach within it (`_contact_possible`). An interval that is not proven is halved. Intervals are
-therefore long where the actors are far apart, and short where they nearly touch.
+An interval of time is proven free of contact from the gaps at its ends and from how far the two
+actors can approach each other within it (`_can_touch`). An interval without such a proof is halved.
+Intervals are therefore long where the actors are far apart, and short where they nearly touch.
 """
 
-from __future__ import annotations
-
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -18,7 +17,6 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.collisions.replay import (
     BrakingPlans,
     Motion,
-    ReplayStates,
     braking_plans,
     motion_of,
     replay,
@@ -32,9 +30,10 @@ from deepaccident_devkit.support.arrays import (
     checked,
 )
 
-_LONGEST_INTERVAL_S: Final = 0.32
-# Halvings of an interval at most: down to 0.3 µs, in which a car moves by less than 0.01 mm.
-_MAX_HALVINGS: Final = 20
+_LONGEST_INTERVAL_S = 0.32
+# Largest number of halvings of an interval: down to 0.3 µs, in which a car moves by less than
+# 0.01 mm.
+_MAX_HALVINGS = 20
 TOUCHING: Final = 1e-9
 """Largest gap that still counts as contact, metres."""
 
@@ -46,9 +45,9 @@ class Pair(FrozenArrays):
     Attributes:
         motions: Motions of the two actors, with the same number of frames.
         sizes: Lengths and widths, shape (2, 2), metres. Read-only.
-        margin: Gap that counts as contact, metres. The simulator's contact need not be an overlap
-            of the boxes at the last frame, so the gap at that frame counts as contact; otherwise
-            doing nothing would avoid such accidents.
+        margin: Gap that counts as contact, metres. When the simulator reports a contact, the boxes
+            need not overlap at the last frame, so the gap at that frame counts as contact;
+            otherwise doing nothing would avoid such accidents.
     """
 
     motions: tuple[Motion, Motion]
@@ -84,18 +83,17 @@ def pair_of(paths: ArrayLike, sizes: ArrayLike, *, margin: float | None = None) 
         margin: Gap that counts as contact, metres; None for the gap at the last frame.
 
     Raises:
-        GeometryError: An array has another shape, or fewer than two frames, or a NaN.
+        GeometryError: An array has a wrong shape or contains NaN, or there are fewer than two
+            frames.
     """
-    actor_paths = checked("paths", paths, (2, None, 3))
+    first_path, second_path = checked("paths", paths, (2, None, 3))
     flat_sizes = checked("sizes", np.asarray(sizes)[:, :2], (2, 2))
-    first_motion, second_motion = (motion_of(path) for path in actor_paths)
+    motions = (motion_of(first_path), motion_of(second_path))
     if margin is None:
-        last_boxes = [
-            np.concatenate([path[-1, :2], size, path[-1, 2:]])
-            for path, size in zip(actor_paths, flat_sizes, strict=True)
-        ]
-        margin = float(gaps_of_pairs(last_boxes[0], last_boxes[1])) + TOUCHING
-    return Pair(motions=(first_motion, second_motion), sizes=flat_sizes, margin=margin)
+        first_box = _make_boxes(first_path[-1:], flat_sizes[0])
+        second_box = _make_boxes(second_path[-1:], flat_sizes[1])
+        margin = gaps_of_pairs(first_box, second_box).item() + TOUCHING
+    return Pair(motions=motions, sizes=flat_sizes, margin=margin)
 
 
 def contact_times(
@@ -109,7 +107,7 @@ def contact_times(
 
     Args:
         pair: Motions and sizes of the two actors.
-        starts: Times at which each actor begins to brake, shape (N, 2), seconds; inf or NaN if it
+        starts: Start time of the braking of each actor, shape (N, 2), seconds; inf or NaN if it
             does not brake.
         decelerations: Decelerations of both actors, shape (N,), m/s².
         window: Times within which contact counts, seconds; None for all to the end of the
@@ -118,11 +116,11 @@ def contact_times(
     Raises:
         GeometryError: An array has another shape.
     """
-    plans = _plans(pair, starts, decelerations)
-    return _search(pair, plans, window or _full_window(pair), earliest=True)
+    plans = _plan_braking(pair, starts, decelerations)
+    return _search_contacts(pair, plans, window or _find_full_window(pair), earliest=True)
 
 
-def contact_made(
+def has_contact(
     pair: Pair,
     starts: ArrayLike,
     decelerations: ArrayLike,
@@ -133,71 +131,73 @@ def contact_made(
 
     This is faster than `contact_times`, and has the same arguments and errors.
     """
-    plans = _plans(pair, starts, decelerations)
-    times = _search(pair, plans, window or _full_window(pair), earliest=False)
+    plans = _plan_braking(pair, starts, decelerations)
+    times = _search_contacts(pair, plans, window or _find_full_window(pair), earliest=False)
     return np.isfinite(times)
 
 
 def impacts(pair: Pair, starts: ArrayLike, decelerations: ArrayLike, times: FloatArray) -> Impacts:
-    """Return how fast the two actors are where replays first touch.
+    """Return the speeds of the two actors at the first contact of each replay.
 
     Args:
         pair: Motions and sizes of the two actors.
-        starts: Times at which each actor begins to brake, as `contact_times` expects them.
+        starts: Start times of the braking, as `contact_times` expects them.
         decelerations: Decelerations, as `contact_times` expects them.
         times: Times of the first contact, shape (N,), seconds; inf without contact.
     """
     hit_rows = np.flatnonzero(np.isfinite(times))
+    hit_times = times[hit_rows]
     speeds = np.full((len(times), 2), np.nan)
     velocities = np.full((2, len(times), 2), np.nan)
-    plans = _plans(pair, starts, decelerations)
-    for actor, (motion, plan) in enumerate(zip(pair.motions, plans, strict=True)):
-        states = replay(motion, plan, hit_rows, times[hit_rows])
+    plans = _plan_braking(pair, starts, decelerations)
+    for actor, motion in enumerate(pair.motions):
+        states = replay(motion, plans[actor], hit_rows, hit_times)
         speeds[hit_rows, actor] = states.speeds
         velocities[actor, hit_rows] = states.velocities(motion)
-    velocity_changes = velocities[0] - velocities[1]
-    return Impacts(speeds=speeds, relative_speeds=np.hypot(*velocity_changes.T))
+    relative_x, relative_y = (velocities[0] - velocities[1]).T
+    return Impacts(speeds=speeds, relative_speeds=np.hypot(relative_x, relative_y))
 
 
-def _full_window(pair: Pair) -> tuple[float, float]:
+def _find_full_window(pair: Pair) -> tuple[float, float]:
     """Return the first and last time of a pair's motions, with the continuation."""
-    return 0.0, float(pair.motions[0].times[-1])
+    motion, _ = pair.motions
+    end = float(motion.times[-1])
+    return 0.0, end
 
 
-def _plans(
+def _plan_braking(
     pair: Pair, starts: ArrayLike, decelerations: ArrayLike
 ) -> tuple[BrakingPlans, BrakingPlans]:
     """Return the braking plans of both actors, as `contact_times` describes the arguments."""
-    actor_starts = checked("starts", starts, (None, 2))
-    first_plans, second_plans = (
-        braking_plans(motion, actor_starts[:, actor], decelerations)
-        for actor, motion in enumerate(pair.motions)
-    )
+    first_starts, second_starts = checked("starts", starts, (None, 2)).T
+    first_motion, second_motion = pair.motions
+    first_plans = braking_plans(first_motion, first_starts, decelerations)
+    second_plans = braking_plans(second_motion, second_starts, decelerations)
     return first_plans, second_plans
 
 
-class _Mark(IntEnum):
-    """Rows of the array that holds what is known of a replay at a time."""
+class _Row(IntEnum):
+    """Rows of an array that describes the state of a pair in N replays, shape (8, N)."""
 
     TIME = 0
     """Time, seconds."""
     GAP = 1
     """Gap less the margin, metres; or a lower bound of it."""
-    WAY = 2
-    """Distance that the two actors have travelled and their corners have turned, metres."""
+    TRAVEL = 2
+    """Sum of the distances that both actors have driven, plus `TURN`, metres."""
     TURN = 3
-    """Distance that their corners have turned, metres."""
+    """Sum of the distances that the corners of both actors have moved by turning, metres."""
     X = 4
     Y = 5
     """Offset from the second centre to the first, metres."""
     SPEED = 6
     """Sum of both speeds, m/s."""
     STRETCH = 7
-    """Number of the pair of stretches of their paths."""
+    """Number that stands for the two stretches of the paths that the actors are on."""
 
 
 class _Gaps:
-    """Gaps of replays of a pair at times, and how far the two actors have moved until then."""
+    """Calculator of the gap between two actors, and the rest of their state, in replays."""
 
     def __init__(self, pair: Pair, plans: tuple[BrakingPlans, BrakingPlans]) -> None:
         self._pair = pair
@@ -205,60 +205,72 @@ class _Gaps:
         self._half_diagonals = np.hypot(*pair.sizes.T) / 2
         self._max_closing_speed = sum(float(motion.speeds.max()) for motion in pair.motions)
 
-    def at(self, rows: IntArray, times: FloatArray, step: float) -> FloatArray:
-        """Return the marks of replays at times, shape (8, N).
+    def pair_states(self, rows: IntArray, times: FloatArray, step: float) -> FloatArray:
+        """Return the states of the pair in replays, shape (8, N), with the rows of `_Row`.
 
-        The gap is a lower bound where the two actors are farther apart than they drive in a step of
-        `step` seconds.
+        If the two actors are too far apart to touch within `step` seconds, the gap is only a lower
+        bound.
+
+        Args:
+            rows: Rows of the replays in the plans, shape (N,).
+            times: Time of each state, shape (N,), seconds.
+            step: Duration of an interval, seconds.
         """
-        first, second = (
-            replay(motion, plan, rows, times)
-            for motion, plan in zip(self._pair.motions, self._plans, strict=True)
-        )
-        turn = self._half_diagonals[0] * first.turned + self._half_diagonals[1] * second.turned
-        x, y = (first.poses - second.poses)[:, :2].T
+        pair = self._pair
+        first_motion, second_motion = pair.motions
+        first_plans, second_plans = self._plans
+        first_states = replay(first_motion, first_plans, rows, times)
+        second_states = replay(second_motion, second_plans, rows, times)
+        first_radius, second_radius = self._half_diagonals
+        turn = first_radius * first_states.turned + second_radius * second_states.turned
+        x, y, _ = (first_states.poses - second_states.poses).T
         gap = np.hypot(x, y) - self._half_diagonals.sum()
         max_approach = self._max_closing_speed * step
-        close_rows = np.flatnonzero(gap <= self._pair.margin + max_approach)
-        first_outlines = self._outlines(first, 0, close_rows)
-        second_outlines = self._outlines(second, 1, close_rows)
-        gap[close_rows] = gaps_of_pairs(first_outlines, second_outlines)
-        stretch = first.stretches * len(self._pair.motions[1].times) + second.stretches
-        way = first.arcs + second.arcs + turn
-        speed = first.speeds + second.speeds
-        return np.stack([times, gap - self._pair.margin, way, turn, x, y, speed, stretch])
-
-    def _outlines(self, states: ReplayStates, actor: int, rows: IntArray) -> FloatArray:
-        """Return the flat boxes (x, y, length, width, yaw) of an actor's states at rows."""
-        poses = states.poses[rows]
-        sizes = np.broadcast_to(self._pair.sizes[actor], (len(rows), 2))
-        return np.concatenate([poses[:, :2], sizes, poses[:, 2:]], axis=1)
+        close_rows = np.flatnonzero(gap <= pair.margin + max_approach)
+        first_boxes = _make_boxes(first_states.poses[close_rows], pair.sizes[0])
+        second_boxes = _make_boxes(second_states.poses[close_rows], pair.sizes[1])
+        gap[close_rows] = gaps_of_pairs(first_boxes, second_boxes)
+        # A different number for each combination of two stretches.
+        stretch = first_states.stretches * len(second_motion.times) + second_states.stretches
+        travel = first_states.arcs + second_states.arcs + turn
+        speed = first_states.speeds + second_states.speeds
+        return np.stack([times, gap - pair.margin, travel, turn, x, y, speed, stretch])
 
 
-def _search(
+def _make_boxes(poses: FloatArray, size: FloatArray) -> FloatArray:
+    """Return flat boxes (x, y, length, width, yaw) of poses (N, 3) with one size (2,), (N, 5)."""
+    x, y, yaw = poses.T
+    length, width = np.broadcast_to(size, (len(poses), 2)).T
+    return np.stack([x, y, length, width, yaw], axis=1)
+
+
+def _search_contacts(
     pair: Pair,
     plans: tuple[BrakingPlans, BrakingPlans],
     window: tuple[float, float],
     *,
     earliest: bool,
 ) -> FloatArray:
-    """Return times of contact, shape (N,), inf for none: the first ones, or any if not `earliest`.
+    """Return times of contact, shape (N,), inf for none.
 
-    Until the first of the two actors brakes, a replay equals the recording, which is searched once.
+    With `earliest`, these are the first times of contact; otherwise, any times of contact. Until
+    the first of the two actors brakes, a replay equals the recording, which is searched once.
     """
-    nodes = _nodes(pair, window)
-    braking_begins = np.minimum(plans[0].starts, plans[1].starts)
-    unbraked_plans = _plans(pair, np.full((1, 2), np.inf), np.ones(1))
+    nodes = _place_nodes(pair, window)
+    first_plans, second_plans = plans
+    braking_begins = np.minimum(first_plans.starts, second_plans.starts)
+    unbraked_plans = _plan_braking(pair, np.full((1, 2), np.inf), np.ones(1))
     unbraked_gaps = _Gaps(pair, unbraked_plans)
-    recorded_time = _refined(unbraked_gaps, nodes, np.array([window[0]]), earliest=True)[0]
+    window_begin = np.array(window[:1])
+    recorded_time = _find_contacts(unbraked_gaps, nodes, window_begin, earliest=True)[0]
     times = np.where(braking_begins >= recorded_time, recorded_time, np.inf)
     rows = np.flatnonzero(braking_begins < recorded_time)
-    gaps = _Gaps(pair, (plans[0].take(rows), plans[1].take(rows)))
-    times[rows] = _refined(gaps, nodes, braking_begins[rows], earliest=earliest)
+    gaps = _Gaps(pair, (first_plans.take(rows), second_plans.take(rows)))
+    times[rows] = _find_contacts(gaps, nodes, braking_begins[rows], earliest=earliest)
     return times
 
 
-def _refined(
+def _find_contacts(
     gaps: _Gaps, nodes: FloatArray, braking_begins: FloatArray, *, earliest: bool
 ) -> FloatArray:
     """Return times of contact after `braking_begins` (N,), shape (N,), inf for none.
@@ -266,29 +278,32 @@ def _refined(
     Intervals between nodes are halved as long as needed.
     """
     times = np.full(len(braking_begins), np.inf)
-    rows, ends = _first_intervals(gaps, nodes, braking_begins)
-    for marks in ends:
-        _note_contacts(times, rows, marks)
+    rows, end_states = _find_first_intervals(gaps, nodes, braking_begins)
+    for states in end_states:
+        _note_contacts(times, rows, states)
     for halving in range(1, _MAX_HALVINGS + 1):
-        limit = times if earliest else np.where(np.isfinite(times), -np.inf, np.inf)
-        undecided = _contact_possible(ends) & (ends[0, _Mark.TIME] < limit[rows])
+        limit = times
+        if not earliest:
+            limit = np.where(np.isfinite(times), -np.inf, np.inf)
+        undecided = _can_touch(end_states) & (end_states[0, _Row.TIME] < limit[rows])
         intervals = np.flatnonzero(undecided)
         if not len(intervals):
             break
         rows = rows[intervals]
-        ends = ends[..., intervals]
-        middle_times = ends[:, _Mark.TIME].mean(axis=0)
-        middle = gaps.at(rows, middle_times, _LONGEST_INTERVAL_S / 2**halving)
-        _note_contacts(times, rows, middle)
+        end_states = end_states[..., intervals]
+        middle_times = end_states[:, _Row.TIME].mean(axis=0)
+        middle_states = gaps.pair_states(rows, middle_times, _LONGEST_INTERVAL_S / 2**halving)
+        _note_contacts(times, rows, middle_states)
         rows = np.concatenate([rows, rows])
-        ends = np.concatenate([[ends[0], middle], [middle, ends[1]]], axis=2)
+        begin, end = end_states
+        end_states = np.concatenate([[begin, middle_states], [middle_states, end]], axis=2)
     return times
 
 
-def _contact_possible(ends: FloatArray) -> BoolArray:
+def _can_touch(end_states: FloatArray) -> BoolArray:
     """Return whether actors can touch within intervals, shape (M,).
 
-    The marks at both ends of the intervals have the shape (2, 8, M).
+    The states at both ends of the intervals have the shape (2, 8, M).
 
     At any moment in between, the gap is at least the mean of the gaps at both ends less half of
     what it can change. The change is no more than the distance travelled. If each of the two actors
@@ -296,18 +311,16 @@ def _contact_possible(ends: FloatArray) -> BoolArray:
     more than the change of their distance plus their deviation from the straight line of constant
     speeds: a quarter of the loss of speed, times the time.
     """
-    begin, end = ends
-    change = np.abs(end - begin)
-    distance = np.hypot(change[_Mark.X], change[_Mark.Y])
-    straight_change = distance + change[_Mark.TURN] + change[_Mark.SPEED] * change[_Mark.TIME] / 2
-    same_stretches = change[_Mark.STRETCH] == 0
-    travelled = change[_Mark.WAY]
-    max_change = np.where(same_stretches, np.minimum(straight_change, travelled), travelled)
-    return np.asarray(begin[_Mark.GAP] + end[_Mark.GAP] <= max_change)
+    begin, end = end_states
+    time, _, travelled, turn, x, y, speed, stretch = np.abs(end - begin)
+    straight_change = np.hypot(x, y) + turn + speed * time / 2
+    least_change = np.minimum(straight_change, travelled)
+    max_change = np.where(stretch == 0, least_change, travelled)
+    return np.asarray(begin[_Row.GAP] + end[_Row.GAP] <= max_change)
 
 
-def _nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:
-    """Return times from the begin to the end of a window, at most `_LONGEST_INTERVAL_S` apart.
+def _place_nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:
+    """Return times from the beginning to the end of a window, at most `_LONGEST_INTERVAL_S` apart.
 
     The end of the recording is a node if the window holds it.
     """
@@ -315,32 +328,36 @@ def _nodes(pair: Pair, window: tuple[float, float]) -> FloatArray:
     bounds = [begin, end]
     if begin < pair.duration < end:
         bounds.insert(1, pair.duration)
-    parts = []
+    nodes = []
     for part_begin, part_end in pairwise(bounds):
-        num_intervals = max(1, int(np.ceil((part_end - part_begin) / _LONGEST_INTERVAL_S)))
-        parts.append(np.linspace(part_begin, part_end, num_intervals + 1))
-    return np.unique(np.concatenate(parts))
+        min_intervals = (part_end - part_begin) / _LONGEST_INTERVAL_S
+        num_intervals = max(1, math.ceil(min_intervals))
+        nodes.append(np.linspace(part_begin, part_end, num_intervals + 1))
+    return np.unique(np.concatenate(nodes))
 
 
-def _first_intervals(
+def _find_first_intervals(
     gaps: _Gaps, nodes: FloatArray, braking_begins: FloatArray
 ) -> tuple[IntArray, FloatArray]:
     """Return the intervals between nodes that end after `braking_begins` (N,).
 
     Returns:
-        Rows of replays, shape (M,), and the marks at both ends of their intervals, shape (2, 8, M).
+        Rows of replays, shape (M,); states at both ends of their intervals, shape (2, 8, M).
     """
-    marks = np.full((len(_Mark), len(braking_begins), len(nodes)), np.nan)
+    states = np.full((len(_Row), len(braking_begins), len(nodes)), np.nan)
     next_nodes = np.append(nodes[1:], np.inf)
-    rows, numbers = np.nonzero(next_nodes > braking_begins[:, None])
-    marks[:, rows, numbers] = gaps.at(rows, nodes[numbers], _LONGEST_INTERVAL_S)
-    rows, numbers = np.nonzero(nodes[1:] > braking_begins[:, None])
-    begins = marks[:, rows, numbers]
-    ends = marks[:, rows, numbers + 1]
-    return rows, np.stack([begins, ends])
+    ends_after = next_nodes > braking_begins[:, None]
+    rows, numbers = np.nonzero(ends_after)
+    node_times = nodes[numbers]
+    states[:, rows, numbers] = gaps.pair_states(rows, node_times, _LONGEST_INTERVAL_S)
+    rows, numbers = np.nonzero(ends_after[:, :-1])
+    begin_states = states[:, rows, numbers]
+    end_states = states[:, rows, numbers + 1]
+    return rows, np.stack([begin_states, end_states])
 
 
-def _note_contacts(times: FloatArray, rows: IntArray, marks: FloatArray) -> None:
-    """Note the times at which replays are in contact, if they are earlier than the noted ones."""
-    in_contact = marks[_Mark.GAP] <= 0
-    np.minimum.at(times, rows[in_contact], marks[_Mark.TIME, in_contact])
+def _note_contacts(times: FloatArray, rows: IntArray, states: FloatArray) -> None:
+    """Store the times at which replays touch, where they are earlier than the stored ones."""
+    in_contact = states[_Row.GAP] <= 0
+    found_times = states[_Row.TIME, in_contact]
+    np.minimum.at(times, rows[in_contact], found_times)

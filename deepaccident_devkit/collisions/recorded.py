@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +24,7 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.support.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.support.reports import Row
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.tables.tables import rows_of_scenarios
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, AgentName
 from deepaccident_devkit.v2x.agents import agents_of
@@ -45,7 +47,7 @@ CLASS_MASSES: Final[Mapping[str, float]] = MappingProxyType(
         "pedestrian": 75.0,
     }
 )
-"""Mass of a road user of its class's median size, with load or rider, kilograms.
+"""Mass of a road user that has the median size of its class, with load or rider, kilograms.
 
 The masses are an assumption of this devkit.
 """
@@ -55,7 +57,7 @@ MASS_UNCERTAINTY: Final = 0.3
 Figures that depend on them are also stated for masses that are heavier and lighter by this share.
 """
 # Length, width, height in metres: medians of 250,378 real boxes (docs/format.md).
-_MEDIAN_SIZES: Final[Mapping[str, tuple[float, float, float]]] = {
+_MEDIAN_SIZES: Mapping[str, tuple[float, float, float]] = {
     "car": (4.60, 1.93, 1.52),
     "truck": (8.47, 2.89, 3.83),
     "van": (4.48, 1.99, 2.04),
@@ -63,13 +65,13 @@ _MEDIAN_SIZES: Final[Mapping[str, tuple[float, float, float]]] = {
     "motorcycle": (2.21, 0.86, 1.53),
     "pedestrian": (0.38, 0.38, 1.86),
 }
-# A motion needs this number of frames that show both actors of a pair.
-_MIN_COMMON_FRAMES: Final = 2
+# Smallest number of frames that must show both actors of a pair for a motion.
+_MIN_COMMON_FRAMES = 2
 # Factors by which a road user's size can make it lighter or heavier than its class.
-_MIN_MASS_FACTOR: Final = 0.5
-_MAX_MASS_FACTOR: Final = 2.0
-# Scenarios of one piece of work: a few tenths of a second.
-_SCENARIOS_PER_RUN: Final = 64
+_MIN_MASS_FACTOR = 0.5
+_MAX_MASS_FACTOR = 2.0
+# Number of scenarios of one piece of work, which takes a few tenths of a second.
+_SCENARIOS_PER_RUN = 64
 
 _Result = TypeVar("_Result")
 
@@ -79,35 +81,31 @@ def masses_of(
 ) -> FloatArray:
     """Return the assumed masses of road users, shape (N,), kilograms.
 
-    A mass is that of its class, times the ratio of the volume to the class's median volume. The
-    ratio is limited to the range from 0.5 to 2.
+    A road user's mass is its class's mass times the ratio of its volume to the class's median
+    volume; the ratio is clipped to 0.5 to 2.
 
     Args:
-        categories: Positions in `taxonomy.CATEGORIES`, shape (N,).
+        categories: Indices into `taxonomy.CATEGORIES`, shape (N,).
         sizes: Lengths, widths, heights, shape (N, 3), metres.
         class_masses: Class → mass at its median size, kilograms.
 
     Raises:
         GeometryError: The sizes have another shape.
-        ConfigError: A class has no mass, or none above 0.
+        ConfigError: A class has no mass, or its mass is not above 0.
     """
     codes = np.asarray(categories, dtype=np.int64)
     volumes = checked("sizes", sizes, (len(codes), 3)).prod(axis=1)
-    masses = np.array(_masses_in_order(class_masses))
-    median_volumes = np.array([np.prod(_MEDIAN_SIZES[name]) for name in CATEGORIES])
-    factors = np.clip(volumes / median_volumes[codes], _MIN_MASS_FACTOR, _MAX_MASS_FACTOR)
-    return np.asarray(masses[codes] * factors)
-
-
-def _masses_in_order(class_masses: Mapping[str, float]) -> Sequence[float]:
-    """Return the mass of each class in the order of `CATEGORIES`, or raise ConfigError."""
     missing = [name for name in CATEGORIES if not class_masses.get(name, 0) > 0]
     if missing:
         raise ConfigError(
             "class_masses: expected kilograms above 0 for each class; "
             f"{', '.join(missing)} has none"
         )
-    return [float(class_masses[name]) for name in CATEGORIES]
+    masses = np.array([float(class_masses[name]) for name in CATEGORIES])
+    median_volumes = np.array([math.prod(_MEDIAN_SIZES[name]) for name in CATEGORIES])
+    volume_ratios = volumes / median_volumes[codes]
+    factors = np.clip(volume_ratios, _MIN_MASS_FACTOR, _MAX_MASS_FACTOR)
+    return np.asarray(masses[codes] * factors)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,8 +113,9 @@ class Accident(FrozenArrays):
     """Two actors up to the moment at which they collide.
 
     World frame, right-handed; metres, seconds, radians. The pair is in the meta file's order.
-    Time 0 is `first_frame`, the first that shows both actors. The impact counts as at the last
-    frame that shows both, though the outlines may touch before (`touching`). Arrays are read-only.
+    Time 0 is `first_frame`, the first that shows both actors. The impact is taken to be at the last
+    frame that shows both, although the outlines may touch earlier (`touching`). Arrays are
+    read-only.
 
     Attributes:
         scenario: Token.
@@ -128,8 +127,8 @@ class Accident(FrozenArrays):
         paths: Positions and yaws (x, y, yaw) at each frame, shape (2, F, 3).
         sizes: Lengths, widths, heights, shape (2, 3): medians over the frames.
         masses: Assumed masses, shape (2,), kilograms (`interactions.masses_of`).
-        interpolated: Number of frames in which a label of one of the two is missing; straight lines
-            fill them.
+        interpolated: Number of frames in which a label of one of the two actors is missing;
+            straight lines fill these frames.
     """
 
     scenario: str
@@ -146,12 +145,14 @@ class Accident(FrozenArrays):
     @property
     def duration(self) -> float:
         """Time from the first frame to the impact, seconds."""
-        return float((self.paths.shape[1] - 1) * FRAME_PERIOD)
+        num_steps = self.paths.shape[1] - 1
+        return float(num_steps * FRAME_PERIOD)
 
     @property
     def last_frame(self) -> int:
         """Number of the frame of the impact."""
-        return int(self.first_frame + self.paths.shape[1] - 1)
+        num_steps: int = self.paths.shape[1] - 1
+        return self.first_frame + num_steps
 
     @property
     def touching(self) -> float | None:
@@ -169,16 +170,18 @@ class Accident(FrozenArrays):
 
 
 def counted_text(touching: Sequence[float | None]) -> str:
-    """Return what the seconds before impacts are counted to, in words.
+    """Return a note on the moment from which the seconds before impacts are counted back.
 
     Args:
         touching: `Accident.touching` of each accident.
     """
-    early = [seconds for seconds in touching if seconds]
+    early_seconds = [seconds for seconds in touching if seconds]
     text = "seconds count to the last frame; the impact is at most 0.1 s after it"
-    if early:
-        num_early = f"{len(early)} of {len(touching)} accidents"
-        text += f", or before it where outlines touch: {num_early}, up to {max(early):.1f} s"
+    if early_seconds:
+        text += (
+            f", or before it where outlines touch: {len(early_seconds)} of "
+            f"{counted(len(touching), 'accident')}, up to {max(early_seconds):.1f} s"
+        )
     return text
 
 
@@ -198,7 +201,7 @@ class Skipped(ShortRepr):
 def accident_of(
     dataset: Dataset, scenario: RowArgument, class_masses: Mapping[str, float] = CLASS_MASSES
 ) -> Accident | None:
-    """Return the motion of the pair that the meta file names; None if it names no collision.
+    """Return the accident of the pair that the meta file names; None if it names no collision.
 
     Args:
         dataset: The release.
@@ -206,7 +209,7 @@ def accident_of(
         class_masses: Class → mass at its median size, kilograms.
 
     Raises:
-        TokenError: No such scenario.
+        TokenError: There is no such scenario.
         NotAvailableError: The scenario has no meta file or no labels, the file names one actor
             twice, or the labels show the two actors together in fewer than two frames.
     """
@@ -219,19 +222,25 @@ def accident_of(
     tracks = scenario_tracks(dataset, token)
     if not len(tracks.index):
         raise NotAvailableError(
-            f"{token} has no labels (the test split ships without), which say where actors are"
+            f"{token} has no labels, which say where actors are (the test split ships "
+            "without labels)"
         )
     actor_rows = [np.flatnonzero(tracks.actor_id == actor_id) for actor_id in actor_ids]
     common_frames, _ = labelled_together(tracks, token, actor_ids)
     if len(common_frames) < _MIN_COMMON_FRAMES:
         raise NotAvailableError(
             f"{token}: its labels show the colliding pair {first_id} and {second_id} together at "
-            f"{len(common_frames)} frames; a motion needs {_MIN_COMMON_FRAMES}"
+            f"{len(common_frames)} frames; the devkit needs at least {_MIN_COMMON_FRAMES}"
         )
     frames = np.arange(common_frames[0], common_frames[-1] + 1)
-    sizes = np.array([np.median(tracks.boxes.size[rows], axis=0) for rows in actor_rows])
     agents = agents_by_actor(dataset, token)
-    codes = [int(tracks.boxes.category[rows[-1]]) for rows in actor_rows]
+    paths = []
+    sizes = []
+    codes = []
+    for rows in actor_rows:
+        paths.append(recorded_path(tracks, rows, frames))
+        sizes.append(np.median(tracks.boxes.size[rows], axis=0))
+        codes.append(int(tracks.boxes.category[rows[-1]]))
     return Accident(
         scenario=token,
         actor_ids=(first_id, second_id),
@@ -239,8 +248,8 @@ def accident_of(
         agents=(agents.get(first_id), agents.get(second_id)),
         first_frame=int(common_frames[0]),
         num_frames=record["num_frames"],
-        paths=np.stack([recorded_path(tracks, rows, frames) for rows in actor_rows]),
-        sizes=sizes,
+        paths=np.stack(paths),
+        sizes=np.stack(sizes),
         masses=masses_of(codes, sizes, class_masses),
         interpolated=len(frames) - len(common_frames),
     )
@@ -255,12 +264,15 @@ def accidents_of(
     are read.
 
     Raises:
-        TokenError: No such scenario.
+        TokenError: There is no such scenario.
     """
     results = []
     for row in rows_of_scenarios(dataset, scenarios):
-        results.append(tried(accident_of, dataset, dataset.scenario[row]))
-    return [*those_of(Accident, results)], [*those_of(Skipped, results)]
+        scenario = dataset.scenario[row]
+        results.append(try_scenario(accident_of, dataset, scenario))
+    accidents = select_results(Accident, results)
+    skipped = select_results(Skipped, results)
+    return list(accidents), list(skipped)
 
 
 def recorded_path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> FloatArray:
@@ -270,8 +282,11 @@ def recorded_path(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> F
     """
     row_frames = tracks.index[rows]
     boxes = tracks.boxes.select(rows)
-    columns = [*boxes.center[:, :2].T, np.unwrap(boxes.yaw)]
-    return np.column_stack([np.interp(frames, row_frames, column) for column in columns])
+    x, y, _ = boxes.center.T
+    columns = []
+    for values in (x, y, np.unwrap(boxes.yaw)):
+        columns.append(np.interp(frames, row_frames, values))
+    return np.column_stack(columns)
 
 
 def agents_by_actor(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
@@ -288,7 +303,7 @@ def agents_by_actor(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
 
 
 def skipped_rows(skipped: Iterable[Skipped]) -> list[Row]:
-    """Return the table of the scenarios that are left out, with a header."""
+    """Return a table, with a header, of the scenarios that are left out."""
     rows: list[Row] = [("scenario", "reason")]
     for skip in skipped:
         rows.append((skip.scenario, skip.reason))
@@ -303,7 +318,7 @@ def reasons_text(title: str, skipped: Iterable[Skipped]) -> str:
     return "\n".join(lines)
 
 
-def each_scenario(
+def map_scenarios(
     work: Callable[[Dataset, Any], _Result | None],
     dataset: Dataset,
     scenarios: Iterable[RowArgument] | None = None,
@@ -312,40 +327,45 @@ def each_scenario(
     at_once: int = _SCENARIOS_PER_RUN,
     **engine: Unpack[Engine],
 ) -> list[_Result | Skipped | None]:
-    """Apply a computation to scenarios, once to each, in the order of the release.
+    """Apply a computation once to each scenario, in the order of the release.
 
     Args:
-        work: An importable function of the devkit (or a `functools.partial` of one) of a release
-            and a scenario's record. It returns None for a scenario that it does not concern, and
-            raises NotAvailableError for one that lacks what it needs: the result is then a Skipped.
+        work: An importable function of the devkit (or a `functools.partial` of one) that takes a
+            release and a scenario's record. It returns None for a scenario that it does not
+            concern, and raises NotAvailableError for one that lacks what it needs: the result is
+            then a Skipped.
         dataset: The release.
         scenarios: Tokens or records; None for all. Raises TokenError.
-        label: Text of the progress bar.
-        at_once: Scenarios of a piece of work; 1 where one scenario takes tenths of a second.
+        label: Label of the progress bar.
+        at_once: Number of scenarios of a piece of work; 1 if one scenario takes tenths of a second.
         **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
     """
     rows = sorted(set(rows_of_scenarios(dataset, scenarios)))
     runs = [rows[start : start + at_once] for start in range(0, len(rows), at_once)]
     sizes = [len(run) for run in runs]
     places = Places(reads=dataset.places)
-    run_work = partial(_run, work, dataset)
-    parts = run_unordered(run_work, runs, sizes=sizes, places=places, label=label, **engine)
-    return [result for part in in_order(parts) for result in part]
+    run_work = partial(_compute_rows, work, dataset)
+    unordered = run_unordered(run_work, runs, sizes=sizes, places=places, label=label, **engine)
+    results: list[_Result | Skipped | None] = []
+    for run_results in in_order(unordered):
+        results += run_results
+    return results
 
 
-def _run(
+def _compute_rows(
     work: Callable[[Dataset, Any], _Result | None], dataset: Dataset, rows: Sequence[int]
 ) -> list[_Result | Skipped | None]:
-    """Return the result of a computation for each row of the scenario table."""
-    return [tried(work, dataset, dataset.scenario[row]) for row in rows]
+    """Return the result of a computation for each of the selected rows of the scenario table."""
+    scenarios = [dataset.scenario[row] for row in rows]
+    return [try_scenario(work, dataset, scenario) for scenario in scenarios]
 
 
-def tried(
+def try_scenario(
     work: Callable[[Dataset, Any], _Result | None], dataset: Dataset, scenario: ScenarioRecord
 ) -> _Result | Skipped | None:
-    """Return the result of a computation for one scenario, or why it has none.
+    """Return the result of a computation for one scenario, or the reason why it has none.
 
-    `each_scenario` describes the computation.
+    `map_scenarios` describes the computation.
     """
     try:
         return work(dataset, scenario)
@@ -353,6 +373,6 @@ def tried(
         return Skipped(scenario=scenario["token"], reason=str(error))
 
 
-def those_of(kind: type[_Result], results: Iterable[object]) -> tuple[_Result, ...]:
-    """Return the results of `each_scenario` that are of a kind: a result class, or Skipped."""
+def select_results(kind: type[_Result], results: Iterable[object]) -> tuple[_Result, ...]:
+    """Return the results of `map_scenarios` that belong to a class, such as Skipped."""
     return tuple(result for result in results if isinstance(result, kind))

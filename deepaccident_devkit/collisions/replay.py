@@ -1,9 +1,9 @@
-"""Replays of recorded motions, with braking from some moment on.
+"""Replays of recorded motions in which actors start to brake at some moment.
 
 They give positions, speeds and arc lengths at any time. A braking actor stays on its recorded path.
-Its arc length is the lesser of the recorded one and the one that the braking allows, so that an
-actor that brakes harder in the recording does so in the replay too, and no actor is sped up. There
-are no limits of jerk or friction.
+Its arc length is the smaller of the recorded one and the one that braking allows. So an actor that
+brakes harder in the recording also does so in the replay, and no actor is sped up. Jerk and
+friction are not limited.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 HORIZON: Final = 3.0
 """Time after the end of the recording during which actors go straight on, seconds."""
-# An actor with a last step no longer than this stands still after the recording.
-_STANDING_STEP_M: Final = 1e-3
-# A time may miss the frame that it means by this share of a frame.
-_FRAME_TOLERANCE: Final = 1e-6
-# A braking actor counts as behind the recording from this distance on.
-_ARC_TOLERANCE_M: Final = 1e-9
+# Longest last step of an actor that stands still after the recording.
+_STANDING_STEP_M = 1e-3
+# Maximum deviation of a time from the frame that it denotes, in frames.
+_FRAME_TOLERANCE = 1e-6
+# Smallest distance by which a braking actor must be behind the recording to count as behind it.
+_ARC_TOLERANCE_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,10 +67,10 @@ class Motion(FrozenArrays):
         return float(self.times[-2])
 
     def stretches(self, times: FloatArray) -> IntArray:
-        """Return the numbers of the stretches between nodes that hold times, shape as `times`.
+        """Return the index of the stretch between nodes that contains each time, shaped as `times`.
 
         The time of a frame belongs to the stretch after it. The end of the recording belongs to its
-        last stretch, since the speed on it is that of the impact.
+        last stretch, which has the speed of the impact.
         """
         continuation = len(self.speeds) - 1
         numbers: IntArray = (times / FRAME_PERIOD + _FRAME_TOLERANCE).astype(np.int64)
@@ -80,10 +80,10 @@ class Motion(FrozenArrays):
 
 
 class BrakingPlans(NamedTuple):
-    """Begin and strength of the braking in N replays of one actor.
+    """Start and strength of the braking in N replays of one actor.
 
     Attributes:
-        starts: Times at which the braking begins, shape (N,), seconds; inf for no braking.
+        starts: Start times of the braking, shape (N,), seconds; inf for no braking.
         decelerations: Decelerations, shape (N,), m/s².
         arcs: Distances along the path at which the braking begins, shape (N,), metres; inf for no
             braking.
@@ -96,8 +96,10 @@ class BrakingPlans(NamedTuple):
     speeds: FloatArray
 
     def take(self, rows: IntArray) -> BrakingPlans:
-        """Return the plans of some rows."""
-        return BrakingPlans(*(column[rows] for column in self))
+        """Return the plans of the replays at some rows."""
+        return BrakingPlans(
+            self.starts[rows], self.decelerations[rows], self.arcs[rows], self.speeds[rows]
+        )
 
 
 class ReplayStates(NamedTuple):
@@ -125,24 +127,25 @@ class ReplayStates(NamedTuple):
         steps = motion.steps[:, :2]
         lengths = motion.lengths[:, None]
         directions = np.divide(steps, lengths, out=np.zeros_like(steps), where=lengths > 0)
-        return np.asarray(self.speeds[:, None] * directions[self.stretches])
+        velocities: FloatArray = self.speeds[:, None] * directions[self.stretches]
+        return velocities
 
 
 def motion_of(path: ArrayLike, *, horizon: float = HORIZON) -> Motion:
-    """Return the motion along a path, which goes on for `horizon` seconds.
+    """Return the motion along a path, continued for `horizon` seconds.
 
     Args:
         path: x, y, yaw at 10 Hz, shape (F, 3).
         horizon: Time of the continuation, seconds.
 
     Raises:
-        GeometryError: The path has another shape, fewer than two frames, or a NaN.
+        GeometryError: The path has a wrong shape, fewer than two frames, or contains NaN.
     """
     poses = checked("path", path, (None, 3)).copy()
     if len(poses) < 2 or not np.isfinite(poses).all():
         raise GeometryError(
-            "path: expected two or more frames of finite x, y, yaw, "
-            f"found {poses.shape} or a NaN in it"
+            "path: expected an array of finite x, y, yaw with two or more frames, found shape "
+            f"{poses.shape} or a NaN"
         )
     poses[:, 2] = np.unwrap(poses[:, 2])
     last_step = poses[-1, :2] - poses[-2, :2]
@@ -155,10 +158,10 @@ def motion_of(path: ArrayLike, *, horizon: float = HORIZON) -> Motion:
     turns = np.abs(steps[:, 2])
     periods = np.full(len(steps), FRAME_PERIOD)
     periods[-1] = horizon
-    end = (len(steps) - 1) * FRAME_PERIOD
+    frame_times = np.arange(len(steps)) * FRAME_PERIOD
     return Motion(
         poses=poses,
-        times=np.append(np.arange(len(steps)) * FRAME_PERIOD, end + horizon),
+        times=np.append(frame_times, frame_times[-1] + horizon),
         arcs=np.concatenate([[0.0], np.cumsum(lengths)]),
         turned=np.concatenate([[0.0], np.cumsum(turns)]),
         speeds=lengths / periods,
@@ -172,11 +175,11 @@ def braking_plans(motion: Motion, starts: ArrayLike, decelerations: ArrayLike) -
     """Return the plans of N replays of a motion.
 
     From the end of the recording on, braking has no effect: such times, inf and NaN give plans
-    without braking. Nothing is recorded before 0, so that the braking begins at 0 at the earliest.
+    without braking. Nothing is recorded before time 0, so braking begins at time 0 at the earliest.
 
     Args:
         motion: The recorded motion.
-        starts: Times at which the braking begins, shape (N,), seconds.
+        starts: Start times of the braking, shape (N,), seconds.
         decelerations: Decelerations, shape (N,) or one number, m/s².
 
     Raises:
@@ -215,17 +218,18 @@ def replay(motion: Motion, plans: BrakingPlans, rows: IntArray, times: FloatArra
     braking = np.flatnonzero(times > plans.starts[rows])
     if len(braking):
         active_plans = plans.take(rows[braking])
-        behind, braked_arcs, braked_speeds = _braked(active_plans, times[braking], arcs[braking])
-        braked = braking[behind]
-        speeds[braked] = braked_speeds
-        arcs[braked] = braked_arcs
-        stretches[braked], shares[braked] = _positions(motion, braked_arcs)
-    poses = motion.poses[stretches] + shares[:, None] * motion.steps[stretches]
-    turned = motion.turned[stretches] + shares * np.abs(motion.steps[stretches, 2])
-    return ReplayStates(poses=poses, speeds=speeds, arcs=arcs, turned=turned, stretches=stretches)
+        is_behind, braked_arcs, braked_speeds = _brake(active_plans, times[braking], arcs[braking])
+        behind = braking[is_behind]
+        speeds[behind] = braked_speeds
+        arcs[behind] = braked_arcs
+        stretches[behind], shares[behind] = _locate_arcs(motion, braked_arcs)
+    steps = motion.steps[stretches]
+    poses = motion.poses[stretches] + shares[:, None] * steps
+    turned = motion.turned[stretches] + shares * np.abs(steps[:, 2])
+    return ReplayStates(poses, speeds, arcs, turned, stretches)
 
 
-def _braked(
+def _brake(
     plans: BrakingPlans, times: FloatArray, arcs: FloatArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return the braked arc lengths and speeds of replays that are behind the recording.
@@ -243,18 +247,19 @@ def _braked(
     lost_speed = plans.decelerations * braking_time
     allowed_arcs = plans.arcs + (plans.speeds - lost_speed / 2) * braking_time
     speeds = np.maximum(0.0, plans.speeds - lost_speed)
-    behind = allowed_arcs < arcs - _ARC_TOLERANCE_M
-    return behind, allowed_arcs[behind], speeds[behind]
+    is_behind = allowed_arcs < arcs - _ARC_TOLERANCE_M
+    return is_behind, allowed_arcs[is_behind], speeds[is_behind]
 
 
-def _positions(motion: Motion, arcs: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the last stretches, and shares of them, at which the path has some lengths.
+def _locate_arcs(motion: Motion, arcs: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the stretch on which each arc length lies, and the fraction of it up to that point.
 
-    The lengths are shorter than the full path. An actor that stands when it begins to brake
-    therefore keeps the heading with which it would drive on.
+    The arc lengths are shorter than the full path. If several stretches fit, the last one is used:
+    an actor that is standing when it begins to brake keeps the heading with which it would drive
+    on.
     """
-    numbers = np.searchsorted(motion.arcs, arcs, side="right") - 1
-    lengths = motion.lengths[numbers]
-    distances = arcs - motion.arcs[numbers]
+    stretches = np.searchsorted(motion.arcs, arcs, side="right") - 1
+    lengths = motion.lengths[stretches]
+    distances = arcs - motion.arcs[stretches]
     shares = np.divide(distances, lengths, out=np.zeros_like(arcs), where=lengths > 0)
-    return numbers, shares
+    return stretches, shares

@@ -1,4 +1,4 @@
-"""Twins: an accident scenario and the normal one of its name and subtype; splits that part them."""
+"""Twins (an accident and the normal scenario of the same name and subtype), and torn twins."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import TokenError
@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import TokenError
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-_OTHER_ENDING: Final[Mapping[str, str]] = {"normal": "accident", "accident": "normal"}
+_OTHER_ENDING: Mapping[str, str] = {"normal": "accident", "accident": "normal"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,32 +31,33 @@ class TornTwins:
 
 
 def twin_of(dataset: Dataset, scenario: RowArgument) -> ScenarioRecord | None:
-    """Return the scenario of the same name and subtype with the other ending, or None.
+    """Return the scenario that has the same name and subtype but the other ending, or None.
 
     Args:
         dataset: The release.
         scenario: Token or record.
 
     Raises:
-        TokenError: No such scenario.
+        TokenError: There is no such scenario.
     """
     record = dataset.get("scenario", scenario)
     family, _, ending = record["scenario_type"].rpartition("_")
     if ending not in _OTHER_ENDING:
         return None
+    twin_type = f"{family}_{_OTHER_ENDING[ending]}"
     try:
-        return dataset.scenario.get(f"{family}_{_OTHER_ENDING[ending]}/{record['name']}")
+        return dataset.scenario.get(f"{twin_type}/{record['name']}")
     except TokenError:
         return None
 
 
 def torn_twins(split_of: Mapping[str, str | None]) -> tuple[TornTwins, ...]:
-    """Return the twins with their two scenarios in different splits.
+    """Return the twins whose two scenarios belong to different splits.
 
     A model that learns from one of the two scenarios has then learnt about the other.
 
     Args:
-        split_of: Scenario token → its split; scenarios without a split do not count.
+        split_of: Scenario token → its split; scenarios without a split (None) are ignored.
     """
     twins: dict[tuple[str, str], list[str]] = defaultdict(list)
     for token, split in split_of.items():
@@ -65,8 +66,8 @@ def torn_twins(split_of: Mapping[str, str | None]) -> tuple[TornTwins, ...]:
             twins[scenario_type.rpartition("_")[0], name].append(token)
     torn = []
     for tokens in twins.values():
-        for pair in combinations(tokens, 2):
-            splits = (split_of[pair[0]], split_of[pair[1]])
+        for first, second in combinations(tokens, 2):
+            splits = (str(split_of[first]), str(split_of[second]))
             if splits[0] != splits[1]:
-                torn.append(TornTwins(scenarios=pair, splits=(str(splits[0]), str(splits[1]))))
+                torn.append(TornTwins(scenarios=(first, second), splits=splits))
     return tuple(torn)

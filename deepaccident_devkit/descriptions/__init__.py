@@ -1,4 +1,4 @@
-"""What happens in a scenario, in words: facts, sentences, observers, and when to brake."""
+"""What happens in a scenario: facts, sentences, which agents saw it, and when to brake."""
 
 from deepaccident_devkit.descriptions.avoidability import (
     Avoidability,

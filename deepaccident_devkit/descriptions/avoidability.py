@@ -1,20 +1,18 @@
-"""The last moment to brake, and what a warning at each earlier moment would have changed."""
-
-from __future__ import annotations
+"""The last moment to brake, and what an earlier warning would have changed."""
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.collisions.contact import Pair, contact_made, contact_times, pair_of
+from deepaccident_devkit.collisions.contact import Pair, contact_times, has_contact, pair_of
 from deepaccident_devkit.collisions.outcomes import (
     BRAKINGS,
-    MOST_MARGIN,
+    MAX_END_GAP_M,
     OUTCOMES,
     Braking,
     Outcomes,
@@ -34,37 +32,39 @@ from deepaccident_devkit.support.arrays import (
     IntArray,
     as_floats,
     checked,
-    known,
+    json_numbers,
 )
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
-BRAKERS: Final = ("first", "second", "both")
-"""The braking actors of the pair; the pair is in the meta file's order."""
-MASKS: Final = ((True, False), (False, True), (True, True))
-"""`BRAKERS` as `outcomes_of` takes them: whether each actor of the pair brakes."""
-# Seconds between the tried starts of braking.
-_SCAN_STEP_S: Final = 0.01
-# Least angle between the headings at the end, radians.
-_MIN_HEAD_ON_ANGLE_RAD: Final = 3 * math.pi / 4
-# Metres of a gap that counts as contact. With other actors no contact was recorded, so no larger
-# margin is needed.
-_CONTACT_GAP_M: Final = 1e-9
+BRAKERS = ("first", "second", "both")
+"""Which of the two colliders brakes; the meta file determines their order."""
+MASKS = ((True, False), (False, True), (True, True))
+"""`BRAKERS` as masks for `outcomes_of`: whether each of the two colliders brakes."""
+# Time between two successive candidate times at which braking begins.
+_SCAN_STEP_S = 0.01
+# Smallest angle between the final headings of two colliders that counts as head-on.
+_MIN_HEAD_ON_ANGLE_RAD = 3 * math.pi / 4
+# Largest gap that counts as contact. Contacts with other actors were not recorded, so no tolerance
+# for label errors is needed.
+_CONTACT_GAP_M = 1e-9
+# Values that can be written as JSON.
+_JsonObject = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LastMoments(FrozenArrays):
-    """The last moments to brake of N ways to brake; arrays are read-only.
+    """The last moments to brake for N cases; arrays are read-only.
 
     Attributes:
-        time: Latest start of a braking that avoids the accident, shape (N,), seconds from the first
-            frame; NaN if no start does.
-        switches: Number of changes of the answer from one tried start to the next, shape (N,). With
-            more than one, braking a little earlier than the last moment can be worse than braking
-            at it, for example if one actor passes behind the other.
-        extrapolated: Whether no start avoids the accident although some start avoids it until the
-            recording ends, shape (N,). The contact is then part of the continuation, in which the
-            other actor goes straight on.
+        time: Latest start of braking that avoids the accident, in seconds from the first frame,
+            shape (N,); NaN if no start avoids it.
+        switches: How often the answer changes from one candidate start to the next, shape (N,). If
+            more than once, braking a little earlier than the last moment can be worse than braking
+            at it, for example if one actor then no longer passes behind the other.
+        extrapolated: Whether some start avoids the accident until the recording ends, but none
+            avoids it altogether, shape (N,). Contact then happens in the extrapolation, in which
+            the other actor goes straight on.
     """
 
     time: FloatArray
@@ -74,16 +74,16 @@ class LastMoments(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SecondaryContact:
-    """A contact of the pair with another actor, in a replay only and not in the recording.
+    """A contact of a collider with a third actor, in a replay but not in the recording.
 
-    The other actor keeps its recorded motion, though a driver would react: the contact is a hint,
-    not an outcome.
+    The third actor keeps its recorded motion, although a driver would react. The contact is thus a
+    hint, not an outcome.
 
     Attributes:
-        replay: Number of the replay.
-        actor_id: CARLA id of the actor of the pair.
-        other_id: CARLA id of the other actor.
-        category: Class of the other actor.
+        replay: Index of the replay.
+        actor_id: CARLA id of the collider.
+        other_id: CARLA id of the third actor.
+        category: Class of the third actor.
         time: Seconds from the first frame of the accident.
         extrapolated: Whether the contact is after the end of the recording.
     """
@@ -98,20 +98,20 @@ class SecondaryContact:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Avoidability(FrozenArrays):
-    """When braking could have avoided an accident, and what warnings would have changed.
+    """When braking could have avoided an accident, and what a warning would have changed.
 
     Arrays are read-only.
 
     Attributes:
         accident: Recorded motion.
-        check: Replay in which nobody brakes.
+        check: Replay without any braking.
         brakings: The K ways to brake after a warning.
-        decelerations: Decelerations of `brakings`, shape (D,), m/s², ascending.
-        last_moments: One value for each of `BRAKERS` and each deceleration, row by row (3 · D).
+        decelerations: Decelerations of `brakings` in m/s², shape (D,), ascending.
+        last_moments: One value for each of `BRAKERS` and deceleration (3 · D, row by row).
         leads: Seconds from a warning to the end of the recording, shape (L,): 0, 0.1, …
-        outcomes: For each of `BRAKERS`, what the L warnings make of the accident in K ways.
-        secondary: Contacts with other actors in the replays in which the braking begins at the last
-            moment; their `replay` is the position in `last_moments`.
+        outcomes: For each of `BRAKERS`, the accident's outcomes for L warnings and K ways to brake.
+        secondary: Contacts with third actors in the replays in which braking begins at the last
+            moment; their `replay` is an index into `last_moments`.
     """
 
     accident: Accident
@@ -127,48 +127,50 @@ class Avoidability(FrozenArrays):
     def slack(self) -> FloatArray:
         """Seconds from the last moment to brake to the end of the recording, shape (3, D).
 
-        It is NaN if nothing avoids the accident.
+        It is NaN where no braking avoids the accident.
         """
         seconds = self.accident.duration - self.last_moments.time
         return np.reshape(seconds, (len(BRAKERS), -1))
 
     @property
     def head_on(self) -> bool:
-        """Whether the pair meets head-on.
+        """Whether the two collide head-on.
 
-        If only one of the two brakes, the outcome then depends on how the other goes on.
+        If only one of them brakes, the outcome then depends on how the other continues.
         """
-        first_yaw, second_yaw = self.accident.paths[:, -1, 2]
-        angle = math.remainder(float(first_yaw - second_yaw), 2 * math.pi)
+        first_yaw, second_yaw = self.accident.paths[:, -1, 2].tolist()
+        angle = math.remainder(first_yaw - second_yaw, 2 * math.pi)
         return abs(angle) >= _MIN_HEAD_ON_ANGLE_RAD
 
     @property
     def pedestrian(self) -> bool:
-        """Whether one of the pair is a pedestrian: a pedestrian cannot answer by braking."""
+        """Whether one of the colliders is a pedestrian, who cannot brake like a vehicle."""
         return "pedestrian" in self.accident.categories
 
     def to_dict(self, *, warnings: bool = True) -> dict[str, Any]:
-        """Return values for JSON; None for what does not exist.
+        """Return the values for JSON; None for values that do not exist.
 
         Args:
-            warnings: Whether to include what each warning changes, about a thousand values.
+            warnings: Whether to include what each warning changes (about a thousand values).
         """
         accident = self.accident
-        actors = zip(
-            accident.actor_ids,
-            accident.categories,
-            accident.agents,
-            accident.masses.tolist(),
-            strict=True,
-        )
-        keys = ("actor_id", "category", "agent", "mass")
-        result: dict[str, Any] = {
+        actors = []
+        for member, mass in enumerate(accident.masses.tolist()):
+            actors.append(
+                {
+                    "actor_id": accident.actor_ids[member],
+                    "category": accident.categories[member],
+                    "agent": accident.agents[member],
+                    "mass": mass,
+                }
+            )
+        result: _JsonObject = {
             "scenario": accident.scenario,
-            "actors": [dict(zip(keys, actor, strict=True)) for actor in actors],
+            "actors": actors,
             "duration": round(accident.duration, 1),
             "head_on": self.head_on,
             "pedestrian": self.pedestrian,
-            "recorded": self._recorded(),
+            "recorded": self._describe_recorded(),
             "last_moments": list(self.last_moment_rows()),
         }
         if warnings:
@@ -185,43 +187,43 @@ class Avoidability(FrozenArrays):
                 "brakers": brakers,
                 "deceleration": deceleration,
                 "avoidable": bool(np.isfinite(moments.time[row])),
-                "last_moment": known(moments.time[row], 2),
-                "slack": known(self.slack.flat[row], 2),
+                "last_moment": json_numbers(moments.time[row], 2),
+                "slack": json_numbers(self.slack.flat[row], 2),
                 "switches": int(moments.switches[row]),
                 "extrapolated": bool(moments.extrapolated[row]),
                 "secondary": self._secondary_rows(row),
             }
 
-    def _secondary_rows(self, replay: int) -> list[dict[str, Any]]:
+    def _secondary_rows(self, replay: int) -> list[_JsonObject]:
         rows = []
         for contact in self.secondary:
             if contact.replay == replay:
-                rows.append(
-                    {
-                        "actor_id": contact.actor_id,
-                        "other_id": contact.other_id,
-                        "category": contact.category,
-                        "time": round(contact.time, 3),
-                        "extrapolated": contact.extrapolated,
-                    }
-                )
+                row = {
+                    "actor_id": contact.actor_id,
+                    "other_id": contact.other_id,
+                    "category": contact.category,
+                    "time": round(contact.time, 3),
+                    "extrapolated": contact.extrapolated,
+                }
+                rows.append(row)
         return rows
 
-    def _recorded(self) -> dict[str, Any]:
+    def _describe_recorded(self) -> _JsonObject:
+        ranges = delta_v_ranges(self.accident.masses, self.relative_speed)
         return {
             "margin": self.check.margin,
             "time": round(self.check.time, 6),
-            "speeds": known(self.check.speeds, 3),
-            "delta_v": known(self.check.delta_v, 3),
-            "delta_v_ranges": known(delta_v_ranges(self.accident.masses, self.relative_speed), 3),
+            "speeds": json_numbers(self.check.speeds, 3),
+            "delta_v": json_numbers(self.check.delta_v, 3),
+            "delta_v_ranges": json_numbers(ranges, 3),
         }
 
     @property
     def relative_speed(self) -> float:
-        """Relative speed of the pair at the recorded contact, m/s."""
-        return float(self.check.delta_v.sum())  # the shares of the two add up to 1
+        """Relative speed of the two at the recorded contact, in m/s."""
+        return float(self.check.delta_v.sum())  # the two fractions of it add up to 1
 
-    def _warning_rows(self) -> Iterator[dict[str, Any]]:
+    def _warning_rows(self) -> Iterator[_JsonObject]:
         for brakers, outcomes in zip(BRAKERS, self.outcomes, strict=True):
             for column, braking in enumerate(self.brakings):
                 yield {
@@ -230,44 +232,45 @@ class Avoidability(FrozenArrays):
                     "deceleration": braking.deceleration,
                     "outcome": [OUTCOMES[code] for code in outcomes.outcome[:, column]],
                     "extrapolated": outcomes.extrapolated[:, column].tolist(),
-                    "speeds": known(outcomes.speeds[:, column], 3),
-                    "delta_v": known(outcomes.delta_v[:, column], 3),
-                    "reduction": known(outcomes.reduction[:, column], 3),
+                    "speeds": json_numbers(outcomes.speeds[:, column], 3),
+                    "delta_v": json_numbers(outcomes.delta_v[:, column], 3),
+                    "reduction": json_numbers(outcomes.reduction[:, column], 3),
                 }
 
 
 def last_moments(pair: Pair, brakers: tuple[bool, bool], decelerations: ArrayLike) -> LastMoments:
-    """Return the last moments to brake with decelerations (N,) m/s².
+    """Find the last moments to brake for decelerations (N,) in m/s².
 
-    Each hundredth of a second is tried, because the answer may change more than once.
+    All candidates, 0.01 s apart, are tried, because the answer may change more than once.
     """
     values = checked("decelerations", decelerations, (None,))
     count = len(values)
-    scan = np.arange(round(pair.duration / _SCAN_STEP_S) + 1) * _SCAN_STEP_S
-    starts = np.where(brakers, np.tile(scan, count)[:, None], np.inf)
-    repeated = np.repeat(values, len(scan))
-    avoids = ~contact_made(pair, starts, repeated).reshape(count, -1)
-    possible = avoids.any(axis=1)
-    latest = len(scan) - 1 - np.argmax(avoids[:, ::-1], axis=1)
-    extrapolated = np.zeros(count, dtype=bool)
-    rows = np.flatnonzero(np.repeat(~possible, len(scan)))
+    tried_starts = np.arange(round(pair.duration / _SCAN_STEP_S) + 1) * _SCAN_STEP_S
+    num_tried = len(tried_starts)
+    starts = np.where(brakers, np.tile(tried_starts, count)[:, None], np.inf)
+    repeated_values = np.repeat(values, num_tried)
+    avoids = ~has_contact(pair, starts, repeated_values).reshape(count, -1)
+    is_possible = avoids.any(axis=1)
+    latest = num_tried - 1 - np.argmax(avoids[:, ::-1], axis=1)
+    rows = np.flatnonzero(np.repeat(~is_possible, num_tried))
     recorded = (0.0, pair.duration)
-    touches = contact_made(pair, starts[rows], repeated[rows], window=recorded)
-    extrapolated[~possible] = (~touches).reshape(-1, len(scan)).any(axis=1)
+    touches = has_contact(pair, starts[rows], repeated_values[rows], window=recorded)
+    extrapolated = np.zeros(count, dtype=bool)
+    extrapolated[~is_possible] = (~touches).reshape(-1, num_tried).any(axis=1)
     switches = np.count_nonzero(np.diff(avoids, axis=1), axis=1)
     return LastMoments(
-        time=np.where(possible, scan[latest], np.nan),
+        time=np.where(is_possible, tried_starts[latest], np.nan),
         switches=switches.astype(np.int64),
         extrapolated=extrapolated,
     )
 
 
 def unusable(accident: Accident, check: ReplayCheck) -> str:
-    """Return in words why an accident with a failed check cannot be replayed."""
+    """Explain why an accident whose replay check failed cannot be replayed."""
     first, second = accident.actor_ids
     return (
         f"{accident.scenario}: the outlines of {first} and {second} are {check.margin:.2f} m apart "
-        f"at their last frame, more than {MOST_MARGIN:g} m: "
+        f"at their last frame, more than {MAX_END_GAP_M:g} m: "
         "the recording does not show the accident"
     )
 
@@ -278,17 +281,17 @@ def avoidability_of(
     *,
     brakings: Sequence[Braking] = BRAKINGS,
 ) -> Avoidability:
-    """Return when braking could have avoided an accident.
+    """Find out when braking could have avoided an accident.
 
     Args:
         accident: Recorded motion.
-        tracks: Tracks of all actors of its scenario, for contacts with actors outside the pair;
-            None to leave these out.
+        tracks: Tracks of all actors in the scenario, to find contacts with third actors; None to
+            skip these.
         brakings: Ways to brake after a warning.
 
     Raises:
-        NotAvailableError: The gap between the two at the last frame is so large that the recording
-            does not show the accident.
+        NotAvailableError: If the two are so far apart in the last frame that the recording does
+            not show the accident.
     """
     check = undisturbed(accident)
     if not check.usable:
@@ -296,15 +299,24 @@ def avoidability_of(
     pair = pair_of(accident.paths, accident.sizes)
     decelerations = np.unique([braking.deceleration for braking in brakings])
     scans = [last_moments(pair, brakers, decelerations) for brakers in MASKS]
-    columns = {}
-    for name in LastMoments.__slots__:
-        columns[name] = np.concatenate([getattr(scan, name) for scan in scans])
-    moments = LastMoments(**columns)
+    moments = LastMoments(
+        time=np.concatenate([scan.time for scan in scans]),
+        switches=np.concatenate([scan.switches for scan in scans]),
+        extrapolated=np.concatenate([scan.extrapolated for scan in scans]),
+    )
     leads = as_floats(np.arange(accident.paths.shape[1]) * FRAME_PERIOD)
     warnings = accident.duration - leads
-    first, second, both = (
+    first, second, joint = (
         outcomes_of(accident, brakers, warnings, brakings=brakings) for brakers in MASKS
     )
+    contacts: list[SecondaryContact] = []
+    if tracks is not None:
+        # In each replay, braking begins at that replay's last moment.
+        times = moments.time[:, None]
+        brakes = np.repeat(np.array(MASKS), len(decelerations), axis=0)
+        starts = np.where(brakes & np.isfinite(times), times, np.inf)
+        repeated_decelerations = np.tile(decelerations, len(MASKS))
+        contacts = secondary_contacts(accident, tracks, starts, repeated_decelerations)
     return Avoidability(
         accident=accident,
         check=check,
@@ -312,26 +324,24 @@ def avoidability_of(
         decelerations=decelerations,
         last_moments=moments,
         leads=leads,
-        outcomes=(first, second, both),
-        secondary=() if tracks is None else _secondary(accident, tracks, moments, decelerations),
+        outcomes=(first, second, joint),
+        secondary=tuple(contacts),
     )
 
 
 def avoidability(
     dataset: Dataset, scenario: RowArgument, *, brakings: Sequence[Braking] = BRAKINGS
 ) -> Avoidability | None:
-    """Return when braking could have avoided a scenario's accident.
-
-    It is None if the meta file names no collision.
+    """Find out when braking could have avoided a scenario's accident; None without a collision.
 
     Args:
         dataset: The release.
-        scenario: Token or record.
+        scenario: Token or record of the scenario.
         brakings: Ways to brake after a warning.
 
     Raises:
-        TokenError: No such scenario.
-        NotAvailableError: The scenario lacks labels or meta, or its labels do not show the
+        TokenError: If the release has no such scenario.
+        NotAvailableError: If the scenario lacks labels or meta, or its labels do not show the
             accident.
     """
     accident = accident_of(dataset, scenario)
@@ -340,26 +350,15 @@ def avoidability(
     return avoidability_of(accident, scenario_tracks(dataset, scenario), brakings=brakings)
 
 
-def _secondary(
-    accident: Accident, tracks: ScenarioTracks, moments: LastMoments, decelerations: FloatArray
-) -> tuple[SecondaryContact, ...]:
-    """Return contacts with other actors in replays that avoid the accident at the last moment."""
-    brakes = np.repeat(np.array(MASKS), len(decelerations), axis=0)
-    moment = moments.time[:, None]
-    starts = np.where(brakes & np.isfinite(moment), moment, np.inf)
-    repeated = np.tile(decelerations, len(MASKS))
-    return tuple(secondary_contacts(accident, tracks, starts, repeated))
-
-
 @dataclass(frozen=True, slots=True)
-class _Other:
-    """An actor outside the pair.
+class _OtherActor:
+    """An actor that is not one of the two colliders.
 
     Attributes:
         actor_id: CARLA id.
         category: Class.
-        path: Path at the accident's frames.
-        size: Length and width, shape (2,), metres.
+        path: Path in the accident's frames.
+        size: Length and width in metres, shape (2,).
         window: First and last second in which labels show the actor.
     """
 
@@ -373,48 +372,51 @@ class _Other:
 def secondary_contacts(
     accident: Accident, tracks: ScenarioTracks, starts: FloatArray, decelerations: FloatArray
 ) -> list[SecondaryContact]:
-    """Return first contacts of the pair with other actors in N replays, by replay, then by time.
+    """Find the colliders' first contacts with third actors in N replays.
 
-    Contacts that the recording has too are left out, and so are actors that labels show at one
-    frame only: they have no motion.
+    They are sorted by replay, then by time. Contacts that also happen in the recording are left
+    out, and so are actors that are labelled in one frame only: their motion is unknown.
 
     Args:
         accident: Recorded motion.
         tracks: Tracks of all actors of the scenario.
-        starts: Seconds at which each of the pair begins to brake, shape (N, 2); inf if it does not.
-        decelerations: Decelerations of the replays, shape (N,), m/s².
+        starts: Seconds at which each collider begins to brake, shape (N, 2); inf if it does not.
+        decelerations: Decelerations in the replays in m/s², shape (N,).
     """
     contacts = []
-    for other, member in product(_others(accident, tracks), (0, 1)):
+    for other, member in product(_other_actors(accident, tracks), (0, 1)):
         rows = np.flatnonzero(np.isfinite(starts[:, member]))
         if not len(rows) or not _may_meet(accident.paths[member], accident.sizes[member], other):
             continue
-        times = _new_contacts(accident, member, other, starts[rows], decelerations[rows])
+        times = _first_contact_times(accident, member, other, starts[rows], decelerations[rows])
         for row, time in zip(rows, times, strict=True):
             if np.isfinite(time):
-                contacts.append(
-                    SecondaryContact(
-                        replay=int(row),
-                        actor_id=accident.actor_ids[member],
-                        other_id=other.actor_id,
-                        category=other.category,
-                        time=float(time),
-                        extrapolated=bool(time > accident.duration),
-                    )
+                contact = SecondaryContact(
+                    replay=int(row),
+                    actor_id=accident.actor_ids[member],
+                    other_id=other.actor_id,
+                    category=other.category,
+                    time=float(time),
+                    extrapolated=bool(time > accident.duration),
                 )
+                contacts.append(contact)
     return sorted(contacts, key=lambda contact: (contact.replay, contact.time, contact.other_id))
 
 
-def _new_contacts(
-    accident: Accident, member: int, other: _Other, starts: FloatArray, decelerations: FloatArray
+def _first_contact_times(
+    accident: Accident,
+    member: int,
+    other: _OtherActor,
+    starts: FloatArray,
+    decelerations: FloatArray,
 ) -> FloatArray:
-    """Return seconds at which one of the pair touches another actor in N replays, shape (N,).
+    """Return when one collider first touches a third actor in N replays, in seconds, shape (N,).
 
-    They are inf if the two never touch, or touch in the recording too.
+    Times are inf if the two never touch, or also touch in the recording.
     """
     paths = np.stack([accident.paths[member], other.path])
     pair = pair_of(paths, [accident.sizes[member, :2], other.size], margin=_CONTACT_GAP_M)
-    # one row for each replay, and a last one for the recording
+    # The additional last row is the recording.
     pair_starts = np.full((len(starts) + 1, 2), np.inf)
     pair_starts[:-1, 0] = starts[:, member]
     times = contact_times(pair, pair_starts, np.append(decelerations, 1.0), window=other.window)
@@ -423,40 +425,46 @@ def _new_contacts(
     return np.full(len(starts), np.inf)
 
 
-def _others(accident: Accident, tracks: ScenarioTracks) -> Iterator[_Other]:
+def _other_actors(accident: Accident, tracks: ScenarioTracks) -> Iterator[_OtherActor]:
+    """Yield all actors, except the colliders, that are labelled in at least two frames."""
     frames = np.arange(accident.first_frame, accident.last_frame + 1)
-    within = (tracks.index >= frames[0]) & (tracks.index <= frames[-1])
-    for actor in np.unique(tracks.actor_id[within]).tolist():
-        rows = np.flatnonzero(within & (tracks.actor_id == actor))
-        if actor not in accident.actor_ids and len(rows) >= 2:
-            yield _other(tracks, rows, frames)
+    is_within = (tracks.index >= frames[0]) & (tracks.index <= frames[-1])
+    for actor in np.unique(tracks.actor_id[is_within]).tolist():
+        rows = np.flatnonzero(is_within & (tracks.actor_id == actor))
+        if actor in accident.actor_ids or len(rows) < 2:
+            continue
+        first_row = rows[0]
+        last_row = rows[-1]
+        start = (tracks.index[first_row] - frames[0]) * FRAME_PERIOD
+        end = (tracks.index[last_row] - frames[0]) * FRAME_PERIOD
+        # An actor that is still labelled at the impact can be hit in the continuation after it.
+        if tracks.index[last_row] == frames[-1]:
+            end = end + HORIZON
+        yield _OtherActor(
+            actor_id=actor,
+            category=CATEGORIES[int(tracks.boxes.category[last_row])],
+            path=recorded_path(tracks, rows, frames),
+            size=np.median(tracks.boxes.size[rows, :2], axis=0),
+            window=(float(start), float(end)),
+        )
 
 
-def _other(tracks: ScenarioTracks, rows: IntArray, frames: IntArray) -> _Other:
-    start, end = ((tracks.index[row] - frames[0]) * FRAME_PERIOD for row in (rows[0], rows[-1]))
-    if tracks.index[rows[-1]] == frames[-1]:
-        end = end + HORIZON
-    return _Other(
-        actor_id=int(tracks.actor_id[rows[0]]),
-        category=CATEGORIES[int(tracks.boxes.category[rows[-1]])],
-        path=recorded_path(tracks, rows, frames),
-        size=np.median(tracks.boxes.size[rows, :2], axis=0),
-        window=(float(start), float(end)),
-    )
+def _may_meet(path: FloatArray, size: FloatArray, other: _OtherActor) -> bool:
+    """Return whether a collider and a third actor can touch at all.
 
-
-def _may_meet(path: FloatArray, size: FloatArray, other: _Other) -> bool:
-    """Return whether the two can touch at all.
-
-    A braking actor is where it was recorded, or earlier on its path.
+    When it brakes, the collider is where it was recorded, or further back on its path.
     """
-    positions, other_positions = _positions(path), _positions(other.path)
-    offsets = positions[:, None] - other_positions[None]
-    distances = np.hypot(*offsets.transpose(2, 0, 1))
+    positions = _extended_positions(path)
+    other_positions = _extended_positions(other.path)
+    offsets = positions[:, None] - other_positions
+    distances = np.hypot(offsets[..., 0], offsets[..., 1])
+    sum_of_diagonals = np.hypot(*size[:2]) + np.hypot(*other.size)
     steps = _longest_step(positions) + _longest_step(other_positions)
-    max_distance = (np.hypot(*size[:2]) + np.hypot(*other.size)) / 2 + steps
-    not_ahead = np.arange(len(positions))[:, None] <= np.arange(len(other_positions)) + 1
-    return bool((not_ahead & (distances <= max_distance)).any())
+    is_near = distances <= sum_of_diagonals / 2 + steps
+    frames = np.arange(len(positions))
+    other_frames = np.arange(len(other_positions))
+    is_not_ahead = frames[:, None] <= other_frames + 1
+    return bool((is_not_ahead & is_near).any())
 
 
 def _longest_step(positions: FloatArray) -> Any:
@@ -464,10 +472,11 @@ def _longest_step(positions: FloatArray) -> Any:
     return np.hypot(*steps.T).max()
 
 
-def _positions(path: FloatArray) -> FloatArray:
-    """Return positions at each frame of the recording and of its continuation."""
+def _extended_positions(path: FloatArray) -> FloatArray:
+    """Return the positions in each frame of the recording, and of its straight continuation."""
     count = round(HORIZON / FRAME_PERIOD)
-    last_step = path[-1, :2] - path[-2, :2]
+    positions = path[:, :2]
+    last_step = positions[-1] - positions[-2]
     steps = np.arange(1, count + 1)[:, None]
-    continuation = path[-1, :2] + steps * last_step
-    return np.concatenate([path[:, :2], continuation])
+    continuation = positions[-1] + steps * last_step
+    return np.concatenate([positions, continuation])

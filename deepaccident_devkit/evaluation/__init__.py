@@ -1,8 +1,8 @@
-"""The released metrics, the paper's, and metrics of other codes: see the packages of the tasks.
+"""The metrics of the released code, of the paper, and of other public implementations.
 
-Each task has a package, which counts arrays and sums the counts; `results` are predictions in
-files; `runs` evaluates them into bundles that others can check, and looks for mistakes in
-predictions (`runs.sanity`). `breakdown` sums by attribute.
+Each task has a package that counts samples and sums the counts. `results` reads and writes files of
+predictions. `runs` evaluates them to bundles that others can check, and looks for mistakes in
+predictions (`runs.sanity`). `breakdown` groups results by attribute.
 """
 
 from deepaccident_devkit.evaluation.accident import (

@@ -1,7 +1,5 @@
 """Alarms in predictions: explicit accidents, or accidents in motion maps, and their actors."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np
@@ -23,7 +21,7 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 # Seconds from one frame of the released labels to the next.
 LABEL_STEP: Final = 0.5
-# Metres: gate of the matches that decide which actors an alarm names.
+# An alarm only names actors that are at most this far away, metres.
 MATCH_DISTANCE: Final = 4.0
 # Alarms with a lower score do not count.
 MIN_SCORE: Final = 0.0
@@ -31,7 +29,7 @@ MIN_SCORE: Final = 0.0
 Pair = tuple[int | None, int | None]
 # An alarm and the actors that it names.
 NamedAlarm = tuple[Accident, Pair]
-_RELEASED_LABELS: Final = MotionLabelConfig()
+_RELEASED_LABELS = MotionLabelConfig()
 
 
 def named_alarms(
@@ -40,73 +38,76 @@ def named_alarms(
     truth: BoxTruth,
     reading: AccidentReading,
 ) -> list[NamedAlarm]:
-    """Return the alarms of one sample with the actors that they name, the surest first.
+    """Return the alarms of one sample, in descending order of score, with the actors they name.
 
-    Of equally sure alarms the earliest comes first. K motion predictions are at most one alarm,
-    scored by the share of them that have an accident. The mean sample (the last) gives place and
-    time, or if it has no accident, the first that has one. An explicit accident without `ids`
-    (actor ids) names the two actors with the box centres nearest to its positions at its time (at
-    the last moment of the truth, if it is for later).
+    Alarms with equal scores are ordered by time. K motion predictions raise at most one alarm; its
+    score is the share of the predictions that contain an accident. The mean prediction (the last)
+    sets the positions and the time; if it contains no accident, the first prediction that contains
+    one does. An explicit accident without `ids` (actor ids) names the two actors whose box centres
+    are nearest to its positions at its time, or in the last frame of the truth if it is later.
 
     Args:
         prediction: Motion in maps, or explicit accidents.
-        label: Labels that define how far apart in time maps are and where instances lie within
-            their cells; None for the released convention.
-        truth: Truth with the actors that can be named.
-        reading: How an accident is read off maps.
+        label: Labels that define the time between maps, and where instances lie within their cells;
+            None for the released convention.
+        truth: Boxes of the actors that can be named.
+        reading: Definition of an accident in maps.
     """
     if isinstance(prediction, MotionOutput):
-        config = label.config if label else _RELEASED_LABELS
-        alarms = _alarms_of_maps(prediction, config, truth, reading)
+        config = _RELEASED_LABELS
+        if label:
+            config = label.config
+        alarms = _read_map_alarm(prediction, config, truth, reading)
     else:
-        alarms = [(accident, _named(accident, truth)) for accident in prediction]
-    counted = [alarm for alarm in alarms if alarm[0].score >= MIN_SCORE]
-    return sorted(counted, key=lambda alarm: by_sureness(alarm[0]))
+        alarms = [(accident, _name_actors(accident, truth)) for accident in prediction]
+    counted_alarms = [alarm for alarm in alarms if alarm[0].score >= MIN_SCORE]
+    return sorted(counted_alarms, key=lambda alarm: alarm_sort_key(alarm[0]))
 
 
 def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:
-    """Return the alarms up to half a recorded frame after the horizon; others do not count."""
+    """Return the alarms whose time is at most half a recorded frame after the horizon."""
     latest = truth.horizon + TIME_TOLERANCE_S
     return [alarm for alarm in alarms if alarm[0].time <= latest]
 
 
-def by_sureness(alarm: Accident) -> tuple[Any, ...]:
-    """Return the sort key for the surest alarm first, of equally sure ones the earliest.
+def alarm_sort_key(alarm: Accident) -> tuple[Any, ...]:
+    """Return a key that sorts alarms in descending order of score, then by time.
 
-    Its other parts make the order independent of the list's order.
+    Further parts of the key make the result independent of the order of the list.
     """
-    return -alarm.score, alarm.time, alarm.positions.tolist(), alarm.ids or ()
+    positions = alarm.positions.tolist()
+    ids = alarm.ids or ()
+    return -alarm.score, alarm.time, positions, ids
 
 
 def nearest_two(positions: FloatArray, identity: IntArray, center: FloatArray, gate: float) -> Pair:
-    """Return the two actors nearest to two positions, by the least sum of distances.
+    """Return the ids of the two actors nearest to two positions, by the smallest sum of distances.
 
     Args:
         positions: (2, 2) x forward, y left, metres.
         identity: (I,) int64 ids of actors that can be named, ascending.
-        center: (I, 2) their positions, in the same frame; NaN where an actor is missing.
-        gate: Metres: an actor that is farther away is not named.
+        center: (I, 2) positions of these actors, in the same frame; NaN where one is missing.
+        gate: An actor that is farther away than this is not named, metres.
     """
     position_tracks = InstanceTracks(identity=np.arange(2), center=positions[None])
-    match = match_tracks(
-        position_tracks, InstanceTracks(identity=identity, center=center[None]), gate
-    )
-    return match.get(0), match.get(1)
+    actor_tracks = InstanceTracks(identity=identity, center=center[None])
+    actor_by_position = match_tracks(position_tracks, actor_tracks, gate)
+    return actor_by_position.get(0), actor_by_position.get(1)
 
 
 def position_difference(first: FloatArray, second: FloatArray) -> float:
-    """Return the difference of two pairs of positions (2, 2), metres.
+    """Return the difference in metres between two pairs of positions, shape (2, 2) each.
 
-    It is the sum of the two distances, in the order that fits better.
+    It is the sum of the two distances, for the better of the two ways to pair the positions.
     """
-    apart = np.linalg.norm(first[:, None] - second, axis=-1)
-    in_order = apart.trace()
-    in_reverse = apart[::-1].trace()
-    return float(min(in_order, in_reverse))
+    distances = np.linalg.norm(first[:, None] - second, axis=-1)
+    sum_in_order = distances.trace()
+    sum_in_reverse = distances[::-1].trace()
+    return float(min(sum_in_order, sum_in_reverse))
 
 
-def _named(alarm: Accident, truth: BoxTruth) -> Pair:
-    """Return the actors that an explicit accident names."""
+def _name_actors(alarm: Accident, truth: BoxTruth) -> Pair:
+    """Return the ids of the two actors that an explicit accident names; None for an unknown one."""
     if alarm.ids is not None:
         return alarm.ids
     frame = min(round(alarm.time / FRAME_PERIOD), len(truth.time) - 1)
@@ -117,34 +118,38 @@ def _named(alarm: Accident, truth: BoxTruth) -> Pair:
 def foreseen_accident(
     output: MotionOutput, *, step: float = LABEL_STEP, labels: str | None = "released"
 ) -> Accident | None:
-    """Return the accident that K motion predictions foresee together, as the protocol `boxes` does.
+    """Merge the accidents in K motion predictions to a single one, as the protocol `boxes` does.
 
-    Its score is the share of the predictions that have one. The mean sample (the last) gives place
-    and time or, if it has none, the first that has one.
+    Its score is the share of the predictions that contain an accident. The mean prediction (the
+    last) sets the positions and the time; if it contains no accident, the first prediction that
+    contains one does.
 
     Args:
         output: Predictions of a sample.
         step: Seconds from one frame to the next.
-        labels: Protocol of the labels that the predictions are, or were learned from: where it has
-            the half-cell shift, that is undone in positions. None for predictions without any.
+        labels: Protocol of the labels that the model was trained on, or that the maps were made
+            from. If it shifts maps by half a cell, the shift is undone in positions. None if there
+            are no such labels.
 
     Returns:
-        The accident without ids, which maps do not know; None if no prediction has one.
+        The accident, without ids, since maps have no actor ids; None if no prediction has one.
 
     Raises:
-        ChoiceError: no such labels.
+        ChoiceError: If the label protocol does not exist.
     """
     labels = choice("labels", labels, (None, *LABEL_PROTOCOLS))
     rules = None if labels is None else LABEL_PROTOCOLS[labels]
     predictions = predicted_accidents(output, rules, AccidentReading())
-    accidents = _mean_first(predictions)
-    return _joint(accidents, len(predictions), step) if accidents else None
+    accidents = _list_accidents(predictions)
+    if not accidents:
+        return None
+    return _merge_accidents(accidents, len(predictions), step)
 
 
-def _mean_first(
+def _list_accidents(
     predictions: list[InstanceAccident],
 ) -> list[tuple[InstanceAccident, MapContact]]:
-    """Return the predictions with an accident, and their contacts; the mean's comes first."""
+    """Return the predictions that contain an accident, with their contacts; the mean is first."""
     accidents = []
     for prediction in (*predictions[-1:], *predictions[:-1]):
         if prediction.contact is not None:
@@ -152,26 +157,27 @@ def _mean_first(
     return accidents
 
 
-def _joint(
+def _merge_accidents(
     accidents: list[tuple[InstanceAccident, MapContact]], prediction_count: int, step: float
 ) -> Accident:
-    """Return the first accident, with the share of predictions that have one as its score."""
+    """Return the first accident, with the share of the predictions that have one as its score."""
     accident, contact = accidents[0]
     score = len(accidents) / prediction_count
     return Accident(positions=accident.positions, time=contact.frame * step, score=score)
 
 
-def _alarms_of_maps(
+def _read_map_alarm(
     output: MotionOutput, config: MotionLabelConfig, truth: BoxTruth, reading: AccidentReading
 ) -> list[NamedAlarm]:
-    """Return the alarm of K predictions and the actors that it names; empty without one."""
-    seconds = config.step * FRAME_PERIOD
+    """Return a list with the single alarm that K predictions raise; empty if they raise none."""
+    step_s = config.step * FRAME_PERIOD
     predictions = predicted_accidents(output, config.rules, reading)
-    accidents = _mean_first(predictions)
+    accidents = _list_accidents(predictions)
     if not accidents:
         return []
     accident, contact = accidents[0]
-    true_tracks = truth.tracks(seconds, len(accident.tracks.center))
-    match = match_tracks(accident.tracks, true_tracks, MATCH_DISTANCE)
-    pair = match.get(contact.ids[0]), match.get(contact.ids[1])
-    return [(_joint(accidents, len(predictions), seconds), pair)]
+    true_tracks = truth.tracks(step_s, len(accident.tracks.center))
+    actor_by_instance = match_tracks(accident.tracks, true_tracks, MATCH_DISTANCE)
+    first_id, second_id = contact.ids
+    pair = actor_by_instance.get(first_id), actor_by_instance.get(second_id)
+    return [(_merge_accidents(accidents, len(predictions), step_s), pair)]

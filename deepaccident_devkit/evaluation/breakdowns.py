@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import SampleRecord
 
 
-_FRAMES_PER_SECOND: Final = round(1 / FRAME_PERIOD)
+_FRAMES_PER_SECOND = round(1 / FRAME_PERIOD)
 NO_IMPACT: Final = "no impact"
-# Attributes that differ within a recording: of no use to a task that needs complete recordings.
+# Attributes that change within a recording; tasks that need whole recordings cannot use them.
 WITHIN_RECORDINGS: Final = ("time_to_impact", "impact_step", "time_to_end", "accident_visibility")
-# Token of a scene of our export to nuScenes, which is one agent's recording of a scenario.
-_NUSCENES_SCENE: Final = re.compile(
+# Token of a scene in our nuScenes export; a scene is one agent's recording of a scenario.
+_NUSCENES_SCENE = re.compile(
     rf"^nuscenes/(\w+_(?:accident|normal))-(.+?)(?:-(?:{'|'.join(AGENTS)}))?$"
 )
 EVERYTHING: Final = "all"
-_SAMPLE_ATTRIBUTES: Final = (
+_SAMPLE_ATTRIBUTES = (
     "agent",
     "accident_visibility",
     "time_to_impact",
     "impact_step",
     "time_to_end",
 )
-# Attributes by which results can be broken down; `all` for one group.
+# Attributes by which results can be broken down; `all` puts all samples into one group.
 ATTRIBUTES: Final = (
     EVERYTHING,
     *(name for name, field in FIELDS.items() if field.groups),
@@ -51,19 +51,22 @@ ATTRIBUTES: Final = (
 
 
 def cluster_of(scenario: str) -> str:
-    """Return the cluster of an accident and its twin, of the same junction, traffic and weather.
+    """Return the name of the cluster that an accident and its twin share.
 
-    A scene of our export to nuScenes is in the cluster of its scenario, for every agent.
+    The two have the same junction, traffic and weather. A scene of our nuScenes export belongs to
+    the cluster of its scenario, whichever agent recorded it.
 
     Args:
-        scenario: Token, such as `type1_subtype1_accident/Town03…`, or
-            `nuscenes/type1_subtype1_accident-Town03…-ego_vehicle` for the export.
+        scenario: Token of a scenario, such as `type1_subtype1_accident/Town03…`, or of a scene in
+            our export, such as `nuscenes/type1_subtype1_accident-Town03…-ego_vehicle`.
 
     Returns:
-        The token without the ending of its type: `type1_subtype1/Town03…`.
+        The token without `_accident` or `_normal`: `type1_subtype1/Town03…`.
     """
-    kind, slash, name = _NUSCENES_SCENE.sub(r"\1/\2", scenario).partition("/")
-    return f"{kind.rpartition('_')[0] or kind}{slash}{name}"
+    token = _NUSCENES_SCENE.sub(r"\1/\2", scenario)
+    scenario_type, slash, name = token.partition("/")
+    family = scenario_type.rpartition("_")[0] or scenario_type
+    return f"{family}{slash}{name}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,15 +74,15 @@ class SampleAttributes(ShortRepr):
     """The attributes of a sample.
 
     Attributes:
-        scenario: Token of its scenario.
-        agent: Name of its agent.
-        story: Values of its scenario, by name (`deepaccident_devkit.selection` explains them); None
-            for unknown ones.
+        scenario: Token of the scenario.
+        agent: Name of the agent.
+        story: Attributes of the scenario, by name (`deepaccident_devkit.selection` explains them);
+            None for unknown values.
         accident_visibility: `visible` or `invisible`, by the released rule
-            (`v2x.accident_visible`); None where that is not known.
-        time_to_impact: `k s`: the recorded impact is more than k − 1 s ahead and at most k s; `no
-            impact` if nobody collides, None without meta.
-        impact_step: The same in steps of 0.5 s.
+            (`v2x.accident_visible`); None if unknown.
+        time_to_impact: `k s` if the recorded impact is more than k − 1 s and at most k s ahead; `no
+            impact` if there is no collision; None if the scenario has no meta file.
+        impact_step: Time to the impact in steps of 0.5 s, otherwise like `time_to_impact`.
         time_to_end: Seconds to the scenario's last frame, such as `1.5`, as in the released
             evaluation.
     """
@@ -93,7 +96,7 @@ class SampleAttributes(ShortRepr):
     time_to_end: str
 
     def value(self, name: str) -> str | None:
-        """Return the value of one of `ATTRIBUTES`; None if it is not known. Raises ChoiceError."""
+        """Return an attribute's value, None if unknown; raise ChoiceError for any other name."""
         if name not in ATTRIBUTES:
             name = attribute_name(name)
         if name == EVERYTHING:
@@ -105,65 +108,67 @@ class SampleAttributes(ShortRepr):
 
 
 def attribute_name(name: str) -> str:
-    """Return the one of `ATTRIBUTES` that a name stands for, in any case; an old name warns.
+    """Return the member of `ATTRIBUTES` with a name, ignoring case.
+
+    Former names of attributes are accepted, too, with a warning.
 
     Raises:
-        ChoiceError: no such attribute.
+        ChoiceError: If no attribute has this name.
     """
     return choice("by", full_name(name), ATTRIBUTES)
 
 
 def sample_attributes(dataset: Dataset, tokens: Iterable[str]) -> dict[str, SampleAttributes]:
-    """Return the attributes of samples, by token.
+    """Look up the attributes of samples, by token.
 
     Raises:
-        TokenError: no such sample.
+        TokenError: If the release does not have a sample.
     """
     stories: dict[str, dict[str, str | None]] = {}
-    result = {}
+    attributes = {}
     for token in tokens:
         sample = dataset.sample.get(token)
         scenario = sample["scenario_token"]
         if scenario not in stories:
             stories[scenario] = group_texts(dataset, dataset.scenario.get(scenario))
         is_visible = accident_visible(dataset, token)
-        result[token] = _attributes(sample, stories[scenario], visible=is_visible)
-    return result
+        attributes[token] = _make_attributes(sample, stories[scenario], visible=is_visible)
+    return attributes
 
 
 def tokens_by_value(
     attributes: Mapping[str, SampleAttributes], name: str
 ) -> dict[str | None, list[str]]:
-    """Return the samples of each value of an attribute; values in order of appearance.
+    """Group tokens by the samples' value of an attribute, in order of appearance.
 
     Raises:
-        ChoiceError: no such attribute.
+        ChoiceError: If the attribute does not exist.
     """
     name = attribute_name(name)
-    result: dict[str | None, list[str]] = {}
+    tokens: dict[str | None, list[str]] = {}
     for token, sample in attributes.items():
-        result.setdefault(sample.value(name), []).append(token)
-    return result
+        tokens.setdefault(sample.value(name), []).append(token)
+    return tokens
 
 
 def time_bin(frames: int, width: int) -> str:
-    """Return the bin of a time as the end of the bin: `2 s`, `0.5 s`.
+    """Return the name of the bin that contains a time: the bin's upper end, such as `0.5 s`.
 
     Args:
         frames: Time as a number of recorded frames.
         width: Number of frames in a bin.
     """
-    bins = -(-frames // width)
+    bins = -(-frames // width)  # rounded up
     return f"{bins * width / _FRAMES_PER_SECOND:g} s"
 
 
-def _attributes(
+def _make_attributes(
     sample: SampleRecord, story: Mapping[str, str | None], *, visible: bool | None
 ) -> SampleAttributes:
-    """Return the attributes of a sample from its record and the values of its scenario."""
-    ahead = sample["time_to_impact"]
-    if ahead is not None:
-        frames = round(ahead * _FRAMES_PER_SECOND)
+    """Build the attributes of a sample from its record and the attributes of its scenario."""
+    seconds = sample["time_to_impact"]
+    if seconds is not None:
+        frames = round(seconds * _FRAMES_PER_SECOND)
         time_to_impact: str | None = time_bin(frames, _FRAMES_PER_SECOND)
         impact_step: str | None = time_bin(frames, _FRAMES_PER_SECOND // 2)
     else:
@@ -188,17 +193,17 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group(FrozenMappings, Generic[_Result]):
-    """The samples that share a value.
+    """The samples that share one value of an attribute.
 
     Attributes:
-        value: Value of the attribute; None for samples without a known value.
+        value: Value of the attribute; None for samples with an unknown value.
         result: Result of these samples only.
         samples: Number of samples.
-        scenarios: Number of their scenarios.
-        clusters: Number of clusters, where an accident and its twin are one (`cluster_of`).
-        intervals: Path of a number (`ranges/30x30/iou`) → (low, high); numbers without an interval
-            are missing, such as NaN and all numbers of fewer than 6 clusters.
-        notes: Sentences on why numbers have no interval.
+        scenarios: Number of scenarios that the samples belong to.
+        clusters: Number of clusters; an accident and its twin are one (`cluster_of`).
+        intervals: Path of a number (`ranges/30x30/iou`) → (low, high). Numbers without an interval
+            are left out: numbers that are NaN, and all numbers if there are fewer than 6 clusters.
+        notes: Sentences that explain why numbers have no interval.
     """
 
     value: str | None
@@ -216,9 +221,9 @@ class Breakdown(FrozenMappings, Generic[_Result]):
 
     Attributes:
         by: Name of the attribute.
-        groups: Groups of all samples, by value; agents in the order of `taxonomy.AGENTS`.
-        without_infrastructure: The same without the samples of the roadside pole, which no vehicle
-            drives.
+        groups: One group per value, over all samples; agents in the order of `taxonomy.AGENTS`.
+        without_infrastructure: The same groups without the samples of the infrastructure, which is
+            not a vehicle.
         resampling: Settings of the intervals.
     """
 
@@ -234,20 +239,21 @@ def breakdown(
     by: str,
     resampling: Resampling | None = None,
 ) -> Breakdown[_Result]:
-    """Return the results of an evaluator's samples, by the values of an attribute.
+    """Compute the results of an evaluator's samples for each value of an attribute.
 
-    The result has the same bits for any order of the samples, of the attributes, and of the parts
-    that were merged.
+    The numbers are identical for any order of the samples, of the attributes, and of merged
+    evaluators.
 
     Args:
         evaluator: Evaluator with all samples counted.
-        attributes: Attributes of its samples, from `sample_attributes`; other samples are ignored.
-        by: One of `ATTRIBUTES`; `all` for one group.
+        attributes: Attributes of its samples, from `sample_attributes`; other samples are
+            ignored.
+        by: One of `ATTRIBUTES`; `all` puts all samples into one group.
         resampling: Settings of the intervals; None for the defaults.
 
     Raises:
-        ChoiceError: no such attribute.
-        EvaluationError: a sample's attributes are missing.
+        ChoiceError: If the attribute does not exist.
+        EvaluationError: If a sample's attributes are missing.
     """
     by = attribute_name(by)
     missing = sorted(evaluator.tokens - attributes.keys())
@@ -262,10 +268,10 @@ def breakdown(
         if sample.agent != INFRASTRUCTURE:
             vehicles[token] = sample
     settings = resampling or Resampling()
-    groups = _groups(evaluator, evaluated, by, settings)
+    groups = _group_samples(evaluator, evaluated, by, settings)
     without_infrastructure = groups
     if len(vehicles) != len(evaluated):
-        without_infrastructure = _groups(evaluator, vehicles, by, settings)
+        without_infrastructure = _group_samples(evaluator, vehicles, by, settings)
     return Breakdown(
         by=by,
         groups=groups,
@@ -274,33 +280,34 @@ def breakdown(
     )
 
 
-def _groups(
+def _group_samples(
     evaluator: Evaluator[_Result],
     attributes: Mapping[str, SampleAttributes],
     by: str,
     resampling: Resampling,
 ) -> tuple[Group[_Result], ...]:
-    """Return the groups of samples by the values of an attribute, in natural order."""
-    by_value = tokens_by_value(attributes, by)
-    ordered: list[str | None] = sorted(by_value, key=natural_order)
+    """Group samples by the values of an attribute; groups are in natural order of the values."""
+    tokens = tokens_by_value(attributes, by)
+    values: list[str | None] = sorted(tokens, key=natural_order)
     if by == "agent":
-        ordered.sort(key=AGENTS.index)
+        values.sort(key=AGENTS.index)
     groups = []
-    for value in ordered:
-        groups.append(_group(evaluator, value, by_value[value], attributes, resampling))
+    for value in values:
+        groups.append(_make_group(evaluator, value, tokens[value], attributes, resampling))
     return tuple(groups)
 
 
-def _group(
+def _make_group(
     evaluator: Evaluator[_Result],
     value: str | None,
     tokens: Sequence[str],
     attributes: Mapping[str, SampleAttributes],
     resampling: Resampling,
 ) -> Group[_Result]:
-    """Return one group of samples with its result and intervals."""
-    names = {token: cluster_of(attributes[token].scenario) for token in tokens}
-    clusters = evaluator.clustered(dict(sorted(names.items(), key=itemgetter(1))))
+    """Compute the result and the intervals of one group of samples."""
+    cluster_by_token = {token: cluster_of(attributes[token].scenario) for token in tokens}
+    ordered_clusters = dict(sorted(cluster_by_token.items(), key=itemgetter(1)))
+    clusters = evaluator.clustered(ordered_clusters)
     result = evaluator.compute(tokens)
     intervals = intervals_of(evaluator, clusters, result, resampling)
     return Group(

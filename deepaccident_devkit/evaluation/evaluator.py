@@ -1,11 +1,9 @@
-"""`Evaluator`: one task, from a sample's prediction and truth to counts, then to a result.
+"""`Evaluator`: the base of all tasks; it turns samples into counts, and counts into a result.
 
-Results do not depend on the order of samples or on how many workers counted them, memory grows with
-the counts only, and any selection of the samples can be summed (see `breakdown`).
+Results do not depend on the order of samples or on the number of workers, memory grows only with
+the counts, and any selection of the samples can be summed (see `breakdown`).
 `counting.evaluate_samples` updates an evaluator with many samples.
 """
-
-from __future__ import annotations
 
 import math
 from abc import abstractmethod
@@ -25,34 +23,34 @@ EvaluatorT = TypeVar("EvaluatorT", bound="Evaluator[Any]")
 
 
 class Evaluator(SampleCounts, Generic[_Result]):
-    """One task: the truth of its predictions, what a sample adds, and the result of many samples.
+    """Base class of evaluators, which count samples and compute a result from the counts.
 
-    A new task is a subclass in a folder of its own, and its name in the tuple of
-    `runs.setups.TASKS`. It defines:
+    A new task is a subclass in its own folder, and is listed in `runs.setups.TASKS`. It defines:
 
-    - its facts, the class attributes below;
-    - `truth`: what the prediction of a sample is compared with;
-    - `update`: what the sample adds, as `add` keeps it;
-    - `result_of`: the result of the counts of some samples, with `rows` that describe its numbers.
+    - the class attributes below;
+    - `truth`, which returns what the prediction for a sample is compared with;
+    - `update`, which counts a sample and passes the counts to `add`;
+    - `result_of`, which computes the result from the counts of samples; the result's `rows`
+      describe its numbers.
 
     All other methods have a default. Pictures of a result are drawn in `render.evaluation`, from
-    the result and from `counts`. Evaluators that are not tasks, for numbers beside the ones of a
-    task, need only `settings`, `update` and `result_of`.
+    the result and from `counts`. Evaluators that are not tasks, but add numbers to a task's
+    numbers, only need `settings`, `update` and `result_of`.
 
     Attributes:
         task: Name of the task.
-        description: One line on the task for the command line.
-        result_kinds: Kinds of results files that the task is evaluated from.
-        protocols: Rules of the metrics by name, frozen dataclasses; the first is the default.
+        description: Description of the task in one line, for the command line.
+        result_kinds: Kinds of results files from which the task can be evaluated.
+        protocols: Name → rules of the metrics, which are frozen dataclasses; the first is the
+            default.
         result_class: Class of the results, or the base of their classes.
-        main_numbers: Paths of the headlines that are shown by attribute; samples are ranked by the
-            first.
-        needs_whole_recordings: Whether whole recordings are followed, so that attributes within
-            them are of no use.
-        needs_meta: Whether the truth is in the scenarios' meta files.
-        vehicles_only: Whether the roadside has no such predictions.
+        main_numbers: Paths of the headlines that breakdowns show; samples are ranked by the first.
+        needs_whole_recordings: Whether the task follows whole recordings; then it cannot be broken
+            down by attributes that change within a recording.
+        needs_meta: Whether the truth is read from the scenarios' meta files.
+        vehicles_only: Whether only vehicles have such predictions, but not the infrastructure.
         has_horizon: Whether predictions look ahead to the horizon of a setup.
-        protocol: The rules of this evaluator.
+        protocol: Rules of this evaluator.
     """
 
     task: ClassVar[str]
@@ -69,14 +67,14 @@ class Evaluator(SampleCounts, Generic[_Result]):
     protocol: Any
 
     def __init__(self, protocol: Any = "") -> None:
-        """Start without samples.
+        """Create an evaluator without samples.
 
         Args:
-            protocol: Name of one of `protocols`, or rules of the same class; empty for the first
-                protocol.
+            protocol: Name of one of `protocols`, or rules of the same class; an empty name selects
+                the first protocol.
 
         Raises:
-            ChoiceError: no protocol has that name, or the rules are of another class.
+            ChoiceError: If no protocol has this name, or the rules have another class.
         """
         super().__init__()
         if protocol == "":
@@ -84,10 +82,10 @@ class Evaluator(SampleCounts, Generic[_Result]):
         else:
             self.protocol = protocol_of(protocol, self.protocols)
 
-    # What a task defines
+    # Methods that a task defines
 
     def truth(self, dataset: Dataset, token: str, form: Any, horizon: float, /) -> tuple[Any, ...]:
-        """Return the arguments of `update` after the prediction; only tasks have them.
+        """Load the arguments of `update` that follow the prediction; only tasks define this method.
 
         Args:
             dataset: Release with the labels.
@@ -99,66 +97,67 @@ class Evaluator(SampleCounts, Generic[_Result]):
 
     @abstractmethod
     def update(self, token: str, *arguments: Any) -> None:
-        """Count one sample: its token, prediction and truth; passes the counts to `add`."""
+        """Count one sample from its token, prediction and truth; pass the counts to `add`."""
 
     @abstractmethod
     def result_of(self, counts: Collection[Counts]) -> _Result:
-        """Return the metrics of some samples' counts, in any order."""
+        """Compute the metrics from the counts of samples, in any order."""
 
-    # What a task can change
+    # Methods that a task can override
 
     def read(self, results: Any, dataset: Dataset, token: str) -> Any:  # noqa: ARG002 - boxes need the data set
-        """Return the prediction of a sample in a results file, as `update` takes it."""
+        """Read the prediction for a sample from results, in the form that `update` expects."""
         return results.prediction(token)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The protocol's choices."""
+        """Names and values of the protocol's fields."""
         return dict(plain(self.protocol))
 
     def sample_row(self, token: str) -> dict[str, Any]:
-        """Return the columns of one sample in the table of samples: its own headlines."""
+        """Return a sample's row in the table of samples; by default it contains the headlines."""
         result: Any = self.compute([token])
         return {number.name: number.value for number in headlines(result)}
 
     def compute(self, tokens: Iterable[str] | None = None) -> _Result:
-        """Return the metrics of all samples, or of some.
+        """Compute the metrics of all samples, or only of some.
 
         Args:
             tokens: Tokens of the samples; None for all.
 
         Raises:
-            EvaluationError: a sample was not counted, or a token is no text.
+            EvaluationError: If a sample was not counted, or a token is not a string.
         """
         if tokens is None:
             return self.result_of(list(self._counts.values()))
         if isinstance(tokens, str) or not isinstance(tokens, Iterable):
             raise EvaluationError(
-                f"tokens: expected several of them, found {tokens!r}; give [token] for one"
+                f"tokens: expected a list of tokens, found {tokens!r}; put a single token "
+                "into a list"
             )
-        selected: list[Any] = list(tokens)
-        for token in selected:
+        selected_tokens: list[Any] = list(tokens)
+        for token in selected_tokens:
             if not isinstance(token, str):
-                raise EvaluationError(f"tokens: expected texts, found {token!r} among them")
-        missing = sorted(set(selected) - self._counts.keys())
+                raise EvaluationError(f"tokens: expected text, found {token!r} among them")
+        missing = sorted(set(selected_tokens) - self._counts.keys())
         if missing:
             raise EvaluationError(
                 f"{len(missing)} samples have no prediction, such as {missing[0]}"
             )
-        return self.result_of([self._counts[token] for token in set(selected)])
+        return self.result_of([self._counts[token] for token in set(selected_tokens)])
 
-    # How intervals and tests draw samples again and again
+    # Methods that resample the counts, for intervals and tests
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Return fewer counts with the same result, for many results of these samples.
+        """Merge counts into fewer ones with the same result, so that they are fast to resample.
 
-        A subclass with sums as counts adds them up; by default they stay apart.
+        A subclass whose counts are sums adds them up; by default they are returned unchanged.
         """
         return list(counts)
 
     @property
     def has_intervals(self) -> bool:
-        """Whether numbers can be computed many times; otherwise they have no intervals or tests."""
+        """Whether the result can be resampled, as intervals and tests require."""
         return True
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[_Result]:
@@ -166,14 +165,14 @@ class Evaluator(SampleCounts, Generic[_Result]):
 
         Args:
             parts: Counts of P groups of samples; each group is drawn as a whole.
-            times: How often each group is drawn, shape (D, P).
+            times: (D, P) how often each draw contains each group.
         """
-        pooled = [self.pooled(part) for part in parts]
+        pooled_parts = [self.pooled(part) for part in parts]
         for draw in times.tolist():
-            repeated = [
-                part for part, count in zip(pooled, draw, strict=True) for _ in range(count)
-            ]
-            yield self.result_of([counts for part in repeated for counts in part])
+            drawn_counts: list[Counts] = []
+            for part, repetitions in zip(pooled_parts, draw, strict=True):
+                drawn_counts += [*part] * repetitions
+            yield self.result_of(drawn_counts)
 
     def drawn_numbers(
         self,
@@ -181,18 +180,20 @@ class Evaluator(SampleCounts, Generic[_Result]):
         times: IntArray,  # noqa: ARG002
         names: Sequence[str],  # noqa: ARG002
     ) -> FloatArray | None:
-        """Return M numbers in each of D draws, shape (D, M), NaN for none.
+        """Compute M numbers in each of D draws, shape (D, M); missing numbers are NaN.
 
-        None to use `resampled`.
+        Return None if the numbers can only be taken from `resampled`.
         """
         return None
 
 
 def ratio(part: float, whole: float) -> float:
-    """Return `part / whole`; NaN if there is nothing to count."""
-    return part / whole if whole else math.nan
+    """Return `part / whole`; NaN if `whole` is 0."""
+    if not whole:
+        return math.nan
+    return part / whole
 
 
 def total(counts: Iterable[Counts], name: str) -> float:
-    """Return the exact sum of a number over samples, the same in any order."""
+    """Sum a number over samples exactly, so that the order does not matter."""
     return math.fsum(sample[name] for sample in counts)

@@ -1,12 +1,10 @@
 """Intervals of any evaluator's numbers, from their changes when a cluster is left out (jackknife).
 
-A cluster is an accident with its twin (`breakdowns.cluster_of`): its samples show the same junction
-and traffic, so the certainty of a number depends on the number of clusters, not of samples.
-docs/numbers.md, Intervals, has the formulas; `python -m benchmarks coverage` measures their
-coverage.
+A cluster is an accident with its twin (`breakdowns.cluster_of`). Its samples show the same junction
+and traffic, so the certainty of a number depends on the number of clusters, not of samples. The
+section "Intervals" of docs/numbers.md states the formulas; `python -m benchmarks coverage` measures
+the coverage.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,42 +18,46 @@ from deepaccident_devkit.errors import ConfigError, shortened
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.task import LIMITS, Row
 from deepaccident_devkit.support.arrays import FloatArray, IntArray, as_floats
+from deepaccident_devkit.support.text import counted
 
-# The default, to evaluate and to compare, in the library and on the command line.
+# Default number of resamples for evaluations and comparisons, in the library and on the command
+# line.
 RESAMPLES: Final = 1000
-MOST_RESAMPLES: Final = 100_000
-# Fewer have no interval, since its coverage would be too low; and no test at 5 % can decide with
-# fewer.
-LEAST_CLUSTERS: Final = 6
-# Largest number of parts, to which more clusters are joined: it costs less, and t hardly changes
-# from 99 degrees of freedom on.
-_MAX_PARTS: Final = 100
-# Changes below this share of a number (or of its range) come from rounding.
-_ROUNDING_SHARE: Final = 1e-9
-# Number of numbers that a note lists by name.
-_MAX_LISTED_NAMES: Final = 3
-# Totals, settings, and medians, which jump when a cluster is left out: the jackknife does not hold
-# for them.
-_PATHS_WITHOUT_INTERVAL: Final = (
+MAX_RESAMPLES: Final = 100_000
+# Smallest number of clusters for an interval. With fewer, the coverage would be too low, and a test
+# at 5 % could never decide.
+MIN_CLUSTERS: Final = 6
+# Largest number of parts. If there are more clusters, they are joined, which saves time; t hardly
+# changes beyond 99 degrees of freedom.
+_MAX_PARTS = 100
+# Changes below this fraction of a number (or of its range) are rounding errors.
+_ROUNDING_SHARE = 1e-9
+# A note lists at most this many names.
+_MAX_LISTED_NAMES = 3
+# The jackknife is not valid for totals and settings, nor for medians, which jump when a cluster is
+# left out.
+_PATHS_WITHOUT_INTERVAL = (
     "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
     "median_*",
 )
+# Range of a number without limits.
+_NO_LIMITS = (-math.inf, math.inf)
 # The counts of each cluster's samples.
 Clusters = Sequence[Sequence[Counts]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Resampling:
-    """The settings of intervals, and of the test of two runs' difference.
+    """Settings of intervals, and of the test whether two runs differ.
 
     Attributes:
-        resamples: Largest number of resamples for intervals and tests; 0 for no intervals and no
-            tests. Numbers are computed again with a cluster left out for intervals (at most 100
-            times), with clusters swapped between two runs for a test.
-        confidence: Share of such intervals that should hold the true number; tests are at 1 −
-            confidence.
-        seed: Seed of the random choice of clusters or swaps, if there are more than are used.
+        resamples: Largest number of resamples for intervals and tests; 0 disables both. For
+            intervals, numbers are computed again without each cluster (at most 100 times); for
+            tests, with clusters swapped between two runs.
+        confidence: Share of intervals that should contain the true number; the level of tests is
+            1 − confidence.
+        seed: Seed of the random choice of clusters or swaps, if not all of them are used.
     """
 
     resamples: int = RESAMPLES
@@ -63,9 +65,9 @@ class Resampling:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
-        if type(self.resamples) is not int or not 0 <= self.resamples <= MOST_RESAMPLES:
-            expected = f"a whole number from 0 to {MOST_RESAMPLES:,}"
+        """Check the fields; raise ConfigError if one is out of range."""
+        if type(self.resamples) is not int or not 0 <= self.resamples <= MAX_RESAMPLES:
+            expected = f"a whole number from 0 to {MAX_RESAMPLES:,}"
             raise ConfigError(
                 f"resamples: expected {expected}, found {shortened(repr(self.resamples))}"
             )
@@ -86,7 +88,7 @@ class Intervals:
 
     Attributes:
         ends: Path of a number → (low, high); numbers without an interval are missing.
-        notes: Sentences on the numbers without an interval, and why.
+        notes: Sentences that say why numbers have no interval.
     """
 
     ends: Mapping[str, tuple[float, float]]
@@ -99,38 +101,40 @@ def intervals_of(
     result: object,
     resampling: Resampling | None = None,
 ) -> Intervals:
-    """Return the intervals of the numbers of a result.
+    """Compute the intervals of a result's numbers.
 
     Args:
         evaluator: Evaluator of the result.
         clusters: Counts of each cluster, always in the same order.
-        result: Result of all of them together.
+        result: Result over all clusters.
         resampling: Settings; None for the defaults.
     """
     settings = resampling or Resampling()
     if not settings.resamples:
         return Intervals(ends={}, notes=())
     if not evaluator.has_intervals:
-        return Intervals(ends={}, notes=("no intervals: this protocol has none",))
-    if len(clusters) < LEAST_CLUSTERS:
-        return Intervals(ends={}, notes=(f"no intervals: {few_clusters(len(clusters))}",))
+        return Intervals(ends={}, notes=("no confidence intervals: this protocol has none",))
+    if len(clusters) < MIN_CLUSTERS:
+        pairs = counted(len(clusters), "scenario pair")
+        note = f"no confidence intervals: {pairs}, at least {MIN_CLUSTERS} needed"
+        return Intervals(ends={}, notes=(note,))
     numbers = {}
     for name, number in numbers_of(result).items():
         if math.isfinite(number) and has_interval(name):
             numbers[name] = number
     names = list(numbers)
-    values = np.array(list(numbers.values()))
-    drawn = draws_of_parts(evaluator, clusters, names, settings)
+    values = np.array([*numbers.values()])
+    drawn_values = draws_of_parts(evaluator, clusters, names, settings)
     rows = evaluator.result_class.rows
-    low, high, having = ends_of_draws(names, values, drawn, settings.confidence, rows)
+    low, high, part_counts = ends_of_draws(names, values, drawn_values, settings.confidence, rows)
     ends: dict[str, tuple[float, float]] = {}
-    without: dict[str, int] = {}
+    parts_without_interval: dict[str, int] = {}
     for index, name in enumerate(names):
         if np.isfinite(low[index]):
             ends[name] = float(low[index]), float(high[index])
         else:
-            without[name] = int(having[index])
-    return Intervals(ends=ends, notes=tuple(_notes(without)))
+            parts_without_interval[name] = int(part_counts[index])
+    return Intervals(ends=ends, notes=tuple(_explain_missing(parts_without_interval)))
 
 
 def difference_intervals(
@@ -139,40 +143,43 @@ def difference_intervals(
     differences: Mapping[str, float],
     resampling: Resampling,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return intervals of the differences between two sets of counts of the same clusters.
+    """Compute intervals of the differences between two sets of counts for the same clusters.
 
-    The same clusters are left out of both sets.
+    Each draw leaves the same clusters out of both sets.
 
     Args:
         evaluator: Evaluator of these counts.
-        pair: For each set the counts of the same clusters, in the same order.
-        differences: Path of a number → second − first, from all clusters together.
-        resampling: Settings.
+        pair: Two sets of counts for the same clusters, in the same order.
+        differences: Path of a number → second − first, over all clusters.
+        resampling: Settings of the intervals.
 
     Returns:
-        Low and high ends, (M,) each, NaN for none (`interval_ends`), and standard errors, (M,).
+        Low and high ends, (M,) each, NaN if there is no interval (see `interval_ends`), and
+        standard errors, (M,).
     """
-    values = np.array(list(differences.values()))
-    first, second = (
-        draws_of_parts(evaluator, clusters, differences, resampling) for clusters in pair
-    )
-    drawn = second - first
-    low, high, _ = ends_of_draws(differences, values, drawn, resampling.confidence)
-    left_out = np.split(drawn, 2)[1]
-    return low, high, standard_errors(values, left_out)[0]
+    values = np.array([*differences.values()])
+    first_clusters, second_clusters = pair
+    first_values = draws_of_parts(evaluator, first_clusters, differences, resampling)
+    second_values = draws_of_parts(evaluator, second_clusters, differences, resampling)
+    drawn_values = second_values - first_values
+    low, high, _ = ends_of_draws(differences, values, drawn_values, resampling.confidence)
+    _, left_out = np.split(drawn_values, 2)
+    errors, _ = standard_errors(values, left_out)
+    return low, high, errors
 
 
 def draws_of_parts(
     evaluator: Evaluator[Any], clusters: Clusters, names: Iterable[str], resampling: Resampling
 ) -> FloatArray:
-    """Return M numbers for each of the P parts of the clusters on its own, then for all but each.
+    """Compute M numbers from each single part of the clusters, and from all parts but one.
 
     Returns:
-        Numbers, shape (2P, M).
+        Numbers, shape (2P, M). First for each of the P parts by itself, then without each part.
     """
-    parts = parts_of(clusters, resampling)
-    leave_one_out = leaving_out(len(parts))
-    return numbers_of_draws(evaluator, parts, np.vstack([1 - leave_one_out, leave_one_out]), names)
+    parts = pool_clusters(clusters, resampling)
+    leave_one_out = leave_one_out_draws(len(parts))
+    times = np.vstack([1 - leave_one_out, leave_one_out])
+    return numbers_of_draws(evaluator, parts, times, names)
 
 
 def ends_of_draws(
@@ -182,69 +189,64 @@ def ends_of_draws(
     confidence: float,
     rows: Sequence[Row] | None = None,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return intervals of numbers from draws.
+    """Compute the intervals of numbers from draws.
 
     Args:
         names: Paths of M numbers.
-        values: (M,) numbers of all parts together.
-        drawn: (2P, M) draws from `draws_of_parts`.
-        confidence: As for `interval_ends`.
-        rows: Rows of the result that the numbers are of (`range_of`); None for differences, which
-            have no limits.
+        values: (M,) numbers over all parts.
+        drawn: (2P, M) numbers from `draws_of_parts`.
+        confidence: Share of intervals that should contain the true number.
+        rows: Rows of the result that contains these numbers (see `range_of`); None for differences,
+            which have no limits.
 
     Returns:
-        Low and high ends, (M,) each (`interval_ends`), and the number of parts that have the number
-        at all, (M,).
+        Low and high ends, (M,) each (see `interval_ends`), and the number of parts that have each
+        number, (M,).
     """
     single_parts, left_out = np.split(drawn, 2)
     if rows is None:
-        ranges = [(-math.inf, math.inf)] * len(values)
+        ranges = [_NO_LIMITS] * len(values)
     else:
-        ranges = [range_of(name, draws, rows) for name, draws in zip(names, drawn.T, strict=True)]
-    having = np.isfinite(single_parts).sum(axis=0)
+        ranges = []
+        for name, drawn_values in zip(names, drawn.T, strict=True):
+            ranges.append(range_of(name, drawn_values, rows))
+    part_counts = np.isfinite(single_parts).sum(axis=0)
     limits = np.reshape(ranges, (-1, 2))
-    low, high = interval_ends(values, left_out, limits, confidence, having)
-    return low, high, having
+    low, high = interval_ends(values, left_out, limits, confidence, part_counts)
+    return low, high, part_counts
 
 
-def few_clusters(count: int) -> str:
-    """Return half a sentence on fewer clusters than intervals need."""
-    return (
-        f"of {count} cluster{'s' * (count != 1)} (an accident and its twin are one); at least "
-        f"{LEAST_CLUSTERS} are "
-        "needed"
-    )
-
-
-def parts_of(clusters: Clusters, resampling: Resampling) -> Clusters:
-    """Return the clusters, or many clusters joined at random to as many parts as fit."""
-    part_count = min(_MAX_PARTS, max(resampling.resamples, LEAST_CLUSTERS))
+def pool_clusters(clusters: Clusters, resampling: Resampling) -> Clusters:
+    """Join the clusters at random into fewer parts if there are too many."""
+    part_count = min(_MAX_PARTS, max(resampling.resamples, MIN_CLUSTERS))
     if len(clusters) <= part_count:
         return clusters
-    order = np.random.default_rng(resampling.seed).permutation(len(clusters)).tolist()
+    generator = np.random.default_rng(resampling.seed)
+    order = generator.permutation(len(clusters)).tolist()
     parts = []
     for start in range(part_count):
-        members = [clusters[index] for index in order[start::part_count]]
-        parts.append([counts for cluster in members for counts in cluster])
+        part: list[Counts] = []
+        for index in order[start::part_count]:
+            part += clusters[index]
+        parts.append(part)
     return parts
 
 
-def leaving_out(count: int) -> IntArray:
-    """Return draws of P parts, each without one of them, shape (P, P)."""
-    return 1 - np.eye(count, dtype=np.int64)
+def leave_one_out_draws(count: int) -> IntArray:
+    """Return P draws of P parts, each without one of the parts, shape (P, P)."""
+    is_left_out = np.eye(count, dtype=np.int64)
+    return 1 - is_left_out
 
 
 def numbers_of_draws(
     evaluator: Evaluator[Any], parts: Clusters, times: IntArray, names: Iterable[str]
 ) -> FloatArray:
-    """Return M numbers in each of D draws, shape (D, M), NaN for none.
-
-    The draws are made by `Evaluator.resampled`.
+    """Compute M numbers in each of D draws, shape (D, M); missing numbers are NaN.
 
     Args:
         evaluator: Evaluator of the counts.
         parts: Counts of P groups of samples.
-        times: How often each draw takes each group, shape (D, P).
+        times: (D, P) how often each draw contains each group.
         names: Paths of the numbers.
     """
     paths = list(names)
@@ -255,31 +257,32 @@ def numbers_of_draws(
     for result in evaluator.resampled(parts, times):
         numbers = numbers_of(result)
         rows.append([numbers.get(path, math.nan) for path in paths])
-    return np.array(rows).reshape(len(rows), len(paths))  # also without names
+    return np.array(rows).reshape(len(rows), len(paths))  # two axes even without names
 
 
 def standard_errors(values: FloatArray, left_out: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how much numbers vary from one set of clusters to another: the delete-one jackknife.
+    """Compute the standard errors of numbers by the delete-one jackknife.
 
     Args:
-        values: (M,) numbers of all P parts.
-        left_out: (P, M) the same numbers without each part.
+        values: (M,) numbers over all P parts.
+        left_out: (P, M) numbers without each part.
 
     Returns:
-        (M,) standard errors, NaN where a number depends on a single part; and (M,) degrees of
-        freedom of t: one less than the parts that change a number, and fewer where some change it
-        much more than others, since such an error is itself uncertain: P / (kurtosis − 1). At
-        least 1.
+        (M,) standard errors, NaN if a number depends on a single part; and (M,) degrees of freedom
+        of t, at least 1: one less than the number of parts that change the number. If some parts
+        change it much more than others, the error itself is uncertain, and the degrees of freedom
+        are reduced to P / (kurtosis − 1).
     """
     count = len(left_out)
     changes = left_out - values
     squares = changes**2
     variation = squares.sum(axis=0)
+    changing_parts = np.count_nonzero(changes, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        excess = count * (squares**2).sum(axis=0) / variation**2 - 1  # kurtosis − 1
-        changed = np.count_nonzero(changes, axis=0)
-        freedom = np.fmin(changed - 1, count / np.maximum(excess, 0))
-    return np.sqrt((count - 1) / count * variation), np.fmax(freedom, 1.0)
+        kurtosis = count * (squares**2).sum(axis=0) / variation**2
+        freedom = np.fmin(changing_parts - 1, count / np.maximum(kurtosis - 1, 0))
+    errors = np.sqrt((count - 1) / count * variation)
+    return errors, np.fmax(freedom, 1.0)
 
 
 def interval_ends(
@@ -289,21 +292,22 @@ def interval_ends(
     confidence: float,
     having: IntArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return intervals by Student's t.
+    """Compute the ends of intervals with Student's t.
 
-    Shares have Wilson's intervals, numbers from 0 on intervals of their logarithms, and other
-    numbers intervals of the numbers themselves.
+    Shares have Wilson intervals. The intervals of numbers that are never negative are computed for
+    their logarithms, and intervals of all other numbers for the numbers themselves.
 
     Args:
-        values: (M,) numbers of all P parts.
-        left_out: (P, M) the same without each part.
+        values: (M,) numbers over all P parts.
+        left_out: (P, M) numbers without each part.
         ranges: (M, 2) lowest and highest possible value; infinite for no limit.
-        confidence: Share of such intervals that should hold the true number.
-        having: (M,) number of parts that have the number at all; None for all.
+        confidence: Share of intervals that should contain the true number.
+        having: (M,) number of parts that have each number; None if all parts have all numbers.
 
     Returns:
-        (M,) low and (M,) high ends; NaN for numbers that fewer than `LEAST_CLUSTERS` parts have or
-        change: shares that are the same in all parts have an interval, other such numbers none.
+        (M,) low and (M,) high ends; NaN if fewer than `MIN_CLUSTERS` parts have or change the
+        number. A share that is the same in all parts still has an interval; other numbers that are
+        the same in all parts have none.
     """
     from scipy.special import stdtrit
 
@@ -317,15 +321,16 @@ def interval_ends(
     changing_parts = np.count_nonzero(left_out - values, axis=0)
     is_known = np.where(
         is_constant,
-        is_share & (having >= LEAST_CLUSTERS),
-        changing_parts >= LEAST_CLUSTERS,
+        is_share & (having >= MIN_CLUSTERS),
+        changing_parts >= MIN_CLUSTERS,
     )
     quantile = (1 + confidence) / 2
     t = as_floats(stdtrit(freedom, quantile))
     plain_t = as_floats(stdtrit(np.maximum(having - 1, 1), quantile))
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share_errors = np.where(is_constant, math.nan, errors / width)
-        low_share, high_share = _wilson((values - lowest) / width, share_errors, having, t, plain_t)
+        shares = (values - lowest) / width
+        low_share, high_share = _wilson_interval(shares, share_errors, having, t, plain_t)
         factors = np.exp(t * errors / values)
         kinds = [is_share, lowest == 0]
         low_ends = [lowest + width * low_share, values / factors]
@@ -336,98 +341,119 @@ def interval_ends(
     return np.where(is_known, low, math.nan), np.where(is_known, high, math.nan)
 
 
-def _wilson(
+def _wilson_interval(
     shares: FloatArray, errors: FloatArray, having: IntArray, t: FloatArray, plain_t: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Wilson's interval of as many independent draws as have these errors.
+    """Compute Wilson's interval for the number of independent draws that leads to these errors.
 
-    NaN as an error counts each part as one draw. What few degrees of freedom add is bounded by one
-    draw per part: a share is no less sure than that.
+    If an error is NaN, each part counts as one draw. Few degrees of freedom widen an interval at
+    most to the interval of one draw per part, since a share is never less certain.
+
+    Args:
+        shares: (M,) shares over all parts.
+        errors: (M,) standard errors.
+        having: (M,) number of parts that have each share.
+        t: (M,) quantiles of Student's t for the degrees of freedom of the errors.
+        plain_t: (M,) quantiles for as many degrees of freedom as there are parts, minus one.
     """
     bounded_shares = np.clip(shares, 0, 1)
-    variance = bounded_shares * (1 - bounded_shares)
+    missing_shares = 1 - bounded_shares
+    variance = bounded_shares * missing_shares
     by_errors = errors**2 / variance
     by_parts = plain_t**2 / having
     bounded = np.maximum(plain_t**2 * by_errors, np.minimum(t**2 * by_errors, by_parts))
     uncertainty = np.where(np.isnan(errors), by_parts, bounded)
-    half = np.sqrt(uncertainty * bounded_shares * (1 - bounded_shares) + uncertainty**2 / 4)
-    # the high end is 1 less the low end of the missing share: for a share of 1 it is exactly 1,
-    # however numbers are rounded
-    low = np.maximum((bounded_shares + uncertainty / 2 - half) / (1 + uncertainty), 0)
-    missing_share = 1 - bounded_shares
-    missing = np.maximum((missing_share + uncertainty / 2 - half) / (1 + uncertainty), 0)
-    return low, 1 - missing
+    half_width = np.sqrt(uncertainty * bounded_shares * missing_shares + uncertainty**2 / 4)
+    scale = 1 + uncertainty
+    low = (bounded_shares + uncertainty / 2 - half_width) / scale
+    # the high end is 1 minus the low end of the complementary share, so that it is exactly 1 for a
+    # share of 1, however numbers are rounded
+    low_missing = (missing_shares + uncertainty / 2 - half_width) / scale
+    return np.maximum(low, 0), 1 - np.maximum(low_missing, 0)
 
 
-def _notes(having: Mapping[str, int]) -> Iterator[str]:
-    """Yield why numbers have no interval.
+def _explain_missing(part_counts: Mapping[str, int]) -> Iterator[str]:
+    """Yield sentences that say why numbers have no interval.
 
     Args:
-        having: Path of a number → number of parts that have it.
+        part_counts: Path of a number without an interval → number of parts that have the number.
     """
-    few = [name for name, count in having.items() if count < LEAST_CLUSTERS]
-    alike = [name for name, count in having.items() if count >= LEAST_CLUSTERS]
-    if few:
+    in_few_parts = []
+    unchanged = []
+    for name, count in part_counts.items():
+        if count < MIN_CLUSTERS:
+            in_few_parts.append(name)
+        else:
+            unchanged.append(name)
+    if in_few_parts:
         yield (
-            f"no interval of {_listed(few)}: fewer than {LEAST_CLUSTERS} clusters have such a "
-            "number"
+            f"no interval for {_list_names(in_few_parts)}: fewer than {MIN_CLUSTERS} clusters "
+            "have such a number"
         )
-    if alike:
-        yield f"no interval of {_listed(alike)}: fewer than {LEAST_CLUSTERS} clusters change it"
+    if unchanged:
+        yield (
+            f"no interval for {_list_names(unchanged)}: fewer than {MIN_CLUSTERS} clusters change "
+            "it"
+        )
 
 
-def _listed(names: Sequence[str]) -> str:
-    """Return the names of a few numbers, and how many others there are."""
+def _list_names(names: Sequence[str]) -> str:
+    """List the first names in a text, and say how many more there are."""
     unlisted = len(names) - _MAX_LISTED_NAMES
     if unlisted <= 0:
         return ", ".join(names)
-    return f"{', '.join(names[:_MAX_LISTED_NAMES])} and {unlisted} others"
+    return f"{', '.join(names[:_MAX_LISTED_NAMES])} and {counted(unlisted, 'other')}"
 
 
 def numbers_of(result: object) -> dict[str, float]:
-    """Return the floats of a result by their path in it: `min_ade`, `ranges/30x30/iou`.
+    """Return the floats in a result by path, such as `min_ade` or `ranges/30x30/iou`.
 
-    Whole numbers, texts and None are left out.
+    Integers, texts and None are left out.
     """
-    return dict(_numbers(result, ""))
+    return dict(_walk_numbers(result, ""))
 
 
 def has_interval(path: str) -> bool:
-    """Return whether the jackknife holds for a number: not a total, a setting or a median."""
-    return not _is_one_of(path, _PATHS_WITHOUT_INTERVAL)
+    """Return whether the jackknife is valid for a number: not for totals, settings and medians."""
+    return not _fits_pattern(path, _PATHS_WITHOUT_INTERVAL)
 
 
 def range_of(path: str, values: FloatArray, rows: Sequence[Row]) -> tuple[float, float]:
     """Return the lowest and the highest possible value of a number; infinite for no limit.
 
-    Shares are in [0, 1], percents in [0, 100], other numbers with a unit from 0 on, and signed
-    numbers have no limit. A number without a row counts as a share if it is in [0, 1] in all draws,
-    and otherwise as one that is never below 0 if no draw is.
+    Shares are in [0, 1], percentages are in [0, 100], other numbers with a unit are at least 0, and
+    signed numbers have no limit. A number without a row counts as a share if it is in [0, 1] in all
+    draws, and has no limit if it is negative in a draw.
 
     Args:
         path: Path of the number.
-        values: Numbers in draws of the clusters, shape (D,); NaN where there is nothing to count.
-        rows: Rows of the result with patterns as paths; the first that fits the path or its end
-            has the unit.
+        values: (D,) values in draws of the clusters; NaN if there is nothing to count.
+        rows: Rows of the result, whose paths are patterns; the first row that matches the path, or
+            its end, determines the unit.
     """
-    row = next((row for row in rows if _is_one_of(path, (row.path,))), None)
-    if row is not None:
-        return (-math.inf, math.inf) if row.is_signed else (0.0, LIMITS.get(row.unit, math.inf))
-    finite = values[np.isfinite(values)]
-    if finite.min(initial=0.0) < 0:
-        return -math.inf, math.inf
-    return 0.0, 1.0 if finite.max(initial=0.0) <= 1 else math.inf
+    for row in rows:
+        if _fits_pattern(path, (row.path,)):
+            if row.is_signed:
+                return _NO_LIMITS
+            return 0.0, LIMITS.get(row.unit, math.inf)
+    finite_values = values[np.isfinite(values)]
+    if finite_values.min(initial=0.0) < 0:
+        return _NO_LIMITS
+    if finite_values.max(initial=0.0) <= 1:
+        return 0.0, 1.0
+    return 0.0, math.inf
 
 
-def _is_one_of(path: str, patterns: Iterable[str]) -> bool:
-    """Return whether a pattern fits the path, or its end, as for the results `beside` others."""
-    return any(
-        fnmatchcase(path, pattern) or fnmatchcase(path, f"*/{pattern}") for pattern in patterns
-    )
+def _fits_pattern(path: str, patterns: Iterable[str]) -> bool:
+    """Return whether a pattern matches a path or its end, since results can contain others."""
+    for pattern in patterns:
+        if fnmatchcase(path, pattern) or fnmatchcase(path, f"*/{pattern}"):
+            return True
+    return False
 
 
-def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
-    """Yield the floats of a value with their paths."""
+def _walk_numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
+    """Yield the path and value of each float in `value`, which is at `path`."""
     parts: Mapping[Any, object] = {}
     if isinstance(value, float):
         yield path, value
@@ -439,4 +465,4 @@ def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
         parts = dict(enumerate(value))
     for key, part in parts.items():
         name = f"{key:g}" if isinstance(key, float) else str(key)
-        yield from _numbers(part, f"{path}/{name}" if path else name)
+        yield from _walk_numbers(part, f"{path}/{name}" if path else name)

@@ -1,6 +1,4 @@
-"""Metrics of predicted motion: IoU, VPQ, minADE, minFDE and miss rate; the task `motion`."""
-
-from __future__ import annotations
+"""Metrics of predicted motion (task `motion`): IoU, VPQ, minADE, minFDE and miss rate."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -12,6 +10,7 @@ from typing import Any, ClassVar, Final
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
+    CLASSES,
     PanopticQuality,
     SegmentationCounts,
     instance_paths,
@@ -61,64 +60,63 @@ __all__ = [
     "panoptic_quality",
 ]
 
-# Name, as the released code prints it → side of the square around the ego in which IoU and VPQ are
-# counted, metres.
+# Name of a range, as the released code prints it → side length, in metres, of the square around the
+# ego in which IoU and VPQ are counted.
 RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionProtocol:
-    """The choices of the motion metrics; the defaults are the released ones.
+    """Options of the motion metrics; the defaults match the released code.
 
-    Sources: docs/released_code.md, Post-processing, IoU and VPQ, and Paths.
+    Sources: docs/released_code.md, sections "Post-processing", "IoU and VPQ" and "Paths".
 
     Attributes:
-        labels: Name of the protocol of the true labels; other labels are refused. None for any
-            labels.
-        nothing_is_zero: Whether IoU and VPQ of samples with nothing to count are 0; otherwise NaN.
+        labels: Name of the protocol that the labels must follow; None for any protocol.
+        nothing_is_zero: Whether IoU and VPQ are 0 (True) or NaN (False) if there is nothing to
+            count.
     """
 
     labels: str | None = "released"
     nothing_is_zero: bool = True
 
     def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError."""
+        """Check the fields; raise ChoiceError if `labels` is not the name of a protocol."""
         settle_choices(self, {"labels": (None, *LABEL_PROTOCOLS)})
 
 
 MOTION_PROTOCOLS: Final[Mapping[str, MotionProtocol]] = MappingProxyType(
     {"released": MotionProtocol(), "paper": MotionProtocol(nothing_is_zero=False)}
 )
-"""The metrics of the released code. The paper's text only has their names, from FIERY, and the
-ranges: so `paper` is the released code, except that a number with nothing to count is NaN and not
-0."""
+"""The metrics of the released code. The paper only states the ranges and the names of the metrics,
+which it takes from FIERY. So `paper` is the same as `released`, except that a metric is NaN instead
+of 0 if there is nothing to count."""
 
 
-# How instances are read off heads, and off labels, for minADE, minFDE and miss rate. The released
-# code has these errors from the accident evaluation, which links and cuts out instances by other
-# rules than VPQ's.
-_PATH_PROCESSING: Final = replace(POST_PROCESSING["accident"], redraw=False)
-_PATH_COUNTS: Final = ("true_positive", "false_positive", "false_negative")
-_PATH_SUMS: Final = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
-_INSTANCE_MAPS_NOTE: Final = (
-    "given as instance maps, and so compared with the labels' own instances, of paths too; those "
-    "given as heads have their paths compared with what is read off the labels as if a model had "
-    "predicted them"
+# Rules for extracting instances from heads and labels for minADE, minFDE and miss rate. The
+# released code computes these errors in the accident evaluation, which links and crops instances
+# differently than VPQ does.
+_PATH_PROCESSING = replace(POST_PROCESSING["accident"], redraw=False)
+_PATH_COUNTS = ("true_positive", "false_positive", "false_negative")
+_PATH_SUMS = ("ade", "fde", "missed", "count", *_PATH_COUNTS)
+_INSTANCE_MAPS_NOTE = (
+    "These maps and the paths in them are compared with the labels' own instances. The paths in "
+    "heads are compared with paths that are extracted from the labels as from a model's heads"
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeResult(ShortRepr):
-    """Metrics within one range.
+    """Metrics in one range, the square around the ego.
 
     Attributes:
         iou: Intersection over union of the actors' cells, percent.
         pq: Video panoptic quality, percent.
-        sq: Segmentation quality of the instances found, percent.
+        sq: Segmentation quality of the true positives, percent.
         rq: Recognition quality, percent.
-        true_positive: Instances found, frame by frame.
-        false_positive: Instances predicted without a true one.
-        false_negative: Instances missed.
+        true_positive: Number of matched instances, summed over frames.
+        false_positive: Number of predicted instances without a match, summed over frames.
+        false_negative: Number of true instances without a match, summed over frames.
     """
 
     iou: float
@@ -132,25 +130,27 @@ class RangeResult(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionResult(TaskResult):
-    """Motion metrics of some samples.
+    """Motion metrics of a set of samples.
 
     Attributes:
-        ranges: Metrics by range (`30x30`, `100x100`), for the last prediction, which in the
-            released order is the mean.
-        min_ade: Mean error of the paths over their frames, of the best of all predictions, metres;
-            NaN without any.
-        min_fde: Error of the paths at the last frame, metres; likewise.
-        miss_rate: Share of the paths that end too far away, in [0, 1]; likewise.
-        paths: Number of true paths with a partner in some prediction: the three errors are means
-            over them.
+        ranges: Metrics by range (`30x30`, `100x100`) of the last prediction, which in the released
+            order is the mean.
+        min_ade: Error of a path averaged over its frames, for the best of all predictions, metres;
+            NaN if there are no paths.
+        min_fde: Error of a path in the last frame, for the best of all predictions, metres; NaN if
+            there are no paths.
+        miss_rate: Share of the paths whose final error is too large, in [0, 1]; NaN if there are no
+            paths.
+        paths: Number of true paths that are matched in at least one prediction; `min_ade`,
+            `min_fde` and `miss_rate` are averaged over these paths.
         path_accuracy: tp / (tp + fp / 2 + fn / 2) of the last prediction's paths, in [0, 1]; NaN
-            without any.
-        path_true_positive: Paths of the last prediction that have a partner.
-        path_false_positive: Paths of the last prediction that have none.
-        path_false_negative: True paths without a partner.
+            if there are no paths.
+        path_true_positive: Number of matched paths of the last prediction.
+        path_false_positive: Number of unmatched paths of the last prediction.
+        path_false_negative: Number of true paths that the last prediction does not match.
         samples: Number of samples.
-        frames: Number of compared frames of all samples.
-        notes: Sentences that a reader of the numbers should know.
+        frames: Number of compared frames, summed over samples.
+        notes: Caveats that belong next to the numbers, one sentence each.
     """
 
     rows: ClassVar[tuple[Row, ...]] = (
@@ -164,12 +164,12 @@ class MotionResult(TaskResult):
         Row("path_accuracy", "share", "higher", is_headline=False),
     )
     ranges: Mapping[str, RangeResult]
-    # paths of all predictions
+    # averaged over the paths of all predictions
     min_ade: float
     min_fde: float
     miss_rate: float
     paths: int
-    # paths of the last prediction
+    # counted in the last prediction
     path_accuracy: float
     path_true_positive: int
     path_false_positive: int
@@ -181,7 +181,7 @@ class MotionResult(TaskResult):
 
 
 class MotionEvaluator(Evaluator[MotionResult]):
-    """IoU and VPQ of the last prediction, and errors of the paths over all predictions.
+    """Evaluator of motion: IoU and VPQ of the last prediction, path errors of all predictions.
 
     >>> evaluator = MotionEvaluator()
     >>> evaluator.compute().ranges["30x30"].iou
@@ -198,29 +198,29 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def __init__(
         self, protocol: str | MotionProtocol = "released", *, trajectories: bool = True
     ) -> None:
-        """Start without samples.
+        """Create an evaluator without samples.
 
         Args:
-            protocol: Name of one of `MOTION_PROTOCOLS`, or a protocol with other fields.
-            trajectories: Whether paths are compared too. For heads that takes many times as long as
-                everything besides, since instances are read off all predictions and the labels for
-                it.
+            protocol: Name of one of `MOTION_PROTOCOLS`, or a `MotionProtocol`.
+            trajectories: Whether to compare paths, too. For heads this takes many times as long as
+                the rest, since instances are extracted from all predictions and from the labels.
 
         Raises:
-            ChoiceError: no protocol has that name.
+            ChoiceError: If no protocol has this name.
         """
         super().__init__(protocol)
         self.trajectories = trajectories
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The protocol's choices, and whether paths are compared."""
-        return {"protocol": asdict(self.protocol), "trajectories": self.trajectories}
+        """Names and values of the settings: the protocol's fields, and whether to compare paths."""
+        protocol = asdict(self.protocol)
+        return {"protocol": protocol, "trajectories": self.trajectories}
 
     def truth(
         self, dataset: Dataset, token: str, form: Any, horizon: float, /
     ) -> tuple[MotionLabels | None]:
-        """Return the sample's motion labels, on the grid of the results."""
+        """Return the sample's motion labels on the grid of the predictions."""
         return (compared_labels(dataset, token, self.protocol, form, horizon),)
 
     def update(self, token: str, prediction: MotionOutput, label: MotionLabels) -> None:
@@ -229,24 +229,23 @@ class MotionEvaluator(Evaluator[MotionResult]):
         Args:
             token: Token of the sample.
             prediction: Prediction of a model, in any orientation.
-            label: Labels of the sample, on the same ground; frames in their own frames are warped
-                to the present.
+            label: Labels of the sample for the same area; if each of their frames is in its own ego
+                frame, they are warped to the current one.
 
         Raises:
-            EvaluationError: there is no prediction or label, the labels are of another protocol,
-                the prediction has another grid or too few frames, or the sample came before with
-                other counts.
+            EvaluationError: If the prediction or the label is missing, the labels follow another
+                protocol, the prediction has another grid or too few frames, or the sample was
+                counted before with other counts.
         """
-        self.add(
-            token, motion_counts(prediction, label, self.protocol, trajectories=self.trajectories)
-        )
+        counts = motion_counts(prediction, label, self.protocol, trajectories=self.trajectories)
+        self.add(token, counts)
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
-        """Return the metrics of some samples' counts, in any order."""
+        """Compute the metrics from the counts of samples, in any order."""
         return motion_result(counts, self.protocol)
 
     def sample_row(self, token: str) -> dict[str, Any]:
-        """Return IoU and PQ (percent), instances and cells by range, then path errors (m)."""
+        """Return a sample's row: IoU and PQ (%), instances, cells by range; path errors (m)."""
         result = self.compute([token])
         row: dict[str, Any] = {"frames": result.frames}
         cells_by_range = self._counts[token]["cells"]
@@ -264,34 +263,37 @@ class MotionEvaluator(Evaluator[MotionResult]):
         return row
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        """Return the counts of one sample of one frame that have the same result."""
-        return [_sums(counts)]
+        """Sum the counts; the list has a single entry that looks like a sample with one frame."""
+        return [_sum_counts(counts)]
 
     def selected_as_released(self, order: Sequence[str], selected: Collection[str]) -> MotionResult:
-        """Return the result that the released code has "by attribute", with its mistake.
+        """Compute the result that the released code prints "by attribute", including its mistake.
 
-        The mistake is reproduced for comparison: VPQ has one entry per *frame*, of all samples one
-        after the other, and takes the entries with the numbers of *samples*, so that most of its
-        sum belongs to other samples. `compute(selected)` is the correct result.
+        The mistake is reproduced for comparison. The released code stores one entry of VPQ per
+        *frame*, one sample after the other, but selects entries by the indices of *samples*, so
+        most of the summed entries belong to other samples. For the correct result, call
+        `compute(selected)`.
 
         Args:
-            order: All samples in the order evaluated.
-            selected: Some of them.
+            order: Tokens of all samples, in the order in which they were evaluated.
+            selected: Tokens of the selected samples.
 
         Raises:
-            EvaluationError: one of them was not counted.
+            EvaluationError: If a sample was not counted.
         """
-        self.compute(order)  # refuses samples that were not counted
-        frames = []
+        self.compute(order)  # raises for samples that were not counted
+        vpq_by_frame = []
         for token in order:
             counts = self._counts[token]
             for frame in range(counts["frames"]):
-                frame_vpq = [[[values[frame]] for values in numbers] for numbers in counts["vpq"]]
-                frames.append(frame_vpq)
+                frame_vpq = []
+                for numbers in counts["vpq"]:
+                    frame_vpq.append([[values[frame]] for values in numbers])
+                vpq_by_frame.append(frame_vpq)
         released_counts = []
         for number, token in enumerate(order):
             if token in set(selected):
-                released_counts.append({**self._counts[token], "vpq": frames[number]})
+                released_counts.append({**self._counts[token], "vpq": vpq_by_frame[number]})
         return motion_result(released_counts, self.protocol)
 
 
@@ -302,15 +304,16 @@ def motion_counts(
     *,
     trajectories: bool = True,
 ) -> Counts:
-    """Return what one sample adds, as JSON can hold it.
+    """Count one sample; the counts can be stored as JSON.
 
     Arguments and errors are as in `MotionEvaluator.update`.
 
     Returns:
-        `samples`, 1; `frames` compared; `instance_maps`, 1 if the prediction is instance maps,
-        otherwise 0; by range, `cells` [tp, fp, fn] and `vpq`, four lists by frame: the sum of the
-        intersections over unions, and the numbers of true positives, false positives and false
-        negatives; `paths`, sums by name, or None.
+        `samples`: 1. `frames`: number of compared frames. `instance_maps`: 1 if the prediction
+        consists of instance maps, otherwise 0. `cells`: [tp, fp, fn] for each range. `vpq`: for
+        each range, four lists with one entry per frame: the summed intersections over unions, and
+        the numbers of true positives, false positives and false negatives. `paths`: sums by name;
+        None if paths are not compared.
     """
     rules = protocol or MotionProtocol()
     prediction, label = checked_pair(prediction, label)
@@ -321,20 +324,21 @@ def motion_counts(
     actors, instance = (prediction.grid.reorient(raster, grid.orientation) for raster in maps)
     true_actors = truth.segmentation[:frames] == 1
     true_instance = truth.instance[:frames]
+    instances_column = CLASSES.index("instances")
     cells = []
     vpq = []
     for extent in RANGES.values():
-        within = (slice(None), *cells_within(grid, extent))
-        mask = mask_counts(actors[within], true_actors[within])
+        in_range = (slice(None), *cells_within(grid, extent))
+        mask = mask_counts(actors[in_range], true_actors[in_range])
         cells.append([mask.true_positive, mask.false_positive, mask.false_negative])
-        quality = vpq_counts(instance[within], true_instance[within])
+        quality = vpq_counts(instance[in_range], true_instance[in_range])
         numbers = (
             quality.iou,
             quality.true_positive,
             quality.false_positive,
             quality.false_negative,
         )
-        vpq.append([values[:, 1].tolist() for values in numbers])
+        vpq.append([values[:, instances_column].tolist() for values in numbers])
     return {
         "samples": 1,
         "frames": frames,
@@ -346,9 +350,9 @@ def motion_counts(
 
 
 def _last_maps(prediction: MotionOutput, frames: int) -> tuple[AnyArray, AnyArray]:
-    """Return the actors' cells and the instances of the last prediction, shape (T, H, W) each.
+    """Return the actor mask and the instance map of the last prediction, shape (T, H, W) each.
 
-    Both are in the orientation of the prediction.
+    Both have the orientation of the prediction.
     """
     actors = actor_cells(prediction)[:frames]
     if prediction.instances is not None:
@@ -358,59 +362,67 @@ def _last_maps(prediction: MotionOutput, frames: int) -> tuple[AnyArray, AnyArra
 
 
 def actor_cells(prediction: MotionOutput) -> AnyArray:
-    """Return which cells are actors in the last prediction, shape (T, H, W), in its orientation."""
+    """Return the mask of the last prediction's actor cells (T, H, W), in its orientation."""
     if prediction.instances is not None:
         instances: AnyArray = prediction.instances[-1] > 0
         return instances
     segmentation = (prediction.heads or ())[-1].segmentation
-    return segmentation[:, 1] > segmentation[:, 0]
+    background = segmentation[:, 0]
+    actor = segmentation[:, 1]
+    return actor > background
 
 
-def _path_counts(prediction: MotionOutput, truth: MotionLabels, frames: int) -> dict[str, float]:
-    """Return the sums of the path errors of one sample, and the cases of its last prediction."""
+def _path_counts(
+    prediction: MotionOutput, truth: MotionLabels, num_frames: int
+) -> dict[str, float]:
+    """Sum a sample's path errors over all predictions, and count TP/FP/FN of the last (the mean).
+
+    Only the first `num_frames` frames are compared.
+    """
     grid = truth.config.grid
     if prediction.instances is not None:
-        true = instance_paths(truth.instance[:frames], grid)
-        predicted = []
+        true_paths = instance_paths(truth.instance[:num_frames], grid)
+        predicted_paths = []
         for maps in prediction.instances:
-            predicted.append(instance_paths(maps[:frames], prediction.grid))
+            predicted_paths.append(instance_paths(maps[:num_frames], prediction.grid))
     else:
-        true = _paths_of(first_frames(MotionHeads.from_labels(truth), frames), grid)
-        predicted = []
+        label_heads = MotionHeads.from_labels(truth)
+        true_paths = _read_paths(first_frames(label_heads, num_frames), grid)
+        predicted_paths = []
         for heads in prediction.heads or ():
-            predicted.append(_paths_of(first_frames(heads, frames), grid))
-    length = longest(true)
-    predicted = [padded(paths, length) for paths in predicted]
-    true = padded(true, length)
-    matches = [match_trajectories(paths, true) for paths in predicted]
-    errors = trajectory_errors(predicted, true, matches)
-    last = matches[-1]
+            predicted_paths.append(_read_paths(first_frames(heads, num_frames), grid))
+    max_path_length = longest(true_paths)
+    predicted_paths = [padded(paths, max_path_length) for paths in predicted_paths]
+    true_paths = padded(true_paths, max_path_length)
+    matches = [match_trajectories(paths, true_paths) for paths in predicted_paths]
+    errors = trajectory_errors(predicted_paths, true_paths, matches)
+    last_matches = matches[-1]
     return asdict(errors) | {
-        "true_positive": len(last.pairs),
-        "false_positive": len(last.unmatched_prediction),
-        "false_negative": len(last.unmatched_truth),
+        "true_positive": len(last_matches.pairs),
+        "false_positive": len(last_matches.unmatched_prediction),
+        "false_negative": len(last_matches.unmatched_truth),
     }
 
 
-def _paths_of(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
-    """Return the paths of the instances of heads."""
+def _read_paths(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
+    """Extract instances from heads, and return their paths: id → (n, 2) positions, metres."""
     instances = predict_instances(heads, _PATH_PROCESSING)
     return trajectories(instances, grid, half_cell_shift=False)
 
 
-def _sums(counts: Collection[Counts]) -> dict[str, Any]:
-    """Return the samples' counts in the form of one sample of one frame."""
+def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
+    """Sum the counts of samples; the sums look like the counts of a sample with one frame."""
     vpq = []
-    for index in range(len(RANGES)):
-        sums = []
-        for kind in range(4):
-            values = chain.from_iterable(sample["vpq"][index][kind] for sample in counts)
-            sums.append([math.fsum(values)])
-        vpq.append(sums)
     cells = []
-    for index in range(len(RANGES)):
-        case_columns = list(zip(*(sample["cells"][index] for sample in counts), strict=True))
-        cells.append([sum(column) for column in case_columns] or [0, 0, 0])
+    for range_index in range(len(RANGES)):
+        vpq_sums = []
+        for number_index in range(4):
+            values = [sample["vpq"][range_index][number_index] for sample in counts]
+            vpq_sums.append([math.fsum(chain.from_iterable(values))])
+        vpq.append(vpq_sums)
+        sample_cells = [sample["cells"][range_index] for sample in counts]
+        cell_sums = [sum(numbers) for numbers in zip(*sample_cells, strict=True)]
+        cells.append(cell_sums or [0, 0, 0])
     paths = [sample["paths"] for sample in counts if sample["paths"]]
     return {
         "samples": sum(sample["samples"] for sample in counts),
@@ -423,8 +435,8 @@ def _sums(counts: Collection[Counts]) -> dict[str, Any]:
 
 
 def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> MotionResult:
-    """Return the metrics of some samples' counts, in any order."""
-    sums = _sums(counts)
+    """Compute the metrics from the counts of samples, in any order."""
+    sums = _sum_counts(counts)
     ranges = {}
     for name, cells, vpq in zip(RANGES, sums["cells"], sums["vpq"], strict=True):
         ranges[name] = _range_result(cells, vpq, protocol)
@@ -433,7 +445,8 @@ def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> Motio
     notes: tuple[str, ...] = ()
     if sums["instance_maps"]:
         predictions = counted(sums["samples"], "prediction")
-        notes = (f"{sums['instance_maps']} of {predictions}: {_INSTANCE_MAPS_NOTE}",)
+        share = f"{sums['instance_maps']} of {predictions}"
+        notes = (f"given as instance maps: {share}. {_INSTANCE_MAPS_NOTE}",)
     return MotionResult(
         ranges=ranges,
         min_ade=ratio(paths["ade"], paths["count"]),
@@ -453,18 +466,18 @@ def motion_result(counts: Collection[Counts], protocol: MotionProtocol) -> Motio
 def _range_result(
     cells: Sequence[int], vpq: Sequence[Sequence[float]], protocol: MotionProtocol
 ) -> RangeResult:
-    """Return the metrics of one range.
+    """Compute the metrics in one range.
 
     Args:
-        cells: Sums of [tp, fp, fn] cells.
-        vpq: Sums of overlaps, found, false and missed instances, each in a list.
-        protocol: The rules.
+        cells: Summed [tp, fp, fn] of cells.
+        vpq: Four lists with one sum each: overlaps, matched instances, false ones, missed ones.
+        protocol: Protocol that decides what a metric is if there is nothing to count.
     """
     (overlap,), *numbers = vpq
-    matches, alarms, missed = (int(number) for (number,) in numbers)
-    quality = panoptic_quality(overlap, matches, alarms, missed)
+    matches, false_alarms, missed = (int(number) for (number,) in numbers)
+    quality = panoptic_quality(overlap, matches, false_alarms, missed)
     absent = 0.0 if protocol.nothing_is_zero else math.nan
-    has_instances = matches or alarms or missed
+    has_instances = matches or false_alarms or missed
     percent = 100.0 if has_instances or protocol.nothing_is_zero else math.nan
     true_positive, false_positive, false_negative = cells
     mask = SegmentationCounts(
@@ -476,6 +489,6 @@ def _range_result(
         sq=percent * quality.sq,
         rq=percent * quality.rq,
         true_positive=matches,
-        false_positive=alarms,
+        false_positive=false_alarms,
         false_negative=missed,
     )

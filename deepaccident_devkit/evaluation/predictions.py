@@ -1,4 +1,4 @@
-"""Predictions of a model for a sample, from any framework, and the frames and cells evaluated."""
+"""A model's predictions for a sample, from any framework, and which frames and cells to compare."""
 
 from __future__ import annotations
 
@@ -32,32 +32,33 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# Numbers of axes of K stacked predictions; centerness may lack that of its only channel.
-_AXES: Final = {"segmentation": (5,), "centerness": (4, 5), "offset": (5,), "flow": (5,)}
-# Seconds: times of a longer path are probably not in seconds.
+# Head → possible numbers of axes of its K stacked maps; the axis of centerness' single channel may
+# be missing.
+_AXES = {"segmentation": (5,), "centerness": (4, 5), "offset": (5,), "flow": (5,)}
+# If a path is longer than this, its times are probably not in seconds.
 LONGEST_PATH: Final = 10.0
 LONG_PATHS: Final = (
     "suspicious: {path} longer than 10 s; times are in seconds, not in frames or milliseconds"
 )
-# Share of a cell: edges of a range fall on edges of cells, apart from rounding.
-_CELL_TOLERANCE: Final = 1e-6
+# Because of rounding, an edge of a range may differ from an edge of a cell by this fraction of it.
+_CELL_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionOutput(FrozenArrays):
-    """K predictions of one sample's motion, in the present ego frame, as heads or as instances.
+    """K predictions of one sample's motion, in the current ego frame, as heads or instances.
 
-    The released order counts: five samples, then the mean; VPQ and IoU use the last one. A single
-    prediction is fine.
+    The order matters, and should be the released one: five random draws, then their mean. VPQ and
+    IoU use the last prediction. A single prediction is accepted, too.
 
     Attributes:
-        grid: Cells; its orientation is that of the maps.
-        heads: K maps of a model over T frames, the present first (a single one need not be in a
-            tuple); None with `instances`.
+        grid: Cells and orientation of the maps.
+        heads: K predictions of a model over T frames, the current one first; None if
+            `instances` are passed. A single prediction need not be in a tuple.
         instances: (K, T, H, W) int32, ids from 1 that stay the same over the frames, 0 elsewhere;
-            None with heads.
-        orientation: Argument of the constructor: orientation of the maps, None for the grid's. The
-            grid stores it: this field is always None.
+            None if `heads` are passed.
+        orientation: Only an argument of the constructor: orientation of the maps; None for the
+            grid's. It is stored in the grid, so this field is always None.
     """
 
     grid: BevGrid
@@ -69,13 +70,13 @@ class MotionOutput(FrozenArrays):
         """Check and freeze.
 
         Raises:
-            GeometryError: heads and instances are both passed, or both missing, nothing is
-                predicted, or a shape is not the grid's.
-            ChoiceError: no such orientation.
+            GeometryError: If heads and instances are both passed or both missing, if there is no
+                prediction, or if a shape does not match the grid.
+            ChoiceError: If the orientation does not exist.
         """
         grid = _checked_grid(self.grid, self.orientation)
         if (self.heads is None) == (self.instances is None):
-            raise GeometryError("motion output: give heads, or instances, and not both")
+            raise GeometryError("motion output: give either heads or instances")
         if self.instances is not None:
             maps = checked("instances", self.instances, (None, None, *grid.shape), np.int32)
             if not len(maps):
@@ -98,25 +99,26 @@ class MotionOutput(FrozenArrays):
         grid: BevGrid,
         orientation: Orientation | None = None,
     ) -> MotionOutput:
-        """Return heads from a model's stacked arrays, of any framework, or from lists.
+        """Create predictions from stacked arrays of a model's heads, from any framework.
 
-        `support.arrays.as_numbers` reads the arrays; float32 arrays in the processor's memory are
-        not copied. A single prediction may lack the first axis, K, in all four. The arrays are of
-        one sample: K is not a batch.
+        `support.arrays.as_numbers` reads the arrays or lists; float32 arrays in CPU memory are not
+        copied. For a single prediction, the first axis, K, may be missing in all four arrays. The
+        arrays belong to one sample: K is not a batch.
 
         Args:
-            segmentation: (K, T, 2, H, W) logits: background, actor.
-            centerness: (K, T, 1, H, W), also (K, T, H, W).
-            offset: (K, T, 2, H, W) cells down the rows and along the columns to the instance's
-                centre.
-            flow: (K, T, 2, H, W) cells to the instance's position at the next frame.
+            segmentation: Logits of background and actor, (K, T, 2, H, W).
+            centerness: Centerness, (K, T, 1, H, W) or (K, T, H, W).
+            offset: Vector to the instance's centre, (K, T, 2, H, W) cells, along rows, then along
+                columns.
+            flow: Vector to the instance's position in the next frame, (K, T, 2, H, W) cells, in the
+                same order.
             grid: Cells of the maps.
             orientation: Orientation of the maps and their vectors; None for the grid's.
 
         Raises:
-            GeometryError: another shape, NaN, or an array that cannot be read from here (see the
-                message's remedy).
-            ChoiceError: no such orientation.
+            GeometryError: If an array has the wrong shape, contains NaN, or cannot be read in this
+                process (the message explains what to do).
+            ChoiceError: If the orientation does not exist.
         """
         oriented_grid = _checked_grid(grid, orientation)
         arrays = {
@@ -126,7 +128,7 @@ class MotionOutput(FrozenArrays):
             "flow": flow,
         }
         maps = {name: as_numbers(name, array, dtype=np.float32) for name, array in arrays.items()}
-        if maps["segmentation"].ndim == 4:
+        if maps["segmentation"].ndim == 4:  # a single prediction
             maps = {name: array[None] for name, array in maps.items()}
         _check_axes(maps)
         heads = []
@@ -142,7 +144,7 @@ class MotionOutput(FrozenArrays):
         return len(self.instances if self.instances is not None else ())
 
     def __repr__(self) -> str:
-        """Return predictions, frames, cells, and which of the two forms."""
+        """Return the numbers of predictions, frames and cells, and the form."""
         if self.instances is not None:
             maps = self.instances[0]
             form = "instances"
@@ -158,10 +160,12 @@ class Accident(FrozenArrays):
     """A predicted accident.
 
     Attributes:
-        positions: (2, 2) x forward, y left of the colliding pair, metres in the present ego frame.
-        time: Seconds after the present, from 0.
-        score: Confidence of the model, higher is surer.
-        ids: Their actor ids, in the order of `positions`; None if the model has none.
+        positions: Positions of the colliding pair, (2, 2) x forward, y left, metres in the current
+            ego frame.
+        time: Seconds after the current frame, at least 0.
+        score: Confidence of the model; higher means more certain.
+        ids: Actor ids of the pair, in the order of `positions`; None if the model does not predict
+            them.
     """
 
     positions: FloatArray
@@ -170,11 +174,12 @@ class Accident(FrozenArrays):
     ids: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        """Check and freeze; raises GeometryError."""
+        """Check and freeze the fields; raise GeometryError if one is invalid."""
         positions = checked("accident positions", self.positions, (2, 2)).copy()
         if not np.isfinite(positions).all():
             raise GeometryError(
-                "accident positions: not all numbers are finite; leave out what is not predicted"
+                "accident positions: not all numbers are finite; remove accidents without "
+                "a predicted position"
             )
         time = checked_number("accident time", self.time, "seconds after the present")
         score = checked_number("accident score", self.score)
@@ -197,10 +202,10 @@ Prediction = MotionOutput | Iterable[Accident]
 
 
 def instances_of(values: ArrayLike, grid: BevGrid) -> MotionOutput:
-    """Return predictions from instance maps; raises GeometryError.
+    """Create predictions from instance maps; raise GeometryError if they do not fit the grid.
 
     Args:
-        values: One prediction (T, H, W), or K of them (K, T, H, W).
+        values: Instance maps of one prediction, (T, H, W), or of K predictions, (K, T, H, W).
         grid: Cells of the maps.
     """
     maps = as_numbers("instances", values, dtype=None)
@@ -214,22 +219,25 @@ def instances_of(values: ArrayLike, grid: BevGrid) -> MotionOutput:
 
 
 def _check_axes(maps: Mapping[str, AnyArray]) -> None:
-    """Check the axes of stacked heads; raises GeometryError."""
+    """Raise GeometryError if stacked heads have wrong axes or different numbers of predictions."""
     segmentation = maps["segmentation"]
     for name, array in maps.items():
         has_axes = segmentation.ndim == 5 and array.ndim in _AXES[name]
         if not has_axes or len(array) != len(segmentation):
-            shapes = ", ".join(f"{key} {np.shape(values)}" for key, values in maps.items())
+            shapes = ", ".join(f"{head} {values.shape}" for head, values in maps.items())
             raise GeometryError(
                 f"{name}: expected (K, T, channels, H, W), or (T, channels, H, W), found {shapes}"
             )
 
 
 def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
-    """Return a prediction, explicit accidents as a list; raises EvaluationError otherwise."""
+    """Return motion unchanged, and explicit accidents as a list.
+
+    Raise EvaluationError for anything else.
+    """
     if isinstance(prediction, MotionOutput):
         return prediction
-    # empty Boxes could only be a list of alarms by mistake
+    # Boxes are iterable, too, and empty ones would pass as an empty list
     is_list = isinstance(prediction, Iterable) and not isinstance(prediction, Boxes)
     items = prediction if is_list else [prediction]
     alarms: list[Accident] = []
@@ -238,7 +246,7 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
             raise EvaluationError(
                 "prediction: expected a MotionOutput or a list of Accidents, found "
                 f"{type(prediction).__name__} with {type(item).__name__}; wrap a single Accident "
-                "in a list, give [] for no alarm, and make an output of instance maps with "
+                "in a list, give [] for no alarm, and make an output from instance maps with "
                 "instances_of"
             )
         alarms.append(item)
@@ -246,7 +254,10 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
 
 
 def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
-    """Return a grid in an orientation; raises GeometryError or ChoiceError."""
+    """Return a grid with an orientation; None keeps the grid's own orientation.
+
+    Raise GeometryError if it is not a grid, or ChoiceError if the orientation does not exist.
+    """
     if not isinstance(grid, BevGrid):
         raise GeometryError(
             f"grid: expected a BevGrid, such as label.config.grid, found {type(grid).__name__}"
@@ -255,7 +266,7 @@ def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
 
 
 def _checked_heads(heads: object, grid: BevGrid) -> tuple[MotionHeads, ...]:
-    """Return heads as a tuple; raises GeometryError if they are not, or not of the grid."""
+    """Return heads as a tuple; raise GeometryError if one has the wrong type or grid."""
     predictions = (heads,) if isinstance(heads, MotionHeads) else heads
     is_sequence = isinstance(predictions, Sequence)
     items = list(cast("Sequence[object]", predictions)) if is_sequence else [predictions]
@@ -263,8 +274,9 @@ def _checked_heads(heads: object, grid: BevGrid) -> tuple[MotionHeads, ...]:
     if non_heads or not is_sequence:
         kinds = sorted({type(item).__name__ for item in items})
         raise GeometryError(
-            f"heads: expected MotionHeads, found {', '.join(kinds)}; of arrays, make the output "
-            "with MotionOutput.from_arrays(segmentation, centerness, offset, flow, grid=…)"
+            f"heads: expected MotionHeads, found {', '.join(kinds)}; to make the output from "
+            "arrays, call MotionOutput.from_arrays(segmentation, centerness, offset, flow, "
+            "grid=…)"
         )
     if not items:
         raise GeometryError("heads: expected at least one prediction, found none")
@@ -280,13 +292,13 @@ def _checked_heads(heads: object, grid: BevGrid) -> tuple[MotionHeads, ...]:
 
 
 def ascending_times(values: ArrayLike) -> FloatArray:
-    """Return a copy of the times of a predicted path, (T,) seconds after the present.
+    """Return a copy of the times of a predicted path, (T,) seconds after the current frame.
 
-    Raises GeometryError if they are not ascending.
+    Raise GeometryError if they are not ascending.
     """
     times = checked("times", values, (None,)).copy()
-    is_valid = len(times) and np.isfinite(times).all() and times[0] >= 0
-    if not (is_valid and (np.diff(times) > 0).all()):
+    begins_in_future = len(times) > 0 and np.isfinite(times).all() and times[0] >= 0
+    if not (begins_in_future and (np.diff(times) > 0).all()):
         raise GeometryError(
             f"times: expected ascending seconds after the present, found {times.tolist()}"
         )
@@ -294,7 +306,7 @@ def ascending_times(values: ArrayLike) -> FloatArray:
 
 
 def _checked_ids(ids: object) -> tuple[int, int] | None:
-    """Return two actor ids, or None; raises GeometryError."""
+    """Return a pair of actor ids, or None; raise GeometryError for anything else."""
     if ids is None:
         return None
     pair = ids.tolist() if isinstance(ids, np.ndarray) else ids
@@ -303,29 +315,32 @@ def _checked_ids(ids: object) -> tuple[int, int] | None:
             f"accident ids: expected two actor ids, or None for unknown ones, found {ids!r}"
         )
     expected = "two whole numbers, or None for unknown ones"
-    first, second = (checked_whole("accident ids", value, expected) for value in pair)
+    first = checked_whole("accident ids", pair[0], expected)
+    second = checked_whole("accident ids", pair[1], expected)
     return first, second
 
 
 def compared_labels(
     dataset: Dataset, token: str, rules: Any, form: Any, horizon: float
 ) -> MotionLabels | None:
-    """Return the sample's motion labels; None where there is nothing to compare with."""
+    """Load the motion labels that a sample's prediction is compared with; None if not needed."""
     config = label_config(rules, form, horizon)
-    return None if config is None else motion_labels(dataset, token, config)
+    if config is None:
+        return None
+    return motion_labels(dataset, token, config)
 
 
 def label_config(rules: Any, form: Any, horizon: float) -> MotionLabelConfig | None:
     """Return the configuration of the labels that predictions are compared with.
 
     Args:
-        rules: Rules with the name of the label protocol in `labels`; without it the form has the
-            name.
-        form: Form in which motion is stored (`Results.form`); None for explicit accidents.
+        rules: Rules of the metrics, whose field `labels` names the label protocol; rules without
+            this field take the protocol of the form.
+        form: How motion is stored (`Results.form`); None for explicit accidents.
         horizon: Seconds that the labels look ahead.
 
     Returns:
-        The configuration; None for explicit accidents by rules without labels.
+        The configuration; None for explicit accidents if the rules do not need labels.
     """
     labels = getattr(rules, "labels", None)
     if form is not None:
@@ -340,21 +355,24 @@ def label_config(rules: Any, form: Any, horizon: float) -> MotionLabelConfig | N
 
 
 def labels_at_present(label: MotionLabels) -> MotionLabels:
-    """Return labels with every frame in the present ego frame.
+    """Return labels with all frames in the current ego frame.
 
-    Labels in their own frames are warped with bilinear centres.
+    If each frame is in its own ego frame, the labels are warped, with bilinear interpolation of
+    centerness.
     """
-    return label if label.at_present else label.to_present(centerness="bilinear")
+    if label.at_present:
+        return label
+    return label.to_present(centerness="bilinear")
 
 
-def frames_there(label: MotionLabels) -> int:
-    """Return the number of label frames, from the present on, that are in the recording.
+def num_recorded_frames(label: MotionLabels) -> int:
+    """Return how many consecutive label frames, from the current one, the recording contains.
 
     Raises:
-        EvaluationError: the present frame is not in the recording.
+        EvaluationError: If the current frame is not in the recording.
     """
-    valid = label.label_valid
-    count = len(valid) if valid.all() else int(np.argmin(valid))
+    is_valid = label.label_valid
+    count = len(is_valid) if is_valid.all() else int(np.argmin(is_valid))
     if not count:
         raise EvaluationError(
             "labels: the present frame is not in the recording; choose another sample"
@@ -363,21 +381,21 @@ def frames_there(label: MotionLabels) -> int:
 
 
 def checked_pair(prediction: object, label: object) -> tuple[MotionOutput, MotionLabels]:
-    """Return a prediction of motion and its labels as they are.
+    """Return a motion prediction and its labels after checking their types.
 
     Raises:
-        EvaluationError: one of them is of another kind.
+        EvaluationError: If one of the two has another type.
     """
     if not isinstance(prediction, MotionOutput):
         raise EvaluationError(
             f"prediction: expected a MotionOutput, found {type(prediction).__name__}; make one "
-            "with MotionOutput.from_arrays(…), of MotionHeads with MotionOutput(…), of instance "
-            "maps with instances_of(…)"
+            "from arrays with MotionOutput.from_arrays(…), from MotionHeads with "
+            "MotionOutput(…), or from instance maps with instances_of(…)"
         )
     if not isinstance(label, MotionLabels):
         raise EvaluationError(
-            f"label: expected MotionLabels, found {type(label).__name__}; give what "
-            "dataset.motion_labels(token) or a folder of label files has of the sample"
+            f"label: expected MotionLabels, found {type(label).__name__}; give "
+            "dataset.motion_labels(token), or the sample's labels from a folder of label files"
         )
     return prediction, label
 
@@ -385,58 +403,60 @@ def checked_pair(prediction: object, label: object) -> tuple[MotionOutput, Motio
 def compared_frames(
     prediction: MotionOutput | list[Accident], label: MotionLabels, protocol: str | None
 ) -> int:
-    """Return the number of frames of a prediction that are compared with labels.
+    """Return how many frames of a prediction are compared with labels.
 
-    Explicit accidents fit all labels.
+    Explicit accidents are compared with all labelled frames that the recording contains.
 
     Args:
         prediction: Prediction of a sample.
         label: Labels of the sample.
-        protocol: Label protocol that the labels must be of; None for any.
+        protocol: Label protocol that the labels must follow; None for any protocol.
 
     Raises:
-        EvaluationError: the labels are of another label protocol or have no frame that is in the
-            recording, or the prediction covers other ground or has too few frames.
+        EvaluationError: If the labels follow another protocol or have no frame in the recording, or
+            if the prediction covers another area or has too few frames.
     """
     if protocol is not None and label.config.rules != LABEL_PROTOCOLS[protocol]:
         raise EvaluationError(
-            f"labels: expected those of the label protocol {protocol!r}, found others; make them "
-            f"with MotionLabelConfig(protocol={protocol!r}), or give the metrics' protocol another "
-            "value of its field labels"
+            f"labels: expected labels of the label protocol {protocol!r}, found labels of "
+            f"another; make them with MotionLabelConfig(protocol={protocol!r}), or give the "
+            "metrics' protocol another value of its field labels"
         )
-    frames = frames_there(label)
+    frames = num_recorded_frames(label)
     grid = label.config.grid
     if not isinstance(prediction, MotionOutput):
         return frames
     if (prediction.grid.x, prediction.grid.y) != (grid.x, grid.y):
         raise EvaluationError(
             f"prediction: its cells cover x {prediction.grid.x}, y {prediction.grid.y}; expected "
-            f"those of the labels, x {grid.x}, y {grid.y}: make both with the same grid"
+            f"the cells of the labels, x {grid.x}, y {grid.y}. Make both with the same grid"
         )
-    lengths = [len(heads.segmentation) for heads in prediction.heads or ()]
+    frame_counts = [len(heads.segmentation) for heads in prediction.heads or ()]
     if prediction.instances is not None:
-        lengths += [len(maps) for maps in prediction.instances]
-    predicted = min(lengths)
-    if predicted < frames:
+        frame_counts += [len(maps) for maps in prediction.instances]
+    predicted_frames = min(frame_counts)
+    if predicted_frames < frames:
         raise EvaluationError(
-            f"prediction: expected at least {frames} frames from the present on, found {predicted}"
+            f"prediction: expected at least {frames} frames from the present on, found "
+            f"{predicted_frames}"
         )
     return frames
 
 
 def first_frames(heads: MotionHeads, frames: int) -> MotionHeads:
-    """Return heads without the frames from `frames` on."""
+    """Cut heads to their first `frames` frames."""
     if len(heads.segmentation) == frames:
         return heads
-    return replace(heads, **{name: getattr(heads, name)[:frames] for name in _AXES})
+    maps = {name: getattr(heads, name)[:frames] for name in _AXES}
+    return replace(heads, **maps)
 
 
 def cells_within(grid: BevGrid, extent: float) -> tuple[slice, slice]:
-    """Return rows and columns of the cells with centres in a square around the ego.
+    """Return the slices of rows and columns whose cell centres are in a square around the ego.
 
     Args:
-        grid: Cells and orientation.
-        extent: Side of the square, metres.
+        grid: Cells and orientation of the maps.
+        extent: Side length of the square, metres.
     """
     along_x = _axis_within(grid.x, extent)
     along_y = _axis_within(grid.y, extent)
@@ -449,11 +469,11 @@ def cells_within(grid: BevGrid, extent: float) -> tuple[slice, slice]:
 
 
 def _axis_within(axis: Axis, extent: float) -> slice:
-    """Return the cells along an axis with centres within `extent` / 2 of the ego."""
+    """Return the slice of cells along an axis whose centres are within `extent` / 2 of the ego."""
     low, high, size = axis
-    count = round((high - low) / size)
-    ends = []
+    cell_count = round((high - low) / size)
+    bounds = []
     for edge in (-extent / 2, extent / 2):
         cell = math.ceil((edge - low) / size - 0.5 - _CELL_TOLERANCE)
-        ends.append(min(max(cell, 0), count))
-    return slice(*ends)
+        bounds.append(min(max(cell, 0), cell_count))
+    return slice(*bounds)

@@ -1,10 +1,7 @@
-"""`SampleCounts`: what each sample adds to the numbers, by token: add, merge, save and resume."""
-
-from __future__ import annotations
+"""`SampleCounts`: the counts of samples by token, which can be merged, saved and resumed."""
 
 import copy
 import json
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,13 +10,12 @@ from typing import Any, TypeVar
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.reading import read_bytes, reason_text
+from deepaccident_devkit.support.text import PathType, counted, path_of
 from deepaccident_devkit.support.version import __version__
 
 Counts = Mapping[str, Any]
-"""What one sample adds: names → whole numbers, floats, None, or nested lists of them, as in
-JSON."""
+"""Counts of one sample: name → whole number, float, None, or nested lists of these, as in JSON."""
 CountsT = TypeVar("CountsT", bound="SampleCounts")
 
 
@@ -27,40 +23,43 @@ class SampleCounts(ABC):
     """Counts by sample token, in any order and from any number of processes.
 
     Attributes:
-        repeated: Tokens that came more than once with equal counts (samplers of distributed
-            training do that); each counts once.
+        repeated: Tokens that were added more than once with equal counts (samplers of distributed
+            training repeat samples); each counts once.
     """
 
     def __init__(self) -> None:
-        """Start without samples."""
+        """Create an instance without samples."""
         self._counts: dict[str, Counts] = {}
         self.repeated: set[str] = set()
 
     def __repr__(self) -> str:
         """Return the class and the number of samples."""
-        return (
-            f"{type(self).__name__}({len(self._counts):,} sample{'s' * (len(self._counts) != 1)})"
-        )
+        samples = counted(len(self), "sample")
+        return f"{type(self).__name__}({samples})"
 
     @property
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """All choices that affect the counts, as in JSON; only equal settings can be merged."""
+        """All choices that affect the counts, as JSON values; merging requires equal settings."""
 
     def fresh(self: CountsT) -> CountsT:
         """Return a copy with the same settings and without samples."""
         other = copy.copy(self)
-        other._counts, other.repeated = {}, set()  # noqa: SLF001 - its own kind
+        other._counts = {}  # noqa: SLF001 - its own kind
+        other.repeated = set()
         return other
 
     def add(self, token: str, counts: Counts) -> None:
-        """Take a sample's counts.
+        """Add a sample's counts.
 
         Raises:
-            EvaluationError: the token is not a text, or the sample came before with other counts.
+            EvaluationError: If the token is not a string, or the sample was added before with other
+                counts.
         """
         if not isinstance(token, str):
-            raise EvaluationError(f"token: expected the sample's token, a text, found {token!r}")
+            raise EvaluationError(
+                f"token: expected the token of the sample as text, found {token!r}"
+            )
         if token not in self._counts:
             self._counts[token] = counts
         elif self._counts[token] == counts:
@@ -71,16 +70,17 @@ class SampleCounts(ABC):
             )
 
     def merge(self: CountsT, other: CountsT) -> CountsT:
-        """Take all samples of another evaluator; returns this one.
+        """Add all samples of another evaluator, and return this one.
 
         Raises:
-            EvaluationError: it has other settings, or other counts of the same sample.
+            EvaluationError: If the other evaluator has different settings, or different counts for
+                the same sample.
         """
         if type(other) is not type(self) or other.settings != self.settings:
+            other_settings = getattr(other, "settings", None)
             raise EvaluationError(
                 f"cannot merge: {type(self).__name__} of {self.settings} with "
-                f"{type(other).__name__} of "
-                f"{getattr(other, 'settings', None)}; evaluate both with the same settings"
+                f"{type(other).__name__} of {other_settings}; evaluate both with the same settings"
             )
         for token, counts in other._counts.items():  # noqa: SLF001 - its own kind
             self.add(token, counts)
@@ -89,17 +89,17 @@ class SampleCounts(ABC):
 
     @property
     def counts(self) -> Mapping[str, Counts]:
-        """Counts of each sample by token, copied, so that callers cannot change the sums."""
+        """Counts of each sample by token; these are copies, so callers cannot change the sums."""
         return _Copies(self._counts)
 
     def clustered(self, clusters: Mapping[str, str]) -> list[list[Counts]]:
-        """Return the counts of some samples by cluster, for `resampled`.
+        """Group the samples' counts by cluster, for `Evaluator.resampled`.
 
-        They are not copies, which would take most of the time.
+        The counts are not copied, which would take most of the time.
 
         Args:
-            clusters: Token → name of its cluster; clusters come in the order of their names' first
-                appearance.
+            clusters: Token → name of the sample's cluster. Clusters are returned in the order in
+                which their names first appear.
         """
         counts: dict[str, list[Counts]] = {}
         for token, name in clusters.items():
@@ -108,20 +108,20 @@ class SampleCounts(ABC):
 
     @property
     def tokens(self) -> set[str]:
-        """Tokens of the samples counted."""
+        """Tokens of the counted samples."""
         return set(self._counts)
 
     def __len__(self) -> int:
-        """Return the number of samples counted."""
+        """Return the number of counted samples."""
         return len(self._counts)
 
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write all counts to a JSON file, from which an interrupted run goes on; returns its path.
+    def save(self, path: PathType) -> Path:
+        """Write all counts to a JSON file, from which `resume` continues, and return its path.
 
-        At any moment the file is either the complete old or the complete new one.
+        At any time, the file is either the complete old one or the complete new one.
 
         Raises:
-            EvaluationError: the file cannot be written.
+            EvaluationError: If the file cannot be written.
         """
         target = path_of(path)
         state = {
@@ -133,18 +133,18 @@ class SampleCounts(ABC):
         try:
             write_bytes(target, json.dumps(state).encode())
         except OSError as error:
-            remedy = "make room there, or choose another file"
+            remedy = "free space there, or choose another file"
             raise EvaluationError(
                 f"{target}: the evaluation cannot be saved ({error}); {remedy}"
             ) from error
         return target
 
-    def resume(self: CountsT, path: str | os.PathLike[str]) -> CountsT:
-        """Take the counts that `save` wrote; returns this evaluator.
+    def resume(self: CountsT, path: PathType) -> CountsT:
+        """Add the counts that `save` wrote, and return this evaluator.
 
         Raises:
-            EvaluationError: there is no such file, it cannot be read, or it is of other settings,
-                another evaluator or another version of the devkit.
+            EvaluationError: If the file does not exist or cannot be read, or was written with other
+                settings, by another evaluator or by another version of the devkit.
         """
         source = path_of(path)
         try:
@@ -155,15 +155,16 @@ class SampleCounts(ABC):
             counts = {token: dict(sample) for token, sample in state["counts"].items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise EvaluationError(
-                f"{source}: no saved evaluation ({fault_text(error)}); begin again"
+                f"{source}: is not a saved evaluation ({reason_text(error)}); start again"
             ) from error
         if maker != self.maker:
             raise EvaluationError(
-                f"{source}: was saved by {maker}, this is {self.maker}; begin again"
+                f"{source}: was saved by {maker}, but this is {self.maker}; start again"
             )
         if settings != self.settings:
             raise EvaluationError(
-                f"{source}: was saved with other settings ({settings}); begin again, or use those"
+                f"{source}: was saved with other settings ({settings}); start again, or use "
+                "the same settings"
             )
         try:
             for token, sample_counts in counts.items():
@@ -175,18 +176,19 @@ class SampleCounts(ABC):
 
     @property
     def maker(self) -> str:
-        """Class and version that made the counts: another version may count differently."""
-        return f"{type(self).__name__} of devkit {__version__}"
+        """Class and devkit version that computed the counts, as versions may count differently."""
+        class_name = type(self).__name__
+        return f"{class_name} of devkit {__version__}"
 
 
 class _Copies(Mapping[str, Counts]):
-    """Counts by token, returned as copies."""
+    """Mapping from tokens to counts, which are copied on access."""
 
     def __init__(self, counts: Mapping[str, Counts]) -> None:
         self._counts = counts
 
     def __getitem__(self, token: str) -> Counts:
-        copied: Counts = _copied(self._counts[token])
+        copied: Counts = _copy_json(self._counts[token])
         return copied
 
     def __contains__(self, token: object) -> bool:
@@ -199,10 +201,10 @@ class _Copies(Mapping[str, Counts]):
         return len(self._counts)
 
 
-def _copied(value: Any) -> Any:
-    """Return a copy of JSON values; much faster than `copy.deepcopy`."""
+def _copy_json(value: Any) -> Any:
+    """Copy a JSON value, much faster than `copy.deepcopy` does."""
     if isinstance(value, Mapping):
-        return {name: _copied(item) for name, item in value.items()}
+        return {name: _copy_json(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_copied(item) for item in value]
+        return [_copy_json(item) for item in value]
     return value

@@ -1,4 +1,4 @@
-"""Common parts of tasks beside `Evaluator`: protocols with switches, and results with rows."""
+"""What tasks share, in addition to `Evaluator`: protocols with switches, and results with rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NoReturn, TypeV
 import numpy as np
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.support.arrays import ShortRepr, known
+from deepaccident_devkit.support.arrays import ShortRepr, json_numbers
+from deepaccident_devkit.support.human_names import metric_name
 from deepaccident_devkit.support.reports import table_html
 from deepaccident_devkit.support.text import choice, counted, meant_text, possible_text
 
@@ -20,26 +21,27 @@ if TYPE_CHECKING:
 
 _Kind = TypeVar("_Kind")
 Rules = TypeVar("Rules", bound="DataclassInstance")
-_WORDS: Final[Mapping[type | None, str]] = {
+# Type of a switch → its name in messages; None for a switch that takes any value.
+_TYPE_NAMES: Mapping[type | None, str] = {
     bool: "true or false",
     float: "a number",
     str: "a word",
     tuple: "a list",
 }
-# A kind of value → the types that are of it; to Python a bool is an int, so it comes first.
-_TYPES_OF_KIND: Final[Mapping[type, tuple[type, ...]]] = {
+# Type of a switch → types of its possible values; bool comes first, since a bool is also an int.
+_ALLOWED_TYPES: Mapping[type, tuple[type, ...]] = {
     bool: (bool,),
     float: (float, int),
     str: (str,),
     tuple: (tuple,),
 }
-# Number of headlines in a result's text.
-_TEXT_HEADLINES: Final = 4
-_HIGHER_IS_BETTER: Final = {"higher": True, "lower": False, "neither": None}
+# The repr of a result shows at most this many headlines.
+_MAX_REPR_HEADLINES = 4
+_HIGHER_IS_BETTER = {"higher": True, "lower": False, "neither": None}
 
 
 def switch_names(rules: DataclassInstance) -> list[str]:
-    """Return the names of all choices of a protocol; a part's choices begin with its name."""
+    """Return the names of all fields of a protocol; nested ones have dots, as in `part.choice`."""
     names = []
     for field in fields(rules):
         value = getattr(rules, field.name)
@@ -51,20 +53,22 @@ def switch_names(rules: DataclassInstance) -> list[str]:
 
 
 def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
-    """Return a protocol with some choices changed.
+    """Return a copy of a protocol with some fields changed.
 
     Args:
-        rules: Protocol, a frozen dataclass; parts of it may be others.
-        switches: Name from `switch_names` → value; lists stand for tuples, as JSON has them.
+        rules: Protocol, a frozen dataclass; its fields may be frozen dataclasses, too.
+        switches: Name from `switch_names` → value; lists are converted to tuples, which JSON does
+            not have.
 
     Raises:
-        ChoiceError: the protocol has no such choice, or it is of another kind: a number for a word.
-        DeepAccidentError: the choice cannot have that value.
+        ChoiceError: If the protocol does not have a field, or a value has the wrong type, such as a
+            number instead of a word.
+        DeepAccidentError: If a field cannot have the value.
     """
     if not switches:
         return rules
     changes: dict[str, Any] = {}
-    parts: dict[str, dict[str, Any]] = {}
+    nested_switches: dict[str, dict[str, Any]] = {}
     names = switch_names(rules)
     for name, value in switches.items():
         if name not in names:
@@ -72,55 +76,59 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
             raise ChoiceError(
                 f"these rules have no switch {name!r}{meant_text(name, names)}; {options}"
             )
-        head, _, tail = name.partition(".")
-        if tail:
-            parts.setdefault(head, {})[tail] = value
+        field_name, _, nested_name = name.partition(".")
+        if nested_name:
+            nested_switches.setdefault(field_name, {})[nested_name] = value
         else:
-            changes[head] = _of_kind(name, rules, head, as_tuples(value))
-    for head, part_switches in parts.items():
-        changes[head] = switched(getattr(rules, head), part_switches)
-    return replace(rules, **changes)  # all at once, since some are only valid together
+            changes[field_name] = _check_type(name, rules, field_name, as_tuples(value))
+    for field_name, part_switches in nested_switches.items():
+        part = getattr(rules, field_name)
+        changes[field_name] = switched(part, part_switches)
+    return replace(rules, **changes)  # all at once, since some values are only valid together
 
 
-def _of_kind(name: str, rules: DataclassInstance, field: str, value: Any) -> Any:
-    """Return a value if it is of the kind of a field's own; raises ChoiceError otherwise.
+def _check_type(name: str, rules: DataclassInstance, field_name: str, value: Any) -> Any:
+    """Return the new value of a field; raise ChoiceError if its type differs from the old one's.
 
-    A field with the value None takes any value.
+    A field whose value is None accepts any value.
     """
-    current = getattr(rules, field)
-    kind: type | None = None
-    for candidate in (bool, float, str, tuple):
-        if isinstance(current, _TYPES_OF_KIND[candidate]):
-            kind = candidate
+    old_value = getattr(rules, field_name)
+    switch_type: type | None = None
+    for candidate, types in _ALLOWED_TYPES.items():
+        if isinstance(old_value, types):
+            switch_type = candidate
             break
     if value is None:
-        types = [str(item.type) for item in fields(rules) if item.name == field]
-        is_allowed = any("None" in text for text in types)
-    elif kind is None:
+        annotations = {field.name: str(field.type) for field in fields(rules)}
+        is_allowed = "None" in annotations[field_name]
+    elif switch_type is None:
         is_allowed = True
+    elif isinstance(value, bool):  # would pass as a number
+        is_allowed = switch_type is bool
     else:
-        is_bool = isinstance(value, bool)
-        is_allowed = isinstance(value, _TYPES_OF_KIND[kind]) and (kind is bool or not is_bool)
+        is_allowed = isinstance(value, _ALLOWED_TYPES[switch_type])
     if not is_allowed:
         raise ChoiceError(
-            f"switch {name}: expected {_WORDS[kind]}, such as {current!r}, found {value!r}"
+            f"switch {name}: expected {_TYPE_NAMES[switch_type]}, such as {old_value!r}, found "
+            f"{value!r}"
         )
     return value
 
 
 def protocol_of(protocol: object, protocols: Mapping[str, _Kind]) -> _Kind:
-    """Return a protocol by its name, or the protocol itself if it is of the class of one of them.
+    """Return the protocol with a name, or the argument itself if it is a protocol.
 
     Raises:
-        ChoiceError: no protocol has that name.
+        ChoiceError: If no protocol has this name, or the argument has another class.
     """
-    if isinstance(protocol, tuple(map(type, protocols.values()))):
+    classes = tuple(map(type, protocols.values()))
+    if isinstance(protocol, classes):
         return cast("_Kind", protocol)
     return protocols[choice("protocol", protocol, protocols)]
 
 
 def as_tuples(value: Any) -> Any:
-    """Return lists as tuples, so that protocols can be compared and used as keys."""
+    """Convert lists to tuples, so that protocols can be compared and used as keys."""
     if isinstance(value, list | tuple):
         return tuple(as_tuples(item) for item in value)
     return value
@@ -131,29 +139,30 @@ _Value = TypeVar("_Value")
 
 
 class FrozenDict(dict[_Key, _Value]):
-    """A dict that does not change, and so has a hash where its values have one.
+    """A dict that cannot be changed, and therefore has a hash if its values have one.
 
-    It is a dict and not a view of one, since `dataclasses.asdict`, `copy.deepcopy` and `pickle`
-    refuse views.
+    It is a dict instead of a view of one, since `dataclasses.asdict`, `copy.deepcopy` and `pickle`
+    do not accept views.
     """
 
     def __hash__(self) -> int:  # type: ignore[override]  # dict has none, as it changes
-        """Return a hash that is equal for equal dicts."""
+        """Return a hash; equal dicts have equal hashes."""
         return hash(frozenset(self.items()))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return the arguments for pickle, which would fill an empty dict."""
+        """Tell pickle how to create a copy; by default it would fill an empty dict."""
         return type(self), (dict(self),)
 
-    def _refused(self, *_arguments: Any, **_named: Any) -> NoReturn:
-        raise TypeError("the mappings of a result cannot be changed; make a dict of it")
+    def _refuse_change(self, *_arguments: Any, **_named: Any) -> NoReturn:
+        """Raise TypeError."""
+        raise TypeError("the mappings in a result cannot be changed; copy the mapping into a dict")
 
-    __setitem__ = __delitem__ = __ior__ = _refused
-    clear = pop = popitem = setdefault = update = _refused
+    __setitem__ = __delitem__ = __ior__ = _refuse_change
+    clear = pop = popitem = setdefault = update = _refuse_change
 
 
 class FrozenMappings(ShortRepr):
-    """Base of frozen dataclasses with read-only mappings, from the start and in every copy."""
+    """Base of frozen dataclasses whose mappings are read-only, even in copies."""
 
     __slots__ = ()
 
@@ -162,22 +171,23 @@ class FrozenMappings(ShortRepr):
         for field in fields(self):  # type: ignore[arg-type]  # its subclasses are dataclasses
             value = getattr(self, field.name)
             if isinstance(value, Mapping):
-                object.__setattr__(self, field.name, _frozen(value))
+                object.__setattr__(self, field.name, _freeze_mappings(value))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all fields, as JSON holds them: None for NaN, numbers as keys as text ("5")."""
+        """Convert all fields to JSON values: NaN becomes None, and numeric keys become text."""
         names = [field.name for field in fields(self)]  # type: ignore[arg-type]
         return {name: plain(getattr(self, name)) for name in names}
 
 
 def plain(value: Any) -> Any:
-    """Return the contents of a result, as JSON holds them: None for NaN and infinite numbers."""
+    """Convert a result to JSON values; NaN and infinite numbers become None."""
     if isinstance(value, FrozenMappings):
         return value.as_dict()
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
+        names = [field.name for field in fields(value)]
+        value = {name: getattr(value, name) for name in names}
     if isinstance(value, Mapping):
         return {_key_text(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -188,19 +198,21 @@ def plain(value: Any) -> Any:
 
 
 def _key_text(key: object) -> str:
-    """Return a key as text, floats without needless digits: `5`."""
-    return f"{key:g}" if isinstance(key, float) else str(key)
+    """Convert a key to text; the float 5.0 becomes `5`."""
+    if isinstance(key, float):
+        return f"{key:g}"
+    return str(key)
 
 
-def _frozen(value: Any) -> Any:
-    """Return a value with all mappings in it frozen."""
+def _freeze_mappings(value: Any) -> Any:
+    """Freeze all mappings in a value."""
     if not isinstance(value, Mapping):
         return value
-    return FrozenDict({key: _frozen(item) for key, item in value.items()})
+    return FrozenDict({key: _freeze_mappings(item) for key, item in value.items()})
 
 
 Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
-# Largest possible number of a unit; other units have no limit.
+# Unit → its largest possible number; other units have no limit.
 LIMITS: Final[Mapping[Unit, float]] = MappingProxyType(
     {"%": 100.0, "share": 1.0, "1 - overlap": 1.0}
 )
@@ -212,9 +224,9 @@ class Headline:
 
     Attributes:
         name: Short name, as tables print it: `iou 30x30`, `accuracy@10`, `mAP`.
-        value: The number; None where there is nothing to count, or the result has no such number.
-        unit: `%` for percent, `share` for a share in [0, 1].
-        higher_is_better: Whether more is better; None where neither is.
+        value: The number; None if there is nothing to count, or the result has no such number.
+        unit: `%` for percent, `share` for a share in [0, 1], or a unit of measurement.
+        higher_is_better: Whether higher numbers are better; None if neither higher nor lower are.
         path: Path of the number in the result, as in `breakdowns.numbers_of`: `ranges/30x30/iou`.
     """
 
@@ -225,23 +237,23 @@ class Headline:
     path: str
 
     def text(self) -> str:
-        """Return the value with its unit; see `value_text`."""
+        """Format the value with its unit; see `value_text`."""
         return value_text(self.value, self.unit)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Describes one number of a result, or all numbers with paths that fit a pattern.
+    """Description of one number of a result, or of all numbers whose paths match a pattern.
 
     Attributes:
-        path: Path of the number in the result; `*` stands for any key.
+        path: Path of the number in the result; `*` matches any key.
         unit: Unit of the number.
-        better: Which numbers are better.
-        name: Short name for tables, in which `*` stands for the key; empty for the last part of the
-            path.
-        is_signed: Whether the number can be below 0.
-        is_headline: Whether the number is a headline; `*` in the path of a headline is exactly one
-            key.
+        better: Whether higher or lower numbers are better, or neither.
+        name: Short name for tables, in which `*` is replaced by the key; if it is empty, the name
+            is the last part of the path.
+        is_signed: Whether the number can be negative.
+        is_headline: Whether the number is a headline; `*` in the path of a headline matches exactly
+            one key.
     """
 
     path: str
@@ -256,8 +268,8 @@ class TaskResult(FrozenMappings):
     """Base of the results of evaluators; `repr` and notebooks show the headlines.
 
     Attributes:
-        rows: Describes every number of the result that is no total and no setting; headlines come
-            in this order.
+        rows: Descriptions of the result's numbers, except for totals and settings. Headlines are
+            shown in this order.
         samples: Number of samples.
     """
 
@@ -269,24 +281,24 @@ class TaskResult(FrozenMappings):
     def __repr__(self) -> str:
         """Return the number of samples and the first headlines."""
         numbers = headlines(self)
-        texts = [f"{number.name} {number.text()}" for number in numbers[:_TEXT_HEADLINES]]
-        if len(numbers) > _TEXT_HEADLINES:
+        texts = [f"{number.name} {number.text()}" for number in numbers[:_MAX_REPR_HEADLINES]]
+        if len(numbers) > _MAX_REPR_HEADLINES:
             texts.append("…")
         samples = counted(self.samples, "sample")
         return f"{type(self).__name__}({samples}: {', '.join(texts)})"
 
     def _repr_html_(self) -> str:
-        rows = [(number.name, number.text()) for number in headlines(self)]
-        return table_html(
-            [("number", "value"), *rows],
-            f"{type(self).__name__}, {counted(self.samples, 'sample')}",
-        )
+        """Format the headlines as an HTML table for notebooks."""
+        rows = [(metric_name(number.name), number.text()) for number in headlines(self)]
+        caption = f"{type(self).__name__}, {counted(self.samples, 'sample')}"
+        return table_html([("number", "value"), *rows], caption)
 
 
 def headlines(result: TaskResult) -> tuple[Headline, ...]:
     """Return the headline numbers of a result, the most important first.
 
-    A number that the protocol does not have is left out: the released accidents have no precision.
+    Numbers that the protocol does not have are left out, such as the precision of released
+    accidents.
     """
     numbers = []
     for row in result.rows:
@@ -296,7 +308,7 @@ def headlines(result: TaskResult) -> tuple[Headline, ...]:
         for key, value in _numbers_at(result, row.path):
             headline = Headline(
                 name=name.replace("*", key),
-                value=known(value),
+                value=json_numbers(value),
                 unit=row.unit,
                 higher_is_better=_HIGHER_IS_BETTER[row.better],
                 path=row.path.replace("*", key),
@@ -306,9 +318,9 @@ def headlines(result: TaskResult) -> tuple[Headline, ...]:
 
 
 def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
-    """Return a number with its unit, for people: `41.20 %`, `0.875`, `1.300 m`; `–` for none.
+    """Format a number with its unit, such as `41.20 %`, `0.875` or `1.300 m`; None is `–`.
 
-    With `signed` it is a change: `+1.300 m`, and `+0.54` for percent, in percentage points.
+    With `signed`, the number is a change, such as `+1.300 m`, or `+0.54` for percentage points.
     """
     if value is None:
         return "–"
@@ -316,25 +328,27 @@ def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
     digits = 2 if unit == "%" else 3
     number = f"{value:{sign}.{digits}f}"
     has_no_unit = unit in ("share", "1 - overlap") or (signed and unit == "%")
-    return number if has_no_unit else f"{number} {unit}"
+    if has_no_unit:
+        return number
+    return f"{number} {unit}"
 
 
 def _numbers_at(result: object, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield the keys that stand for the `*` of a path (empty without one), and their values."""
-    head, _, tail = path.partition("/")
+    """Yield each key that matches the `*` in a path (empty if there is none), with its value."""
+    name, _, inner_path = path.partition("/")
     if isinstance(result, Mapping):
         for key, item in result.items():
             text = _key_text(key)
-            if head not in ("*", text):
+            if name not in ("*", text):
                 continue
-            if not tail:
+            if not inner_path:
                 yield text, item
                 continue
-            for _, value in _numbers_at(item, tail):
+            for _, value in _numbers_at(item, inner_path):
                 yield text, value
-    elif hasattr(result, head):
-        value = getattr(result, head)
-        if tail:
-            yield from _numbers_at(value, tail)
+    elif hasattr(result, name):
+        value = getattr(result, name)
+        if inner_path:
+            yield from _numbers_at(value, inner_path)
         else:
             yield "", value

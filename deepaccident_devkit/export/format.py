@@ -1,4 +1,4 @@
-"""Base of export formats: settings, units of scenarios, output of a unit; shards and README."""
+"""The base of export formats: their settings, units and output, shards, and the README."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.selection import parse_where
 from deepaccident_devkit.support.files import place_in, remove_in, replacing, replacing_folder
 from deepaccident_devkit.support.reading import fault_text, open_file, read_bytes
-from deepaccident_devkit.support.text import choices, members_of, settle_choices
+from deepaccident_devkit.support.text import PathType, choices, members_of, settle_choices
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tables import split_choice
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
 
 LinkKind = Literal["hard", "symbolic", "copy"]
-# Errors of a file system that cannot make a link; a full disk is another matter.
-_NO_LINKS: Final = (
+# Errors of a file system that cannot make a link, unlike a full disk.
+_NO_LINKS = (
     errno.EXDEV,
     errno.EPERM,
     errno.EACCES,
@@ -37,10 +37,10 @@ _NO_LINKS: Final = (
     errno.ENOTSUP,
     errno.ENOSYS,
 )
-_DIGEST_SUFFIX: Final = re.compile(r"-[0-9a-f]{16}\Z")
-# In characters, of a name made from a token; endings of the devkit and of formats are appended, and
-# systems allow 255.
-_MAX_NAME_LENGTH: Final = 150
+_DIGEST_SUFFIX = re.compile(r"-[0-9a-f]{16}\Z")
+# Largest number of characters of a name made from a token. Systems allow 255, but the devkit and
+# the formats append endings.
+_MAX_NAME_LENGTH = 150
 README: Final = "README.md"
 SPLIT_NAMES: Final[Mapping[str | None, str]] = {
     "train": "train",
@@ -48,8 +48,8 @@ SPLIT_NAMES: Final[Mapping[str | None, str]] = {
     "test": "test",
     None: "unknown",
 }
-"""A scenario's split → its word in names of files; `datasets` expects these words."""
-_README_TEMPLATE: Final = """\
+"""Word for each split in the names of files; `datasets` expects these words."""
+_README_TEMPLATE = """\
 ---
 {head}---
 
@@ -61,9 +61,9 @@ DeepAccident
 
 Please cite the paper: Wang et al., DeepAccident: A Motion and Accident Prediction Benchmark for \
 V2X Autonomous Driving,
-AAAI 2024, https://arxiv.org/abs/2304.01168. The data are those of its authors, and their terms \
-hold. The licence of the
-devkit, Apache-2.0, is that of its code alone.
+AAAI 2024, https://arxiv.org/abs/2304.01168. The data belong to the authors of the paper, whose \
+terms apply. The licence
+Apache-2.0 covers only the code of the devkit.
 
 Everything is right-handed: x forward, y left, z up, yaw counter-clockwise; metres, seconds, \
 radians. Quaternions are
@@ -79,12 +79,12 @@ class Tally:
     """Counts of what was written.
 
     Attributes:
-        samples: Number of agents at moments.
-        files: Number of files written, not linked or copied.
-        bytes: Their size.
-        linked: Kind of link → number of files of the release that were linked or copied.
-        left_out: Kind of data → how much of it the format cannot hold, or is missing in this
-            (partial) release.
+        samples: Number of samples, each of one agent at one moment.
+        files: Number of files that were written, neither linked nor copied.
+        bytes: Size of these files, bytes.
+        linked: Number of files of the release that were linked or copied, by kind of link.
+        left_out: Number of items, by kind of data, that are missing in this (partial) release or
+            that the format cannot represent.
     """
 
     samples: int = 0
@@ -105,12 +105,12 @@ class Tally:
 
 
 class Output:
-    """The folder that a unit is written into. Each file is complete or absent, and counted.
+    """The folder that a unit is written into. Each file is complete or absent, and is counted.
 
     Attributes:
         folder: Folder that paths are relative to.
         parts: Folder of the unit's own files for `finish`.
-        tally: The counts so far; the format counts samples itself.
+        tally: The counts so far; the format itself counts samples.
     """
 
     def __init__(
@@ -126,26 +126,28 @@ class Output:
         Args:
             folder: Folder that paths are relative to.
             parts: Folder of the unit's own files.
-            link: Kind of links to the release's files; if it is impossible, the next kind is used.
+            link: Kind of links to files of the release; if it is impossible, the next kind is used.
             tally: Counts to add to; None for new ones.
-            note: Function that is called with each path before something is written there.
+            note: Function that is called with each path before anything is written there.
         """
-        self.folder, self.parts = folder, parts
+        self.folder = folder
+        self.parts = parts
         self.tally = Tally() if tally is None else tally
-        self._link, self._note = link, note
+        self._link = link
+        self._note = note
 
     def __repr__(self) -> str:
         return f"<output in {self.folder}>"
 
     def write(self, path: str, content: bytes) -> None:
-        """Write a file; the path is relative to the folder."""
+        """Write a file with a path relative to the folder."""
         with self.file(path) as temporary:
             temporary.write_bytes(content)
 
     @contextmanager
     def file(self, path: str) -> Iterator[Path]:
         """Yield a temporary path for a file that is written piece by piece."""
-        with replacing(self._place(path)) as temporary:
+        with replacing(self._prepare_path(path)) as temporary:
             yield temporary
             size = temporary.stat().st_size
         self.tally.files += 1
@@ -153,14 +155,14 @@ class Output:
 
     @contextmanager
     def whole_folder(self, path: str) -> Iterator[Output]:
-        """Yield the output of a folder; its files appear at once, and replace an older folder."""
-        target = self._place(path)
+        """Yield the output of a folder, whose files appear at once and replace an older folder."""
+        target = self._prepare_path(path)
         remove_in(self.folder, path)
         with replacing_folder(target) as temporary:
             yield Output(temporary, self.parts, self._link, self.tally)
 
     def link(self, source: ReleasePath, path: str, *, symbolic: bool = True) -> None:
-        """Link a file of the release: tries a hard link, then a symbolic link, then a copy.
+        """Link a file of the release, by a hard link, otherwise a symbolic link, otherwise a copy.
 
         A file in an archive is always copied.
 
@@ -171,19 +173,21 @@ class Output:
                 release.
 
         Raises:
-            SensorFileError: it cannot be read.
+            SensorFileError: If the file cannot be read.
         """
+        content = b""
+        file = None
         try:
             if isinstance(source, StorePath):
-                content, file = read_bytes(source, "image"), None
+                content = read_bytes(source, "image")
             else:
-                content, file = b"", Path(os.path.realpath(source))
+                file = Path(os.path.realpath(source))
                 open_file(file).close()
         except OSError as error:
             raise SensorFileError(
                 f"{source}: {fault_text(error)}; restore it from its archive"
             ) from error
-        with replacing(self._place(path)) as temporary:
+        with replacing(self._prepare_path(path)) as temporary:
             if file is None:
                 temporary.write_bytes(content)
                 link = "copy"
@@ -192,17 +196,17 @@ class Output:
         self.tally.linked[link] = self.tally.linked.get(link, 0) + 1
 
     def leave_out(self, kind: str, count: int = 1) -> None:
-        """Count data that is not written; `kind` is a plain plural, such as `untracked boxes`."""
+        """Count data that is not written; `kind` is its plain plural, such as `untracked boxes`."""
         if count:
             self.tally.left_out[kind] = self.tally.left_out.get(kind, 0) + count
 
-    def _place(self, path: str) -> Path:
+    def _prepare_path(self, path: str) -> Path:
         self._note(path)
         return place_in(self.folder, path)
 
 
 def _link_file(source: Path, target: Path, link: LinkKind, *, symbolic: bool) -> str:
-    """Link `target` to `source` by the first possible kind, from `link` on, and return the kind."""
+    """Link `target` to `source` by the first possible kind from `link` on, and return that kind."""
     functions: dict[str, Callable[[], object]] = {
         "hard": lambda: os.link(source, target),
         "symbolic": lambda: target.symlink_to(source),
@@ -227,7 +231,8 @@ class Unit:
     """Scenarios that one worker writes at once. No two units write the same file.
 
     Attributes:
-        name: Name of its folder of parts: letters, digits, `_`, `-` and dots, no dot first; unique.
+        name: Name of the folder of its parts, which is unique and consists of letters, digits, `_`,
+            `-` and dots, with no dot at the beginning.
         scenarios: Tokens, in order.
     """
 
@@ -237,20 +242,21 @@ class Unit:
 
 @dataclass(frozen=True, kw_only=True)
 class Format(ABC):
-    """A format with its settings; cheap to pickle. Each format adds settings of its own.
+    """A format with its settings, cheap to pickle. Each format adds its own settings.
 
     Attributes:
-        split: Only scenarios of this split, or of your own split file; None for all.
-        where: Only scenarios that match all of these filters (`deepaccident_devkit.selection`).
-        agents: Only recordings of these agents.
-        link: How files of the release are included where the format takes them unchanged: `hard`
-            links, otherwise `symbolic` ones, otherwise copies.
+        split: Name of the only split to export, or path of your own split file; None for all.
+        where: Filters that all exported scenarios match (`deepaccident_devkit.selection`).
+        agents: Agents with recordings to export.
+        link: Way to include files of the release that the format takes unchanged: `hard` links,
+            otherwise `symbolic` ones, otherwise copies.
 
     Raises:
-        ChoiceError: no such split, agent or kind of link; or a filter is not a valid text.
+        ChoiceError: If there is no such split, agent or kind of link, or a filter is not a valid
+            text.
     """
 
-    split: str | os.PathLike[str] | None = None
+    split: PathType | None = None
     where: tuple[str, ...] = ()
     agents: tuple[str, ...] = AGENTS
     link: LinkKind = "hard"
@@ -258,14 +264,14 @@ class Format(ABC):
     name: ClassVar[str]
     """Name on the command line, a single word."""
     unit_word: ClassVar[str] = "scenario"
-    """Name of a unit in texts."""
+    """Word for a unit in texts."""
     channels: ClassVar[tuple[str, ...]] = CHANNELS
-    """Sensors with files that decide what is written; tables and infos also name missing files."""
-    nothing: ClassVar[str] = (
-        "no chosen agent recorded one of these scenarios; choose other agents or scenarios"
+    """Sensors whose files decide what is written; tables and infos also name missing files."""
+    empty_reason: ClassVar[str] = (
+        "none of the chosen agents recorded these scenarios; choose other agents or scenarios"
     )
-    """Why there may be no sample to write, and the remedy."""
-    beside: ClassVar[tuple[str, ...]] = ()
+    """Text that states why there may be no sample to write, and what to do about it."""
+    compatible_formats: ClassVar[tuple[str, ...]] = ()
     """Formats that may already have exports in the same folder."""
 
     def __post_init__(self) -> None:
@@ -276,54 +282,64 @@ class Format(ABC):
         object.__setattr__(self, "where", tuple(members_of("where", self.where, "filters")))
         for text in self.where:
             parse_where(text)
-        object.__setattr__(self, "agents", checked_names("agents", self.agents, AGENTS))
+        object.__setattr__(self, "agents", check_names("agents", self.agents, AGENTS))
 
     def settings(self) -> dict[str, Any]:
         """Return all settings that decide what is written, for JSON.
 
-        The release is not among them. Links are not either, since they have the content of copies.
+        The release is not among them. The kind of links is not either, since links have the same
+        content as copies.
         """
         values = asdict(self)
         del values["link"]
-        return {**values, "split": None if self.split is None else os.fspath(self.split)}
+        if self.split is not None:
+            values["split"] = os.fspath(self.split)
+        return values
 
     def sensors(self) -> tuple[tuple[str, str], ...]:
-        """Return agents and channels of the sensor files that decide what is written."""
+        """Return the agents and channels of the sensor files that decide what is written."""
         return tuple(product(self.agents, self.channels))
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:  # noqa: ARG002 - for other formats
-        """Return the selected scenarios as units: one each."""
-        return [Unit(name=flat_name(token), scenarios=(token,)) for token in scenarios]
+        """Return the selected scenarios as units of one scenario each."""
+        units = []
+        for token in scenarios:
+            units.append(Unit(name=flat_name(token), scenarios=(token,)))
+        return units
 
     def check(self, dataset: Dataset, folder: Path) -> None:  # noqa: B027 - few formats add to one
-        """Raise ExportError or ConfigError if a folder lacks the export that the format adds to."""
+        """Check that a folder contains the export to which this format adds files.
+
+        Raises ExportError if it does not, and ConfigError if the export has other settings.
+        """
 
     @abstractmethod
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write a unit, and count its samples (`output.tally`).
+        """Write a unit, and count its samples in `output.tally`.
 
-        It is called again for the same unit after an interruption.
+        After an interruption, it is called again for the same unit.
         """
 
     def finish(  # noqa: B027 - some formats write nothing more
         self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
     ) -> None:
-        """Write files that span units, from their parts; called again after an interruption."""
+        """Write the files that span units from the units' parts.
+
+        After an interruption, it is called again.
+        """
 
 
-def checked_names(
-    argument: str, requested: Sequence[str], names: tuple[str, ...]
-) -> tuple[str, ...]:
+def check_names(argument: str, requested: Sequence[str], names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the requested names, each once, in their usual order.
 
-    Raises ChoiceError, also for none.
+    Raises ChoiceError if a name is unknown, or if no name is requested.
     """
-    valid_names = choices(argument, requested, names)
-    return tuple(name for name in names if name in valid_names)
+    requested_names = choices(argument, requested, names)
+    return tuple(name for name in names if name in requested_names)
 
 
 def flat_name(token: str) -> str:
-    """Return a scenario's token as the name of one folder: `<type>__<scenario>`; it is unique.
+    """Turn a scenario's token into a unique folder name: `<type>__<scenario>`.
 
     A digest of the token is appended if characters were replaced (all but ASCII letters, digits,
     `_`, `-` and dots), if the name was too long, or if it seems to end with a digest.
@@ -336,42 +352,50 @@ def flat_name(token: str) -> str:
     return f"{name}-{digest}"
 
 
-def shards(
+def divide_into_shards(
     dataset: Dataset, sizes: Mapping[str, int], limit: int
 ) -> dict[str, list[tuple[str, ...]]]:
-    """Return name of a split → its shards, each a tuple of consecutive scenarios.
+    """Divide scenarios into shards by their splits.
 
     Args:
         dataset: The release.
-        sizes: Scenario → its size.
+        sizes: Size of each scenario, by token.
         limit: Largest sum of sizes in a shard, unless it has only one scenario.
+
+    Returns:
+        The shards of each split, by the split's name; a shard is a tuple of consecutive scenarios.
     """
-    groups: dict[str, list[tuple[str, ...]]] = {name: [] for name in SPLIT_NAMES.values()}
-    free = dict.fromkeys(groups, 0)
+    shards: dict[str, list[tuple[str, ...]]] = {name: [] for name in SPLIT_NAMES.values()}
+    free_sizes = dict.fromkeys(shards, 0)
     for scenario, size in sizes.items():
         split = SPLIT_NAMES[dataset.scenario.get(scenario)["split"]]
-        split_groups = groups[split]
-        if not split_groups or size > free[split]:
-            split_groups.append(())
-            free[split] = limit
-        split_groups[-1] = (*split_groups[-1], scenario)
-        free[split] -= size
-    return {split: split_groups for split, split_groups in groups.items() if split_groups}
+        split_shards = shards[split]
+        if not split_shards or size > free_sizes[split]:
+            split_shards.append(())
+            free_sizes[split] = limit
+        split_shards[-1] = (*split_shards[-1], scenario)
+        free_sizes[split] -= size
+    return {split: split_shards for split, split_shards in shards.items() if split_shards}
 
 
-def readme(form: Format, dataset: Dataset, title: str, head: Mapping[str, Any], body: str) -> bytes:
-    """Return a README.md with a head in YAML, the export's contents and source, and a body."""
+def format_readme(
+    form: Format, dataset: Dataset, title: str, head: Mapping[str, Any], body: str
+) -> bytes:
+    """Return a README.md with a YAML head, the source and selection of the export, and a body."""
     import yaml
 
-    parts = [f"split {form.split}"] if form.split is not None else []
-    parts += [f"scenarios where {text}" for text in form.where]
-    scenarios, agents = ", ".join(parts) or "all scenarios", ", ".join(form.agents)
+    conditions = []
+    if form.split is not None:
+        conditions.append(f"split {form.split}")
+    conditions += [f"scenarios where {text}" for text in form.where]
+    scenarios = ", ".join(conditions) or "all scenarios"
+    agents = ", ".join(form.agents)
     return _README_TEMPLATE.format(
         head=yaml.safe_dump({"pretty_name": title, **head}, sort_keys=False, allow_unicode=True),
         title=title,
         name=form.name,
         devkit=__version__,
         version=dataset.version,
-        selection=f"It holds {scenarios}, as recorded by {agents}.",
+        selection=f"It contains {scenarios}, as recorded by {agents}.",
         body=body,
     ).encode()

@@ -1,8 +1,9 @@
-"""Keyframes of a recording, two a second counted back from its end, and its sensor files."""
+"""Keyframes of a recording (two a second, counted back from its end), and its sensor files."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, TypeAlias
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import PinholeCamera
@@ -13,25 +14,30 @@ from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CHANNEL_FORMAT
 
 KEY_STEP: Final = 5
-"""Number of recorded frames between keyframes."""
+"""Number of recorded frames from one keyframe to the next one."""
+SensorFile: TypeAlias = "tuple[ReleasePath, int]"
+"""Path of a sensor file, and its size in bytes."""
+FrameFiles: TypeAlias = "dict[int, SensorFile]"
+"""Sensor files by frame number."""
 
 
 def keyframes(frame_count: int) -> range:
-    """Return the numbers of a recording's keyframes, from 1 to its number of frames."""
-    return range((frame_count - 1) % KEY_STEP + 1, frame_count + 1, KEY_STEP)
+    """Return the frame numbers, from 1 to `frame_count`, of a recording's keyframes."""
+    first_keyframe = (frame_count - 1) % KEY_STEP + 1
+    return range(first_keyframe, frame_count + 1, KEY_STEP)
 
 
-def keyframe_after(number: int, frame_count: int) -> int:
-    """Return the keyframe that a frame leads to: itself, or the next one."""
+def next_keyframe(number: int, frame_count: int) -> int:
+    """Return the number of the first keyframe at or after a frame."""
     return number + (frame_count - number) % KEY_STEP
 
 
-def sensor_files(
-    dataset: Dataset, scenario: str, agent: str, channel: str
-) -> dict[int, tuple[ReleasePath, int]]:
-    """Return frame number → path and bytes of a channel's existing files.
+def sensor_files(dataset: Dataset, scenario: str, agent: str, channel: str) -> FrameFiles:
+    """Find the existing files of a channel.
 
-    Raises TokenError and DatarootError.
+    Raises:
+        TokenError: If there is no such scenario, agent or channel.
+        DatarootError: If the folder cannot be listed.
     """
     frame_count = dataset.scenario[dataset.getind("scenario", scenario)]["num_frames"]
     first_path = dataset.sensor_path(f"{sample_token(scenario, agent, 1)}/{channel}")
@@ -44,19 +50,22 @@ def sensor_files(
     return files
 
 
-def stored_camera(
-    dataset: Dataset, camera: str, file: tuple[ReleasePath, int] | None
-) -> PinholeCamera:
-    """Return a camera with K and size of its file of `sensor_files`, or of calib without a file.
+def select_files(files: FrameFiles, numbers: Iterable[int]) -> FrameFiles:
+    """Return the existing files of these frames."""
+    return {number: files[number] for number in numbers if number in files}
+
+
+def load_camera(dataset: Dataset, camera: str, file: SensorFile | None) -> PinholeCamera:
+    """Return a camera with the K and size of its stored image, or of calib without a file.
 
     Args:
         dataset: The release.
         camera: Token of the camera's image.
-        file: Path and bytes of the image; None for no file.
+        file: File of the image; None for no file.
 
     Raises:
-        TokenError: no such image.
-        SensorFileError: the file is no image.
+        TokenError: If there is no such image.
+        SensorFileError: If the file is not an image.
     """
     pinhole = dataset.camera(camera)
     if file is None:

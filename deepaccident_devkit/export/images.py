@@ -1,7 +1,5 @@
 """Camera images for models: resized, cropped and scaled, with matching intrinsics."""
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Iterable, Sequence
@@ -9,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 from math import gcd
-from typing import Any, Final, Literal, NamedTuple, SupportsIndex, get_args
+from typing import Any, Literal, NamedTuple, SupportsIndex, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,16 +21,17 @@ from deepaccident_devkit.taxonomy import CAMERAS
 
 ImageDtype = Literal["float32", "uint8"]
 Decoding = Literal["full", "scaled"]
-_NO_MEAN: Final = (0.0, 0.0, 0.0)
-_NO_STD: Final = (1.0, 1.0, 1.0)
+_NO_MEAN = (0.0, 0.0, 0.0)
+_NO_STD = (1.0, 1.0, 1.0)
 
 
 class VirtualCamera(NamedTuple):
     """A pinhole camera with the pose of a real one, to compare images of two sensor setups.
 
-    The image is scaled to this focal length, rounded to whole pixels of its size, and moved by
-    whole pixels until its principal point is in the middle; areas that the camera did not see are
-    black. So K is exact, but differs slightly from the requested one.
+    The image is scaled to this focal length, which is rounded so that the scaled size is in whole
+    pixels. The image is then shifted by whole pixels until the principal point is in the middle.
+    Areas that the real camera did not see are black. K is therefore exact, but differs slightly
+    from the requested one.
 
     Attributes:
         focal: Focal length in pixels.
@@ -52,45 +51,47 @@ class VirtualCamera(NamedTuple):
         Args:
             image: The full image of the real camera.
             lens: The real camera.
-            decode: How images are resized.
+            decode: Filter that resizes the image.
         """
-        height = max(round(lens.height * self.focal / lens.intrinsic[1, 1]), 1)
-        width = max(round(lens.width * self.focal / lens.intrinsic[0, 0]), 1)
-        intrinsic = lens.resized(width, height).intrinsic.copy()
-        corner = np.rint(intrinsic[:2, 2] - (self.width / 2, self.height / 2)).astype(int)
-        left, top = corner.tolist()
+        scaled_height = max(round(lens.height * self.focal / lens.intrinsic[1, 1]), 1)
+        scaled_width = max(round(lens.width * self.focal / lens.intrinsic[0, 0]), 1)
+        intrinsic = lens.resized(scaled_width, scaled_height).intrinsic.copy()
+        corner = np.rint(intrinsic[:2, 2] - (self.width / 2, self.height / 2))
+        left, top = corner.astype(int).tolist()
         intrinsic[:2, 2] -= (left, top)
         result = np.zeros((3, self.height, self.width), dtype=np.uint8).transpose(1, 2, 0)
-        rows = slice(max(top, 0), min(top + self.height, height))
-        columns = slice(max(left, 0), min(left + self.width, width))
-        if rows.start < rows.stop and columns.start < columns.stop:
-            part = (rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
-            target_rows = slice(rows.start - top, rows.stop - top)
-            target_columns = slice(columns.start - left, columns.stop - left)
-            result[target_rows, target_columns] = resized_part(image, (height, width), part, decode)
+        first_row = max(top, 0)
+        first_column = max(left, 0)
+        num_rows = min(top + self.height, scaled_height) - first_row
+        num_columns = min(left + self.width, scaled_width) - first_column
+        if num_rows > 0 and num_columns > 0:
+            size = (scaled_height, scaled_width)
+            crop = (first_row, first_column, num_rows, num_columns)
+            target = result[first_row - top :, first_column - left :]
+            target[:num_rows, :num_columns] = resized_part(image, size, crop, decode)
         return result, intrinsic
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageConfig:
-    """How images are prepared; checked on creation, raises ConfigError.
+    """Preparation of images; raises ConfigError on creation if a field is impossible.
 
     Attributes:
-        resize: Height and width to which the full image is resized; None keeps the stored size.
+        resize: Height and width to which the full image is resized; None for the stored size.
         crop: Top, left, height and width of the retained part, in pixels of the resized image; None
-            retains all.
-        dtype: `float32` in [0, 1], or `uint8` as decoded.
-        mean: Subtracted from the channels R, G, B in [0, 1]; `float32` only.
-        std: The channels are then divided by this; `float32` only.
-        cameras: The cameras, in this order.
-        decode: How images are resized: `full`, or `scaled` in two thirds of the time, with slightly
+            for all of it.
+        dtype: Type of the values: `float32` in [0, 1], or `uint8` as decoded.
+        mean: Values that are subtracted from the channels R, G, B in [0, 1]; only for `float32`.
+        std: Values by which the channels are then divided; only for `float32`.
+        cameras: Cameras, in this order.
+        decode: Way to resize images: `full`, or `scaled` in two thirds of the time, with slightly
             different pixels (docs/training.md). `full` decodes full images and resizes like
             Pillow's bilinear filter; `scaled` decodes JPEG at the smallest of 1/1, 1/2, 1/4 and 1/8
             that is no smaller than `resize` and resizes like OpenCV's area filter. A pixel differs
             by at most 1 of 255 from these libraries, except where `scaled` shrinks one axis and
             enlarges the other, for which OpenCV has another filter.
-        virtual_camera: Replaces `resize` and `crop`: the pinhole camera that all images look as if
-            taken by.
+        virtual_camera: Pinhole camera by which all images seem to be taken, instead of `resize` and
+            `crop`.
     """
 
     resize: tuple[int, int] | None = None
@@ -105,33 +106,36 @@ class ImageConfig:
     def __post_init__(self) -> None:
         """Check every field, and convert sequences to tuples."""
         if self.resize is not None:
-            self._set("resize", _pixels("resize", self.resize, "height and width", (1, 1)))
+            self._set("resize", _check_pixels("resize", self.resize, "height and width", (1, 1)))
         if self.crop is not None:
-            crop = _pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1))
+            crop = _check_pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1))
             self._set("crop", crop)
             if self.resize is not None:
                 _check_crop(self.crop, self.resize)
         allowed = {"dtype": get_args(ImageDtype), "decode": get_args(Decoding)}
         settle_choices(self, allowed, error=ConfigError)
         for name in ("mean", "std"):
-            self._set(name, _channels(name, getattr(self, name)))
+            self._set(name, _check_channels(name, getattr(self, name)))
         if min(self.std) <= 0:
             raise ConfigError(f"std: expected numbers above 0, found {self.std}")
         if self.dtype == "uint8" and (self.mean, self.std) != (_NO_MEAN, _NO_STD):
             raise ConfigError(
-                "mean and std: uint8 images are not scaled; choose dtype='float32', or leave them "
-                "out"
+                "mean and std: uint8 images are not scaled; choose dtype='float32', or "
+                "remove mean and std"
             )
-        self._set("cameras", _cameras(self.cameras))
+        cameras = choices("cameras", self.cameras, CAMERAS, error=ConfigError)
+        if len(set(cameras)) != len(cameras):
+            raise ConfigError(f"cameras: expected each camera once, found {self.cameras!r}")
+        self._set("cameras", cameras)
         if self.virtual_camera is not None:
             focal, *size = self.virtual_camera
-            height, width = _pixels("virtual_camera", size, "height and width", (1, 1))
+            height, width = _check_pixels("virtual_camera", size, "height and width", (1, 1))
             self._set("virtual_camera", VirtualCamera(focal, height, width))
-            is_used_with_others = (self.resize, self.crop) != (None, None)
-            if not 0 < focal < math.inf or is_used_with_others:
+            has_other_size = (self.resize, self.crop) != (None, None)
+            if not 0 < focal < math.inf or has_other_size:
                 raise ConfigError(
                     "virtual_camera: expected a focal length above 0, and no resize or crop "
-                    "beside it"
+                    "together with it"
                 )
 
     def _set(self, name: str, value: object) -> None:
@@ -144,17 +148,16 @@ class ImageConfig:
         full image is at (u · width' / width − left, v · height' / height − top).
 
         Raises:
-            TokenError: no such image.
-            MissingFileError: it was not downloaded.
-            SensorFileError: it cannot be read.
-            ConfigError: the crop reaches beyond the image.
+            TokenError: If there is no such image.
+            MissingFileError: If the image was not downloaded.
+            SensorFileError: If the image cannot be read.
+            ConfigError: If the crop reaches beyond the image.
         """
         lens = dataset.camera(camera)
         if self.virtual_camera is not None:
             image = dataset.load_image(camera)
-            return self.virtual_camera.capture(
-                image, lens.resized(image.shape[1], image.shape[0]), self.decode
-            )
+            image_lens = lens.resized(image.shape[1], image.shape[0])
+            return self.virtual_camera.capture(image, image_lens, self.decode)
         if self.resize is not None:
             min_size = self.resize if self.decode == "scaled" else None
             image = dataset.load_image(camera, min_size=min_size)
@@ -190,9 +193,9 @@ class ImageConfig:
         return intrinsic
 
     def values(self, images: ByteArray, known: BoolArray) -> AnyArray:
-        """Return images (A, P, C, 3, h, w) uint8 as an array of `dtype`.
+        """Convert images (A, P, C, 3, h, w) uint8 to an array of `dtype`.
 
-        Images are 0 where `known` (A, P) is False.
+        The values are 0 where `known` (A, P) is False.
         """
         if self.dtype == "uint8":
             return images
@@ -200,10 +203,11 @@ class ImageConfig:
         result = make_array(images.shape, dtype=np.float32)
         mean = np.array(self.mean, dtype=np.float32)[:, None, None]
         std = np.array(self.std, dtype=np.float32)[:, None, None]
-        scale, shift = np.float32(1) / (np.float32(255) * std), mean / std
-        for a, p in np.argwhere(known).tolist():
-            # image by image, since one fits into the processor's cache
-            for image, target in zip(images[a, p], result[a, p], strict=True):
+        scale = np.float32(1) / (np.float32(255) * std)
+        shift = mean / std
+        for agent, moment in np.argwhere(known).tolist():
+            # Images are converted one by one, because a single one fits into the processor's cache.
+            for image, target in zip(images[agent, moment], result[agent, moment], strict=True):
                 np.copyto(target, image)
                 np.multiply(target, scale, out=target)
                 np.subtract(target, shift, out=target)
@@ -216,16 +220,16 @@ def resized_part(
     crop: tuple[int, int, int, int] | None,
     decode: Decoding,
 ) -> ByteArray:
-    """Return a part of an image (H, W, 3) that is resized to `size`.
+    """Resize an image (H, W, 3) to `size`, and return only a part of the result.
 
     Args:
         image: The full image.
         size: Height and width to which the full image would be resized; little more than the part
             is computed.
         crop: Top, left, height and width of the part; None for all.
-        decode: The filter: with `full`, weights fall linearly with the distance, over two pixels of
-            the smaller of both images in each direction, like Pillow's bilinear filter; with
-            `scaled`, they are the areas that pixels share, like OpenCV's area filter.
+        decode: Name of the filter. With `full`, weights fall linearly with the distance, over two
+            pixels of the smaller of both images in each direction, like Pillow's bilinear filter.
+            With `scaled`, they are the areas by which pixels overlap, like OpenCV's area filter.
 
     Returns:
         Image (height, width, 3), the view of an array (3, height, width); see `ImageConfig.decode`.
@@ -233,62 +237,71 @@ def resized_part(
     import cv2
 
     top, left, height, width = crop or (0, 0, *size)
-    row_part, column_part = range(top, top + height), range(left, left + width)
-    rows = _resample(image.reshape(len(image), -1), size[0], row_part, decode)
-    turned: Any = cv2.transpose(rows.reshape(height, -1, 3)).reshape(-1, 3 * height)
-    columns = _resample(turned, size[1], column_part, decode).reshape(width, height, 3)
-    channels = [cv2.transpose(channel) for channel in cv2.split(columns)]
-    return np.stack(channels, dtype=np.uint8).transpose(1, 2, 0)
+    row_range = range(top, top + height)
+    column_range = range(left, left + width)
+    rows = _resample(image.reshape(len(image), -1), size[0], row_range, decode)
+    turned: Any = cv2.transpose(rows.reshape(height, -1, 3))
+    columns = _resample(turned.reshape(-1, 3 * height), size[1], column_range, decode)
+    channels = cv2.split(columns.reshape(width, height, 3))
+    upright_channels = [cv2.transpose(channel) for channel in channels]
+    return np.stack(upright_channels, dtype=np.uint8).transpose(1, 2, 0)
 
 
 def _resample(rows: ByteArray, new: int, part: range, decode: Decoding) -> ByteArray:
-    """Return a part of the `new` rows to which rows (old, n) are resized.
+    """Resize rows, and return only a part of the new ones.
 
-    They are running means of old rows, many at once.
+    New rows are running means of old rows; many of them are computed at once.
+
+    Args:
+        rows: The old rows, shape (old, n).
+        new: Number of rows to which the old ones are resized.
+        part: Numbers of the new rows to return.
+        decode: Name of the filter.
     """
     import cv2
 
     if len(rows) == new:
         return rows[part.start : part.stop]
     result = np.empty((len(part), rows.shape[1]), dtype=np.uint8)
-    groups = _groups(len(rows), new, part, decode)
-    means = np.zeros(
-        (max(len(new_rows) for new_rows, _ in groups), rows.shape[1]), dtype=np.float32
-    )
+    groups = _group_rows(len(rows), new, part, decode)
+    largest_size = max(len(new_rows) for new_rows, _ in groups)
+    means = np.zeros((largest_size, rows.shape[1]), dtype=np.float32)
     for new_rows, old_rows in groups:
-        start, stop = new_rows.start - part.start, new_rows.stop - part.start
+        start = new_rows.start - part.start
+        stop = new_rows.stop - part.start
         target = result[start : stop : new_rows.step]
         if len(old_rows) == 2:
             (first, total), (second, share) = old_rows
             cv2.addWeighted(rows[first], total - share, rows[second], share, 0, target)
         else:
             mean = means[: len(new_rows)]
-            for old, share in old_rows:
-                cv2.accumulateWeighted(rows[old], mean, share)
+            for old_row, share in old_rows:
+                cv2.accumulateWeighted(rows[old_row], mean, share)
             cv2.convertScaleAbs(mean, target)
     return result
 
 
 @lru_cache
-def _groups(
+def _group_rows(
     old: int, new: int, part: range, decode: Decoding
 ) -> list[tuple[range, list[tuple[slice, float]]]]:
-    """Return groups of `new` rows that are the same means of the `old` rows near them.
+    """Group the `new` rows that are the same means of the `old` rows near them.
 
     Returns:
-        For each group its rows, which have the same position between the old rows, and a list of
-        the old rows: the first one of the mean for each row of the group, and so on, with their
-        share in the mean of all up to them. Positions are counted in units of 1 / (2 `new`) of an
-        old row, and so in whole numbers.
+        (new rows, list of steps) for each group. The new rows of a group have the same position
+        relative to the old rows. Each step is a slice of the old rows, one old row for each new
+        row, and its share in the mean of all steps so far. Positions are counted in units of
+        1 / (2 `new`) of an old row, so that they are whole numbers.
     """
     reach = 2 * max(old, new) if decode == "full" else old
-    step, stride = new // gcd(old, new), old // gcd(old, new)
-    edge = -(
-        (old - reach) // (2 * old)
-    )  # number of rows at each end that reach beyond the old ones
-    inner = range(max(part.start, edge), min(part.stop, new - edge))
-    row_groups = [range(row, row + 1) for row in part if row not in inner]
-    row_groups += [inner[start::step] for start in range(step) if inner[start:]]
+    divisor = gcd(old, new)
+    step = new // divisor
+    stride = old // divisor
+    # Number of rows at each end that reach beyond the old ones.
+    num_edge_rows = -((old - reach) // (2 * old))
+    inner_rows = range(max(part.start, num_edge_rows), min(part.stop, new - num_edge_rows))
+    row_groups = [range(row, row + 1) for row in part if row not in inner_rows]
+    row_groups += [inner_rows[start::step] for start in range(step) if inner_rows[start:]]
     groups = []
     for new_rows in row_groups:
         centre = (2 * new_rows[0] + 1) * old
@@ -309,10 +322,13 @@ def _groups(
     return groups
 
 
-def _pixels(
+def _check_pixels(
     name: str, values: Iterable[SupportsIndex], meaning: str, minima: Sequence[int]
 ) -> tuple[int, ...]:
-    """Return whole numbers of pixels; raises ConfigError if one is below its minimum."""
+    """Return values as whole numbers of pixels.
+
+    Raises ConfigError if one is not a whole number, or is below its minimum.
+    """
     try:
         numbers = tuple(map(operator.index, values))
     except TypeError:
@@ -323,7 +339,7 @@ def _pixels(
     return numbers
 
 
-def _channels(name: str, values: ArrayLike) -> tuple[float, ...]:
+def _check_channels(name: str, values: ArrayLike) -> tuple[float, ...]:
     try:
         numbers = checked(name, values, (3,))
     except GeometryError:
@@ -331,13 +347,6 @@ def _channels(name: str, values: ArrayLike) -> tuple[float, ...]:
     if not np.isfinite(numbers).all():
         raise ConfigError(f"{name}: expected a number for each of R, G and B, found {values!r}")
     return tuple(numbers.tolist())
-
-
-def _cameras(requested: Iterable[str]) -> tuple[str, ...]:
-    names = choices("cameras", requested, CAMERAS, error=ConfigError)
-    if len(set(names)) != len(names):
-        raise ConfigError(f"cameras: expected each camera once, found {requested!r}")
-    return names
 
 
 def _check_crop(crop: tuple[int, int, int, int], size: tuple[int, int]) -> None:

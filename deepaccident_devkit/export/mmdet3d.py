@@ -1,4 +1,4 @@
-"""The infos of mmdet3d from 1.1 on, beside a nuScenes export with the files that they name.
+"""Infos for mmdet3d 1.1 or later, next to a nuScenes export with the files that they name.
 
     from deepaccident_devkit import DeepAccident
     from deepaccident_devkit.export.bulk import export_release
@@ -9,7 +9,7 @@
     export_release(da, "data/nuscenes", NuScenes(split="val"))
     export_release(da, "data/nuscenes", Mmdet3d(split="val"))
 
-docs/exports.md describes the mapping, and what is lost.
+`Mmdet3d` describes the mapping, docs/exports.md what is lost.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 
 from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.export.bulk import Manifest
-from deepaccident_devkit.export.frames import keyframes, stored_camera
+from deepaccident_devkit.export.frames import keyframes, load_camera
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import (
     AXES_ROTATIONS,
     CAMERA_CHANNELS,
     NUSCENES_VERSION,
-    sensor_path,
+    build_sensor_path,
     token,
 )
 from deepaccident_devkit.geometry import SE3
@@ -46,58 +46,68 @@ if TYPE_CHECKING:
     from deepaccident_devkit.export.nuscenes.scenes import AgentScene, Van
 
 NUSCENES_CLASSES: Final = (
-    *(
-        "car",
-        "truck",
-        "trailer",
-        "bus",
-        "construction_vehicle",
-        "bicycle",
-        "motorcycle",
-        "pedestrian",
-    ),
-    *("traffic_cone", "barrier"),
+    "car",
+    "truck",
+    "trailer",
+    "bus",
+    "construction_vehicle",
+    "bicycle",
+    "motorcycle",
+    "pedestrian",
+    "traffic_cone",
+    "barrier",
 )
-"""NuScenes' ten classes, in the order of the client's labels."""
+"""The ten classes of nuScenes, in the order of mmdet3d's labels."""
 LABELS: Final = MappingProxyType(
     {"car": 0, "truck": 1, "cyclist": 5, "motorcycle": 6, "pedestrian": 7}
 )
-"""Class of DeepAccident → its label; vans are labelled as cars or trucks."""
-# Largest number of clouds before a keyframe that an info names: one second.
-_MAX_SWEEPS: Final = 10
-_INFOS_FILE: Final = "infos.jsonl"
+"""Label of each DeepAccident class; vans are labelled as cars or trucks."""
+# Largest number of clouds before a keyframe that an info names, which is one second.
+_MAX_SWEEPS = 10
+_INFOS_FILE = "infos.jsonl"
+# An info, or a part of one.
+_Info: TypeAlias = "dict[str, Any]"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mmdet3d(NuScenes):
-    """`deepaccident_infos_train.pkl`, `…_val.pkl` and `…_test.pkl`.
+    """The files `deepaccident_infos_train.pkl`, `…_val.pkl` and `…_test.pkl`.
 
-    It has the settings of the nuScenes export in the same folder.
+    Their settings must equal the nuScenes export's in the same folder. An info contains:
+
+    - `instances`: the boxes of a keyframe, right-handed in the LiDAR frame, with centre, full
+      length, width and height, and counter-clockwise yaw.
+    - Labels: car, truck, cyclist, motorcycle and pedestrian are 0, 1, 5, 6 and 7 of nuScenes' ten
+      classes, and a van is what `van` sets. `category` has our class.
+    - Velocities: from positions at 10 Hz; mmdet3d makes an unknown velocity 0.
+    - `lidar_sweeps`: up to ten clouds before the keyframe. `lidar2sensor` is what the loader of
+      mmdet3d 1.4 needs, not the inverse of the sensor's pose.
+    - `deepaccident`: agent, scenario and frame.
     """
 
     name: ClassVar[str] = "mmdet3d"
-    beside: ClassVar[tuple[str, ...]] = ("nuscenes",)
+    compatible_formats: ClassVar[tuple[str, ...]] = ("nuscenes",)
 
     def check(self, dataset: Dataset, folder: Path) -> None:
-        """Raise an error for a folder without a complete nuScenes export of the same settings.
+        """Check that a folder has a complete nuScenes export with the same settings.
 
         Raises:
-            ExportError: there is none.
-            ConfigError: its settings differ.
+            ExportError: If there is no such export.
+            ConfigError: If the settings of that export differ.
         """
         settings = {**self.settings(), "version": dataset.version}
         manifest = Manifest.of(folder, NuScenes, settings)
         if manifest.release is None:
             raise ExportError(
-                f"{folder}: holds no complete nuscenes export, whose files the infos name; write "
+                f"{folder}: contains no complete nuscenes export, which the infos refer to; write "
                 "it there first, with the same settings"
             )
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write the infos of a scenario into its part, a line each."""
+        """Write the infos of a scenario into its part, one on each line."""
         lines = []
         for scene in self.scenes(dataset, unit):
-            for info in _infos(scene, self, output):
+            for info in _make_infos(scene, self, output):
                 lines.append(f"{json.dumps(info)}\n")
         output.tally.samples += len(lines)
         write_bytes(output.parts / _INFOS_FILE, "".join(lines).encode())
@@ -105,7 +115,7 @@ class Mmdet3d(NuScenes):
     def finish(
         self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
     ) -> None:
-        """Join the infos of each non-empty split; `sample_idx` is an info's index in its file."""
+        """Join the infos of each split that has any; `sample_idx` is their index in the file."""
         folders: dict[str, list[Path]] = {}
         for unit in units:
             split = dataset.get("scenario", unit.scenarios[0])["split"] or "unknown"
@@ -117,14 +127,14 @@ class Mmdet3d(NuScenes):
             "info_version": "1.1",
         }
         for split, split_folders in sorted(folders.items()):
-            pieces = (pickled_items([info]) for info in _numbered_infos(split_folders))
+            pieces = (pickled_items([info]) for info in _number_infos(split_folders))
             name = f"deepaccident_infos_{split}.pkl"
             with output.file(name) as temporary, temporary.open("wb") as file:
                 write_joined(file, "data_list", pieces, {"metainfo": metainfo})
 
 
-def _numbered_infos(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
-    """Yield the infos in the units' folders of parts, with their indices."""
+def _number_infos(folders: Iterable[Path]) -> Iterator[_Info]:
+    """Yield the infos from the units' part folders, numbered from 0."""
     index = 0
     for folder in folders:
         text = read_bytes(folder / _INFOS_FILE, "bundle").decode()
@@ -133,43 +143,44 @@ def _numbered_infos(folders: Iterable[Path]) -> Iterator[dict[str, Any]]:
             index += 1
 
 
-def _infos(scene: AgentScene, form: NuScenes, output: Output) -> Iterator[dict[str, Any]]:
-    """Yield the infos of a scene's keyframes, without `sample_idx`."""
+def _make_infos(scene: AgentScene, form: NuScenes, output: Output) -> Iterator[_Info]:
+    """Yield the infos of the keyframes of a scene, without `sample_idx`."""
     lidar_from_client = SE3.from_rotation(AXES_ROTATIONS[form.lidar_axes]).inverse()
-    for number in keyframes(scene.last):
+    for number in keyframes(scene.last_frame):
         sample = scene.sample(number)
         world_from_lidar = scene.dataset.world_from(sample, "lidar") @ lidar_from_client
         ego_from_lidar = scene.dataset.ego_from(sample, LIDAR) @ lidar_from_client
         lidar_from_world = world_from_lidar.inverse()
-        images = _images(scene, number, ego_from_lidar, output)
+        images = _make_image_infos(scene, number, ego_from_lidar, output)
         if number not in scene.files[LIDAR]:
             output.leave_out("point clouds that are not in this release (the infos name them)")
         earlier_numbers = range(number - 1, max(number - 1 - _MAX_SWEEPS, 0), -1)
-        sweeps = [earlier for earlier in earlier_numbers if earlier in scene.files[LIDAR]]
-        boxes = _instances(scene, sample, form.van, lidar_from_client.inverse(), output)
+        sweeps = []
+        for earlier in earlier_numbers:
+            if earlier in scene.files[LIDAR]:
+                sweeps.append(_make_sweep(scene, earlier, lidar_from_world, lidar_from_client))
+        instances = _make_instances(scene, sample, form.van, lidar_from_client.inverse(), output)
         yield {
             "token": token("sample", sample),
-            "timestamp": scene.stamp(number) / 1e6,
+            "timestamp": scene.timestamp(number) / 1e6,
             "ego2global": scene.dataset.world_from(sample, "ego").matrix.tolist(),
             "lidar_points": {
                 "num_pts_feats": 5,
-                "lidar_path": _file(scene, LIDAR, number).name,
+                "lidar_path": _locate_file(scene, LIDAR, number).name,
                 "lidar2ego": ego_from_lidar.matrix.tolist(),
             },
             "images": images,
-            "lidar_sweeps": [
-                _sweep(scene, sweep, lidar_from_world, lidar_from_client) for sweep in sweeps
-            ],
-            "instances": list(boxes),
+            "lidar_sweeps": sweeps,
+            "instances": list(instances),
             "cam_instances": {},
             "deepaccident": {"scenario": scene.scenario, "agent": scene.agent, "frame": number},
         }
 
 
-def _images(
+def _make_image_infos(
     scene: AgentScene, number: int, ego_from_lidar: SE3, output: Output
-) -> dict[str, dict[str, Any]]:
-    """Return channel → info of its image in a keyframe, and count missing images."""
+) -> dict[str, _Info]:
+    """Return the info of each camera's image at a keyframe by channel; count missing images."""
     sample = scene.sample(number)
     images = {}
     for camera, channel in CAMERA_CHANNELS.items():
@@ -179,31 +190,32 @@ def _images(
             continue
         ego_from_camera = scene.dataset.ego_from(sample, camera)
         camera_from_lidar = ego_from_camera.inverse() @ ego_from_lidar
-        lens = stored_camera(scene.dataset, f"{sample}/{camera}", file)
+        lens = load_camera(scene.dataset, f"{sample}/{camera}", file)
         images[channel] = {
-            "img_path": _file(scene, camera, number).name,
+            "img_path": _locate_file(scene, camera, number).name,
             "cam2img": lens.intrinsic.tolist(),
             "lidar2cam": camera_from_lidar.matrix.tolist(),
             "cam2ego": ego_from_camera.matrix.tolist(),
             "sample_data_token": token("sample_data", sample, camera),
-            "timestamp": scene.stamp(number) / 1e6,
+            "timestamp": scene.timestamp(number) / 1e6,
         }
     return images
 
 
-def _sweep(
+def _make_sweep(
     scene: AgentScene, number: int, lidar_from_world: SE3, lidar_from_client: SE3
-) -> dict[str, Any]:
+) -> _Info:
     """Return the info of a cloud before a keyframe.
 
-    The client rotates points by the transpose of `lidar2sensor` and subtracts its fourth column
-    without rotation. So that column is the displacement of the sensor, not that of the inverse.
+    mmdet3d rotates points by the transpose of `lidar2sensor` and subtracts its fourth column
+    without rotating it. So that column is the displacement of the sensor, not the displacement of
+    the inverse transform.
 
     Args:
         scene: The scene.
-        number: Frame of the cloud.
+        number: Number of the cloud's frame.
         lidar_from_world: Transform to the LiDAR frame of the keyframe.
-        lidar_from_client: Rotation from the client's LiDAR axes.
+        lidar_from_client: Rotation from mmdet3d's LiDAR axes.
     """
     sample = scene.sample(number)
     lidar_from_sensor = (
@@ -213,8 +225,8 @@ def _sweep(
     lidar_to_sensor = np.eye(4)
     lidar_to_sensor[:3, :3] = lidar_from_sensor.rotation.T
     lidar_to_sensor[:3, 3] = -lidar_from_sensor.translation
-    # with its folder, by which the client recognises keyframes
-    lidar_path = str(_file(scene, LIDAR, number))
+    # The path includes the folder, by which mmdet3d recognises keyframes.
+    lidar_path = str(_locate_file(scene, LIDAR, number))
     return {
         "lidar_points": {
             "lidar_path": lidar_path,
@@ -222,17 +234,17 @@ def _sweep(
             "lidar2sensor": lidar_to_sensor.tolist(),
         },
         "ego2global": scene.dataset.world_from(sample, "ego").matrix.tolist(),
-        "timestamp": scene.stamp(number) / 1e6,
+        "timestamp": scene.timestamp(number) / 1e6,
         "sample_data_token": token("sample_data", sample, LIDAR),
     }
 
 
-def _instances(
+def _make_instances(
     scene: AgentScene, sample: str, van: Van, client_from_lidar: SE3, output: Output
-) -> Iterator[dict[str, Any]]:
-    """Yield the boxes of a keyframe as in the nuScenes export, without the agent's own.
+) -> Iterator[_Info]:
+    """Yield the boxes of a keyframe as in the nuScenes export, without the agent's own box.
 
-    The client replaces NaN velocities by 0.
+    mmdet3d replaces NaN velocities by 0.
     """
     all_boxes = scene.dataset.boxes(sample, "lidar", velocity="derived")
     other_actors = all_boxes.select(all_boxes.actor_id != OWN_ACTOR_ID)
@@ -254,8 +266,8 @@ def _instances(
         }
 
 
-def _file(scene: AgentScene, channel: str, number: int) -> PurePosixPath:
-    """Return the path of a sensor file in the folder of the nuScenes export."""
+def _locate_file(scene: AgentScene, channel: str, number: int) -> PurePosixPath:
+    """Return the path of a sensor file within the nuScenes export."""
     return PurePosixPath(
-        sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
+        build_sensor_path(scene.name, channel, scene.timestamp(number), is_key=scene.is_key(number))
     )

@@ -1,4 +1,4 @@
-"""The infos that the released code's own converter makes, which its two dataset classes read.
+"""Info files as the released code's converter writes them, for its two dataset classes.
 
     from deepaccident_devkit import DeepAccident
     from deepaccident_devkit.export.bulk import export_release
@@ -10,13 +10,11 @@
 docs/exports.md lists what is left out, and where the classes look for files.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -42,42 +40,42 @@ from deepaccident_devkit.v2x.agents import agents_of
 
 logger = logging.getLogger(__name__)
 
-# Split with a file → version that the converter writes into it.
-_SPLITS: Final[Mapping[str, str]] = {
+# Version that the converter writes into the file of each split.
+_SPLITS: Mapping[str, str] = {
     "train": "v1.0-trainval",
     "val": "v1.0-trainval",
     "train_mini": "v1.0-mini",
     "val_mini": "v1.0-mini",
 }
-_INFOS_SUFFIX: Final = ".infos"
-_EMPTY_LIST: Final = "without_boxes.txt"
-# Number of slashes before the scenario type in a path that the released code can read.
-_PATH_DEPTH: Final = 2
+_INFOS_SUFFIX = ".infos"
+_EMPTY_LIST = "without_boxes.txt"
+# Number of slashes before the scenario type in each path that the released code can read.
+_PATH_DEPTH = 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedInfos(Format):
-    """`carla_infos_train.pkl`, `…_val.pkl`, and `…_mini.pkl` if the release has mini split files.
+    """The files `carla_infos_train.pkl`, `…_val.pkl` and, with mini split files, `…_mini.pkl`.
 
-    Values are unchanged from the files, left-handed, except −yaw and −vy; two keyframes a second;
-    all five agents.
+    They have two keyframes a second and all five agents. Values are taken from the release's files,
+    and so left-handed, except −yaw and −vy.
 
     Attributes:
-        root_prefix: Beginning of paths. The released classes find a scenario's meta file by the
-            first four parts of a path, and the last of the four must be the scenario type: three
-            parts, or, in a release with split folders, two.
-        drop_empty: Leave out infos without boxes, at which both released classes stop.
-            The converter retains them.
+        root_prefix: Beginning of paths. The released classes find the meta file of a scenario by
+            the first four parts of a path, and the fourth must be the scenario type. So this has
+            three parts or, in a release with split folders, two.
+        drop_empty: Whether to exclude infos without boxes, which the released converter writes
+            but both released classes fail on.
 
     Raises:
-        ChoiceError: the prefix is no path, or only some agents are selected.
+        ChoiceError: If the prefix is not a path, or only some agents are selected.
     """
 
     root_prefix: str = "./data/DeepAccident_data"
     drop_empty: bool = False
     name: ClassVar[str] = "released"
     channels: ClassVar[tuple[str, ...]] = ()
-    nothing: ClassVar[str] = (
+    empty_reason: ClassVar[str] = (
         "no scenario is in the split files train.txt or val.txt (which are in the root of the "
         "release or in split_txt_files) and has labels and all five agents; add these files, or "
         "choose other scenarios"
@@ -87,16 +85,16 @@ class ReleasedInfos(Format):
         """Check the choices."""
         super().__post_init__()
         if self.agents != AGENTS:
-            raise ChoiceError("agents: the released classes need all five; leave this choice out")
+            raise ChoiceError("agents: the released classes need all five; remove this choice")
         if not self.root_prefix.isprintable():
             raise ChoiceError(f"root_prefix: expected a path, found {self.root_prefix!r}")
         object.__setattr__(self, "root_prefix", self.root_prefix.rstrip("/"))
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
-        """Return the selected scenarios as units: one each.
+        """Return the selected scenarios as units of one scenario each.
 
         Raises:
-            ChoiceError: the prefix has too many parts or too few.
+            ChoiceError: If the prefix has too many or too few parts.
         """
         folders = {dataset.get("scenario", token)["folder"] for token in scenarios}
         for folder in sorted(folders):
@@ -111,9 +109,9 @@ class ReleasedInfos(Format):
         return super().units(dataset, scenarios)
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Make the infos of a scenario, one part for each agent."""
+        """Write the infos of a scenario, with one part for each agent."""
         token = unit.scenarios[0]
-        fault = _fault(dataset, token)
+        fault = _find_fault(dataset, token)
         if fault:
             output.leave_out(fault)
             return
@@ -121,33 +119,35 @@ class ReleasedInfos(Format):
         folder = ScenarioFolder(
             dataset.dataroot, record["folder"], record["scenario_type"], record["name"], AGENTS
         )
-        empty: list[str] = []
+        numbers = keyframes(record["num_frames"])
+        empty_infos: list[str] = []
         for agent in AGENTS:
-            infos = list(_infos(folder, agent, _keyframes(dataset, token), self.root_prefix))
-            boxless = [info["lidar_prefix"] for info in infos if not len(info["gt_boxes"])]
+            infos = list(_make_infos(folder, agent, numbers, self.root_prefix))
             output.tally.samples += len(infos)
+            prefixes = [info["lidar_prefix"] for info in infos if not len(info["gt_boxes"])]
             if self.drop_empty:
                 infos = [info for info in infos if len(info["gt_boxes"])]
-                output.leave_out("infos without boxes", len(boxless))
+                output.leave_out("infos without boxes", len(prefixes))
             else:
-                empty += boxless
+                empty_infos += prefixes
             name = f"{folder.scenario_type}_{agent}_{folder.name}_{_INFOS_SUFFIX}"
             write_bytes(output.parts / name, pickled_items(infos))
-        write_bytes(
-            output.parts / _EMPTY_LIST, "".join([f"{prefix}\n" for prefix in empty]).encode()
-        )
+        lines = [f"{prefix}\n" for prefix in empty_infos]
+        write_bytes(output.parts / _EMPTY_LIST, "".join(lines).encode())
 
     def finish(
         self, dataset: Dataset, units: Sequence[Unit], output: Output, parts: Callable[[Unit], Path]
     ) -> None:
-        """Join the parts of each split, in the order of `lidar_prefix`."""
+        """Join the parts of each split in the order of `lidar_prefix`; list infos without boxes."""
         for split, version in _SPLITS.items():
             try:
                 scenarios = dataset.split_scenarios(split)
             except NotAvailableError:
                 continue
-            folders = [parts(unit) for unit in units if unit.scenarios[0] in scenarios]
-            paths = [path for folder in folders for path in folder.glob(f"*{_INFOS_SUFFIX}")]
+            paths: list[Path] = []
+            for unit in units:
+                if unit.scenarios[0] in scenarios:
+                    paths += parts(unit).glob(f"*{_INFOS_SUFFIX}")
             paths.sort(key=lambda path: path.name)
             if paths:
                 pieces = (read_bytes(path, "bundle") for path in paths)
@@ -155,38 +155,35 @@ class ReleasedInfos(Format):
                 with output.file(name) as temporary, temporary.open("wb") as file:
                     write_joined(file, "infos", pieces, {"metadata": {"version": version}})
         list_paths = [parts(unit) / _EMPTY_LIST for unit in units]
-        empty = b"".join(read_bytes(path, "bundle") for path in list_paths if path.exists())
-        if empty:
-            output.write(f"carla_infos_{_EMPTY_LIST}", empty)
+        empty_infos = b"".join(read_bytes(path, "bundle") for path in list_paths if path.exists())
+        if empty_infos:
+            output.write(f"carla_infos_{_EMPTY_LIST}", empty_infos)
             logger.warning(
                 "%d infos have no boxes (carla_infos_%s lists them): the released classes stop at "
-                "them; drop_empty (--drop-empty) leaves them out",
-                empty.count(b"\n"),
+                "them; drop_empty (--drop-empty) excludes them",
+                empty_infos.count(b"\n"),
                 _EMPTY_LIST,
             )
 
 
-def _keyframes(dataset: Dataset, scenario: str) -> range:
-    return keyframes(dataset.get("scenario", scenario)["num_frames"])
-
-
-def _fault(dataset: Dataset, scenario: str) -> str | None:
-    """Return why the released code cannot use a scenario, as a plural; None if it can."""
-    if dataset.get("scenario", scenario)["split"] not in _SPLITS:
+def _find_fault(dataset: Dataset, scenario: str) -> str | None:
+    """Name the kind of unusable scenario that this is; None if the released code can use it."""
+    record = dataset.get("scenario", scenario)
+    if record["split"] not in _SPLITS:
         return "scenarios that are neither in train nor in val"
     if agents_of(dataset, scenario) != AGENTS:
         return "scenarios without all five agents"
-    for number in _keyframes(dataset, scenario):
+    for number in keyframes(record["num_frames"]):
         for sample in dataset.samples_of(frame_token(scenario, number)):
             if not sample["labelled"]:
                 return "scenarios without labels"
     return None
 
 
-def _infos(
+def _make_infos(
     folder: ScenarioFolder, agent: str, numbers: range, root_prefix: str
 ) -> Iterator[dict[str, Any]]:
-    """Yield the infos of an agent's keyframes, with the converter's own keys."""
+    """Yield the infos of an agent's keyframes, with the keys that the converter uses."""
     calibs = [read_calib(folder.calib_path(agent, number), raw=True) for number in numbers]
     name_parts = folder.name.split("_")
     scene_name = f"{folder.scenario_type}_{name_parts[0]}_{name_parts[-1]}"
@@ -218,11 +215,11 @@ def _infos(
             "cams": cameras,
             "lidar_to_ego_matrix": calib["lidar_to_ego"],
             "ego_to_world_matrix": calib["ego_to_world"],
-            **_boxes(read_label(folder.label_path(agent, number), raw=True)),
+            **_make_box_columns(read_label(folder.label_path(agent, number), raw=True)),
         }
 
 
-def _boxes(label: Labels) -> dict[str, Any]:
+def _make_box_columns(label: Labels) -> dict[str, Any]:
     speed_x, speed_y = label.agent_velocity[0].tolist()
     return {
         "vehicle_speed_x": speed_x,

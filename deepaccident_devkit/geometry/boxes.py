@@ -1,6 +1,6 @@
-"""`Boxes`: oriented boxes of a sample, a struct of arrays; `Box`: a view of one row.
+"""`Boxes`: oriented boxes of a sample as arrays; `Box`: a view of one row.
 
-`Box` has the names of nuScenes.
+`Box` has the attribute names of nuScenes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from deepaccident_devkit.support.nuscenes_names import (
     with_keywords_named,
     without_names,
 )
-from deepaccident_devkit.support.text import Pictured
+from deepaccident_devkit.support.text import PictureRepr, counted
 from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
 
 if TYPE_CHECKING:
@@ -54,50 +54,58 @@ CORNER_SIGNS = np.array(
     ],
     dtype=np.float64,
 )
-"""Signs of (length, width, height) of the eight corners: four in front, then four behind, each four
-clockwise from the upper left, for a viewer in the box who looks forward (the nuScenes devkit's
-order, with y left)."""
+"""Signs of (length, width, height) of the eight corners, in the nuScenes devkit's order.
+
+The four in front come first, then the four behind; each four are clockwise from the upper left, as
+seen by a viewer in the box who looks forward (with y left).
+"""
+# Indices of the lower corners: front right, front left, rear left, rear right.
 BOTTOM_CORNERS = (2, 3, 7, 6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Boxes(FrozenArrays, Pictured):
-    """N oriented boxes in one right-handed coordinate frame; arrays are read-only copies.
+class Boxes(FrozenArrays, PictureRepr):
+    """N oriented boxes in one right-handed coordinate frame, as read-only copies of the arrays.
 
     Attributes:
         frame: Coordinate frame: `world`, `ego`, `lidar` or a camera channel (then with optical
             axes).
-        center: (N, 3) float64, metres.
-        size: (N, 3) float64, full length, width, height, metres.
-        rotation: (N, 4) float64, unit quaternions w, x, y, z: the box's axes (x along its length)
-            in `frame`.
-        velocity: (N, 3) float64, m/s over the ground (not relative to the agent), NaN if unknown.
-        category: (N,) int8, index into `taxonomy.CATEGORIES`.
-        actor_id: (N,) int64, the label's id; −100 is the recording agent, −1 an untracked actor.
-        num_lidar_pts: (N,) int64, LiDAR points of the recording agent in the box.
-        camera_visible: (N,) bool, whether any of the recording agent's cameras sees it.
-        row: (N,) int64, row of each box in its label file, counted from 0.
-        sample: Token of the sample with all of them in its label; None if they are of several or of
-            none.
+        center: (N, 3) float64 centres, metres.
+        size: (N, 3) float64 full length, width, height, metres.
+        rotation: (N, 4) float64 unit quaternions w, x, y, z: the box's axes (x along its length) in
+            `frame`.
+        velocity: (N, 3) float64 velocities over the ground (not relative to the agent), m/s, NaN if
+            unknown.
+        category: (N,) int8 index into `taxonomy.CATEGORIES`.
+        actor_id: (N,) int64 id in the label; −100 is the recording agent, −1 an untracked actor.
+        num_lidar_pts: (N,) int64 number of LiDAR points of the recording agent in the box.
+        camera_visible: (N,) bool, whether any of the recording agent's cameras sees the box.
+        row: (N,) int64 row of the box in its label file, counted from 0.
+        sample: Token of the sample whose label contains all boxes; None if the boxes come from
+            several samples or from none.
     """
 
-    # where the boxes are
+    # Where the boxes are.
     frame: str
     center: FloatArray
     size: FloatArray
     rotation: FloatArray
     velocity: FloatArray
-    # what they are
+    # What they are.
     category: AnyArray
     actor_id: IntArray
     num_lidar_pts: IntArray
     camera_visible: BoolArray
-    # which label they are from
+    # Which label they come from.
     row: IntArray
     sample: str | None = None
 
     def __post_init__(self) -> None:
-        """Check shapes and numbers; raises GeometryError."""
+        """Check shapes and numbers.
+
+        Raises:
+            GeometryError: If a shape is wrong or a number is invalid.
+        """
         checked_frame("Boxes.frame", self.frame)
         if not (self.sample is None or isinstance(self.sample, str)):
             raise GeometryError(f"Boxes.sample: expected a token or None, found {self.sample!r}")
@@ -124,21 +132,27 @@ class Boxes(FrozenArrays, Pictured):
         category: ArrayLike | None = None,
         **columns: ArrayLike,
     ) -> Boxes:
-        """Return boxes that stand upright in `frame`.
+        """Return upright boxes in `frame` (rotated about z only).
 
         Args:
-            center: (N, 3) metres.
+            center: (N, 3) centres, metres.
             size: (N, 3) full length, width, height, metres.
-            yaw: (N,) radians, counter-clockwise.
+            yaw: (N,) headings, radians, counter-clockwise.
             frame: Coordinate frame of all values.
-            category: (N,) indices or names; None for cars.
-            **columns: Other columns of `Boxes`; they default to unknown values (velocity NaN, id
-                −1, no points, not visible).
+            category: (N,) indices or names of categories; None for cars.
+            **columns: Other columns of `Boxes`; by default they are unknown (velocity NaN, id −1,
+                no points, not visible).
+
+        Raises:
+            GeometryError: If a shape is wrong, a number or category is invalid, or a column is
+                unknown.
         """
         heading = checked("Boxes.yaw", yaw, (None,))
         count = len(heading)
+        if category is None:
+            category = np.zeros(count, dtype=np.int8)
         all_columns: dict[str, Any] = {
-            "category": np.zeros(count, dtype=np.int8) if category is None else category,
+            "category": category,
             "velocity": np.full((count, 3), np.nan),
             "actor_id": np.full(count, -1),
             "num_lidar_pts": np.zeros(count),
@@ -168,17 +182,17 @@ class Boxes(FrozenArrays, Pictured):
     @overload
     def __getitem__(self, key: slice | Sequence[int] | Sequence[bool] | AnyArray) -> Boxes: ...
     def __getitem__(self, key: Any) -> Box | Boxes:
-        """Return one box by its number, or the boxes of a slice, a mask or an array of numbers.
+        """Return one box by its index, or the boxes of a slice, a mask or an array of rows.
 
-        Negative numbers count from the end. A mask has shape (N,).
+        Negative indices count from the end. A mask has shape (N,).
 
         Raises:
-            IndexError: there are fewer boxes.
-            GeometryError: `key` is none of these, or is for more boxes than there are (see
+            IndexError: If the index is out of range.
+            GeometryError: If `key` is none of these, or does not fit the number of boxes (see
                 `select`).
         """
         if isinstance(key, slice):
-            return self._picked(key)
+            return self._select(key)
         try:
             number = operator.index(key)
         except TypeError:
@@ -186,21 +200,24 @@ class Boxes(FrozenArrays, Pictured):
         if isinstance(key, bool):
             return self.select(key)
         if not -len(self) <= number < len(self):
-            raise IndexError(f"there are {len(self)} boxes, asked for box {number}")
+            raise IndexError(f"no box {number} among {counted(len(self), 'box')}")
         row = number % len(self)
-        token = None if self.sample is None else f"{self.sample}/{self.row.item(row)}"
-        return Box(self._picked(slice(row, row + 1)), token)
+        token = None
+        if self.sample is not None:
+            token = f"{self.sample}/{self.row.item(row)}"
+        return Box(self._select(slice(row, row + 1)), token)
 
     def __iter__(self) -> Iterator[Box]:
-        """Yield each box, which takes a few microseconds: for many boxes the arrays are faster."""
-        return (self[number] for number in range(len(self)))
+        """Yield each box, which takes a few microseconds; for many boxes, use the arrays."""
+        for row in range(len(self)):
+            yield self[row]
 
     def __array__(self, dtype: object = None, copy: object = None) -> NoReturn:
-        """Raise GeometryError: boxes are several arrays.
+        """Raise GeometryError, because boxes consist of several arrays.
 
-        Without this, numpy would make an array of objects.
+        Without this method, numpy would make an array of objects.
         """
-        raise GeometryError("Boxes are several arrays; give one of them, such as boxes.center")
+        raise GeometryError("Boxes contain several arrays; give one array, such as boxes.center")
 
     def __repr__(self) -> str:
         """Return number, frame and categories of the boxes."""
@@ -213,7 +230,7 @@ class Boxes(FrozenArrays, Pictured):
 
     @property
     def token(self) -> list[str] | None:
-        """Tokens of the N annotations; None if the boxes are of several samples or of none."""
+        """Tokens of the N annotations; None if the boxes come from several samples or from none."""
         if self.sample is None:
             return None
         return [f"{self.sample}/{row}" for row in self.row.tolist()]
@@ -225,14 +242,14 @@ class Boxes(FrozenArrays, Pictured):
 
     @property
     def category_names(self) -> list[str]:
-        """Category of each box by name."""
+        """Category names of the N boxes."""
         return [CATEGORIES[code] for code in self.category.tolist()]
 
     def select(self, rows: ArrayLike) -> Boxes:
-        """Return the boxes of a mask (N,) or of an integer array of rows.
+        """Return the boxes that a mask (N,) or an integer array of rows selects.
 
         Raises:
-            GeometryError: `rows` is neither of the two, or has a row that does not exist.
+            GeometryError: If `rows` is neither of the two, or a row does not exist.
         """
         selection = np.asarray(rows)
         if selection.ndim != 1:
@@ -242,25 +259,25 @@ class Boxes(FrozenArrays, Pictured):
         if not selection.size:
             selection = np.zeros(0, dtype=np.int64)
         try:
-            return self._picked(selection)
+            return self._select(selection)
         except IndexError as error:
             raise GeometryError(
                 f"{rows!r} does not pick from {len(self)} boxes: {error}"
             ) from error
 
     def transform(self, target_from_source: SE3, frame: str) -> Boxes:
-        """Return the boxes in another coordinate frame. Raises GeometryError."""
+        """Transform the boxes to `frame`; raise GeometryError if an argument is invalid."""
         checked_transform("target_from_source", target_from_source)
         checked_frame("frame", frame)
-        turn = target_from_source.rotation
-        turn_transposed = turn.T
+        rotation = target_from_source.rotation
+        multiplier = quaternions.single_left_multiplier(rotation)
         return trusted_boxes(
             frame,
             {
-                "center": self.center @ turn_transposed + target_from_source.translation,
+                "center": self.center @ rotation.T + target_from_source.translation,
                 "size": self.size,
-                "rotation": self.rotation @ quaternions.single_left_multiplier(turn).T,
-                "velocity": self.velocity @ turn_transposed,
+                "rotation": self.rotation @ multiplier.T,
+                "velocity": self.velocity @ rotation.T,
                 "category": self.category,
                 "actor_id": self.actor_id,
                 "num_lidar_pts": self.num_lidar_pts,
@@ -273,8 +290,9 @@ class Boxes(FrozenArrays, Pictured):
     def corners(self) -> FloatArray:
         """Return the eight corners of each box, (N, 8, 3) metres, ordered as `CORNER_SIGNS`."""
         offsets = self.size[:, None, :] / 2 * CORNER_SIGNS
-        result: FloatArray = offsets @ np.swapaxes(quaternions.to_matrix(self.rotation), 1, 2)
-        return result + self.center[:, None, :]
+        rotation = quaternions.to_matrix(self.rotation)
+        rotated_offsets: FloatArray = offsets @ np.swapaxes(rotation, 1, 2)
+        return rotated_offsets + self.center[:, None, :]
 
     def bottom_corners(self) -> FloatArray:
         """Return the four corners of each box's lower face, (N, 4, 3) metres.
@@ -305,57 +323,59 @@ class Boxes(FrozenArrays, Pictured):
         return np.bincount(boxes, minlength=len(self)).astype(np.int64)
 
     def iou_bev(self, other: Boxes) -> FloatArray:
-        """Return intersection over union of the footprints of these N boxes and M others, (N, M).
+        """Return the IoU of the footprints of these N boxes and M others, shape (N, M).
 
-        Shares are in [0, 1]. A footprint is the rectangle of length × width at the box's yaw: a
-        tilted box counts as if it stood upright in the frame, with the same centre, size and yaw.
-        For two boxes without any area the result is 0.
+        IoU (intersection over union) is in [0, 1]. A footprint is the rectangle of length × width
+        at the box's yaw: a tilted box is treated as upright in the frame, with the same centre,
+        size and yaw. If both boxes have no area, the IoU is 0.
 
         Raises:
-            GeometryError: the frames differ, or are those of a camera, where z points forward.
+            GeometryError: If the frames differ, or are a camera's, where z points forward.
         """
         self._check_ground(other)
-        common = box_arrays.intersection_areas(self._footprints(), other._footprints())
-        return _over_union(common, self.size[:, :2], other.size[:, :2])
+        common_areas = box_arrays.intersection_areas(self._footprints(), other._footprints())
+        return _over_union(common_areas, self.size[:, :2], other.size[:, :2])
 
     def iou_3d(self, other: Boxes) -> FloatArray:
-        """Return intersection over union of the volumes of these N boxes and M others, (N, M).
+        """Return the IoU of the volumes of these N boxes and M others, shape (N, M).
 
-        Shares are in [0, 1]. The common volume is the footprints' common area times the common
-        height. That is exact for boxes that stand upright in the frame, like labels in the LiDAR
-        frame; a tilted box counts as if it stood upright, with the same centre, size and yaw.
-        For two boxes without any volume the result is 0.
+        IoU (intersection over union) is in [0, 1]. The common volume is the footprints' common area
+        times the common height. This is exact for upright boxes, like labels in the LiDAR frame; a
+        tilted box is treated as upright, with the same centre, size and yaw. If both boxes have no
+        volume, the IoU is 0.
 
         Raises:
-            GeometryError: the frames differ, or are those of a camera, where z points forward.
+            GeometryError: If the frames differ, or are a camera's, where z points forward.
         """
         self._check_ground(other)
-        common_area = box_arrays.intersection_areas(self._footprints(), other._footprints())
-        low, high = self._heights()
-        other_low, other_high = other._heights()
-        top = np.minimum(high[:, None], other_high)
-        bottom = np.maximum(low[:, None], other_low)
-        common = common_area * np.maximum(top - bottom, 0)
-        return _over_union(common, self.size, other.size)
+        common_areas = box_arrays.intersection_areas(self._footprints(), other._footprints())
+        bottom, top = self._heights()
+        other_bottom, other_top = other._heights()
+        common_top = np.minimum(top[:, None], other_top)
+        common_bottom = np.maximum(bottom[:, None], other_bottom)
+        common_volumes = common_areas * np.maximum(common_top - common_bottom, 0)
+        return _over_union(common_volumes, self.size, other.size)
 
     def distance_bev(self, other: Boxes) -> FloatArray:
-        """Return the gap between the footprints of these N boxes and M others, (N, M) metres.
+        """Return the gaps between the footprints of these N boxes and M others, (N, M), metres.
 
-        It is 0 if they touch or overlap. Footprints and errors are as in `iou_bev`.
+        A gap is 0 if the two touch or overlap. Footprints and errors are as in `iou_bev`.
         """
         self._check_ground(other)
-        return box_arrays.gaps(self._footprints(), other._footprints())
+        footprints = self._footprints()
+        return box_arrays.gaps(footprints, other._footprints())
 
-    def _picked(self, rows: slice | AnyArray) -> Boxes:
-        """Return the boxes of a slice, a mask or an array of rows; raises numpy's IndexError."""
-        columns = {name: getattr(self, name)[rows] for name in BOX_COLUMNS}
+    def _select(self, rows: slice | AnyArray) -> Boxes:
+        """Return the boxes of a slice, mask or rows; raise IndexError if a row does not exist."""
+        columns = {}
+        for name in BOX_COLUMNS:
+            columns[name] = getattr(self, name)[rows]
         return trusted_boxes(self.frame, columns, self.sample)
 
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
-        """Return rows of boxes and rows of points (P, 3), one pair for each point in a box."""
-        return box_arrays.points_in_boxes(
-            points, self.center, self.size / 2, quaternions.to_matrix(self.rotation)
-        )
+        """Return indices of boxes and of points (P, 3), one pair for each point in a box."""
+        axes = quaternions.to_matrix(self.rotation)
+        return box_arrays.points_in_boxes(points, self.center, self.size / 2, axes)
 
     def _footprints(self) -> FloatArray:
         """Return x, y, length, width and yaw of each box, shape (N, 5)."""
@@ -364,13 +384,13 @@ class Boxes(FrozenArrays, Pictured):
         return np.column_stack([position, extent, self.yaw])
 
     def _heights(self) -> tuple[FloatArray, FloatArray]:
-        """Return the lower and upper ends of the boxes, (N,) each, as if they stood upright."""
-        center = self.center[:, 2]
-        half = self.size[:, 2] / 2
-        return center - half, center + half
+        """Return the lowest and highest z of the boxes, (N,) each, as if they were upright."""
+        z = self.center[:, 2]
+        half_height = self.size[:, 2] / 2
+        return z - half_height, z + half_height
 
     def _check_ground(self, other: Boxes) -> None:
-        """Check that boxes can be compared on the ground with these; raises GeometryError."""
+        """Raise GeometryError unless `other` is in the same frame and z points up in it."""
         checked_boxes("other", other)
         if other.frame != self.frame:
             raise GeometryError(
@@ -379,48 +399,51 @@ class Boxes(FrozenArrays, Pictured):
             )
         if self.frame in CAMERAS:
             raise GeometryError(
-                f"boxes of {self.frame} have no ground plane, z points forward there; transform "
-                "them to ego or lidar"
+                f"boxes of {self.frame} have no ground plane, as z points forward in this frame; "
+                "transform the boxes to ego or lidar"
             )
 
 
 def trusted_boxes(frame: str, columns: dict[str, AnyArray], sample: str | None = None) -> Boxes:
-    """Return boxes from columns that are correct: fast, without checks.
+    """Return boxes from columns that are known to be correct, without checking them.
 
     Args:
         frame: Coordinate frame.
-        columns: Every column of `Boxes`; the arrays must be fresh or read-only, and become
-            read-only.
-        sample: Token of the sample; None for none.
+        columns: All columns of `Boxes`; arrays must be new or read-only, and are made read-only.
+        sample: Token of the sample whose label contains all boxes, or None.
     """
-    result = object.__new__(Boxes)
+    boxes = object.__new__(Boxes)
     set_field = object.__setattr__
-    set_field(result, "frame", frame)
-    set_field(result, "sample", sample)
+    set_field(boxes, "frame", frame)
+    set_field(boxes, "sample", sample)
     for name, array in columns.items():
         array.setflags(write=False)
-        set_field(result, name, array)
-    return result
+        set_field(boxes, name, array)
+    return boxes
 
 
 def concatenate(parts: list[Boxes], frame: str) -> Boxes:
-    """Return all boxes of `parts`, in order; every part must be in `frame`."""
+    """Return all boxes of `parts`, in order.
+
+    Raises:
+        GeometryError: If a part is not in `frame`.
+    """
     for part in parts:
         if part.frame != frame:
             raise GeometryError(
                 f"boxes of frame {part.frame!r} cannot join those of {frame!r}; transform them "
                 "first"
             )
+    columns = {}
+    for name in BOX_COLUMNS:
+        columns[name] = np.concatenate([getattr(part, name) for part in parts])
     samples = {part.sample for part in parts}
-    return trusted_boxes(
-        frame,
-        {name: np.concatenate([getattr(part, name) for part in parts]) for name in BOX_COLUMNS},
-        samples.pop() if len(samples) == 1 else None,
-    )
+    sample = samples.pop() if len(samples) == 1 else None
+    return trusted_boxes(frame, columns, sample)
 
 
 def _over_union(common: FloatArray, sizes: FloatArray, other_sizes: FloatArray) -> FloatArray:
-    """Return intersection over union, shape (N, M), from common parts and sizes.
+    """Return the IoU, shape (N, M), from common areas or volumes; 0 where both sizes are 0.
 
     Args:
         common: (N, M) common areas or volumes.
@@ -429,17 +452,17 @@ def _over_union(common: FloatArray, sizes: FloatArray, other_sizes: FloatArray) 
     """
     products = sizes.prod(axis=1)[:, None]
     union = products + other_sizes.prod(axis=1) - common
-    shares = np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+    zeros = np.zeros_like(common)
+    shares = np.divide(common, union, out=zeros, where=union > 0)
     return as_floats(shares.clip(0, 1))
 
 
 def checked_boxes(name: str, boxes: object) -> Boxes:
-    """Return `boxes` if they are `Boxes`; raises GeometryError otherwise."""
+    """Return `boxes` if they are `Boxes`; otherwise raise a GeometryError that names `name`."""
     if not isinstance(boxes, Boxes):
         raise GeometryError(
             f"{name}: expected Boxes, found {type(boxes).__name__}; da.boxes(sample, frame=…) "
-            "gives those of a sample, "
-            "Boxes.from_arrays makes some"
+            "gives the boxes of a sample, and Boxes.from_arrays makes boxes from arrays"
         )
     return boxes
 
@@ -461,7 +484,7 @@ class Box:
         instance_token: str | None = None,
         **unknown: NoReturn,
     ) -> None:
-        """Wrap the only row of `boxes`; raises GeometryError if it has no or several rows."""
+        """Wrap the only row of `boxes`; raise GeometryError unless there is exactly one."""
         if unknown or not isinstance(boxes, Boxes):
             raise GeometryError(
                 f"a Box is one row of Boxes, found {type(boxes).__name__}; {BOX_MADE}"
@@ -485,20 +508,20 @@ class Box:
         category: str = "car",
         velocity: ArrayLike = (np.nan, np.nan, np.nan),
     ) -> Box:
-        """Return one box from numbers, as nuScenes' `Box(center, wlh, orientation)`.
+        """Make one box from numbers, like nuScenes' `Box(center, wlh, orientation)`.
 
         Args:
-            center: (3,) metres.
-            wlh: (3,) full width, length, height, metres: the nuScenes order, while `Boxes` begin
-                with the length.
-            orientation: The box's axes in `frame`, a unit quaternion (pyquaternion's, or four
-                numbers w, x, y, z).
+            center: (3,) centre, metres.
+            wlh: (3,) full width, length, height, metres: the nuScenes order (`Boxes` start with the
+                length).
+            orientation: The box's axes in `frame`, as a unit quaternion (a pyquaternion object, or
+                four numbers w, x, y, z).
             frame: Frame of all values: `world`, `ego`, `lidar` or a camera channel.
             category: Name of the category.
-            velocity: (3,) m/s over the ground, NaN where unknown.
+            velocity: (3,) velocity over the ground, m/s, NaN where unknown.
 
         Raises:
-            GeometryError: an impossible shape, number, frame or category.
+            GeometryError: If a shape is wrong, or a number, the frame or the category is invalid.
         """
         width, length, height = checked("wlh", wlh, (3,))
         boxes = Boxes.from_arrays(
@@ -519,7 +542,7 @@ class Box:
 
     @property
     def center(self) -> FloatArray:
-        """(3,) metres, read-only."""
+        """(3,) centre, metres, read-only."""
         return as_floats(self._boxes.center[0])
 
     @property
@@ -530,7 +553,8 @@ class Box:
     @property
     def wlh(self) -> FloatArray:
         """(3,) width, length, height, metres: the nuScenes order."""
-        return as_floats(self._boxes.size[0][[1, 0, 2]])
+        size = self._boxes.size[0]
+        return as_floats(size[[1, 0, 2]])
 
     @property
     def orientation(self) -> Quaternion:
@@ -542,7 +566,8 @@ class Box:
     @property
     def rotation_matrix(self) -> FloatArray:
         """Axes of the box in `frame`, (3, 3)."""
-        return quaternions.to_matrix(self._boxes.rotation[0])
+        quaternion = self._boxes.rotation[0]
+        return quaternions.to_matrix(quaternion)
 
     @property
     def yaw(self) -> float:
@@ -551,17 +576,18 @@ class Box:
 
     @property
     def velocity(self) -> FloatArray:
-        """(3,) m/s over the ground, NaN if unknown, read-only."""
+        """(3,) velocity over the ground, m/s, NaN if unknown, read-only."""
         return as_floats(self._boxes.velocity[0])
 
     @property
     def category(self) -> str:
         """Name of the category."""
-        return CATEGORIES[int(self._boxes.category[0])]
+        code = int(self._boxes.category[0])
+        return CATEGORIES[code]
 
     @property
     def actor_id(self) -> int:
-        """Id of the label: −100 is the recording agent, −1 an untracked actor."""
+        """Id in the label: −100 is the recording agent, −1 an untracked actor."""
         return int(self._boxes.actor_id[0])
 
     @property
@@ -571,17 +597,25 @@ class Box:
 
     @property
     def camera_visible(self) -> bool:
-        """Whether any camera of the recording agent sees it."""
+        """Whether any camera of the recording agent sees the box."""
         return bool(self._boxes.camera_visible[0])
 
     @with_keywords_named
     def corners(self) -> FloatArray:
-        """Return the eight corners (3, 8), metres: four in front, then four behind, as nuScenes."""
-        return as_floats(self._boxes.corners()[0].T)
+        """Return the eight corners (3, 8), metres, in the nuScenes devkit's order.
+
+        The four in front come first, then the four behind.
+        """
+        corners = self._boxes.corners()[0]
+        return as_floats(corners.T)
 
     def bottom_corners(self) -> FloatArray:
-        """Return the lower face's corners (3, 4): front right and left, rear left and right."""
-        return as_floats(self._boxes.bottom_corners()[0].T)
+        """Return the corners of the lower face (3, 4), metres.
+
+        The order is front right, front left, rear left, rear right.
+        """
+        corners = self._boxes.bottom_corners()[0]
+        return as_floats(corners.T)
 
     @with_keywords_named
     def translate(self, translation: ArrayLike) -> Box:
@@ -590,14 +624,14 @@ class Box:
         return self.transform(moved, self.frame)
 
     def rotate(self, quaternion: Quaternion) -> Box:
-        """Return a new box turned about its frame's origin: centre, orientation and velocity."""
-        return self.transform(SE3.from_quaternion(quaternion), self.frame)
+        """Return a new box, rotated about its frame's origin (centre, orientation and velocity)."""
+        rotation = SE3.from_quaternion(quaternion)
+        return self.transform(rotation, self.frame)
 
     def transform(self, target_from_source: SE3, frame: str) -> Box:
-        """Return the same box in another frame. Raises GeometryError."""
-        return Box(
-            self._boxes.transform(target_from_source, frame), self.token, self.instance_token
-        )
+        """Transform the box to `frame`; raise GeometryError if an argument is invalid."""
+        boxes = self._boxes.transform(target_from_source, frame)
+        return Box(boxes, self.token, self.instance_token)
 
     def __repr__(self) -> str:
         """Return category, id, frame and pose on one line."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,26 +24,25 @@ from deepaccident_devkit.support.arrays import (
 from deepaccident_devkit.taxonomy import BEV_CAMERA, LIDAR, Frame
 
 VISIBLE_DEPTH = 1.0
-"""A corner in the image counts as seen from this distance on, metres (as in the nuScenes
-devkit)."""
+"""A corner in the image counts as seen if it is deeper than this, metres (nuScenes' value)."""
 IN_FRONT_DEPTH = 0.1
-"""All corners of a visible box must be deeper than this, metres (as in the nuScenes devkit)."""
-# The known frames whose axes are not optical.
-_NO_PINHOLE: Final = (*get_args(Frame), LIDAR, BEV_CAMERA)
+"""All corners of a visible box must have a greater depth, metres (the nuScenes devkit's value)."""
+# Frames whose axes are not optical.
+_NO_PINHOLE = (*get_args(Frame), LIDAR, BEV_CAMERA)
 
 
 class BoxVisibility(IntEnum):
-    """How much of a box an image shows, with the nuScenes devkit's names and numbers.
+    """How much of a box is in the image, with the nuScenes devkit's names and numbers.
 
     A lower number is stricter: a box that meets `ALL` meets `ANY` too, and every box meets `NONE`.
-    So `camera.box_visibility(boxes) <= BoxVisibility.ANY` are the boxes that the nuScenes devkit
-    lists by default.
+    `camera.box_visibility(boxes) <= BoxVisibility.ANY` is the mask of the boxes that the nuScenes
+    devkit lists by default.
     """
 
     ALL = 0
     """All corners are in the image and in front of the camera."""
     ANY = 1
-    """A corner is in the image, and all are in front of the camera."""
+    """At least one corner is in the image, and all are in front of the camera."""
     NONE = 2
     """No condition."""
 
@@ -53,7 +52,7 @@ class PinholeCamera(FrozenArrays):
     """A camera without distortion.
 
     Attributes:
-        intrinsic: (3, 3) float64, K = [[f, 0, cx], [0, f, cy], [0, 0, 1]], pixels.
+        intrinsic: (3, 3) float64 matrix K = [[f, 0, cx], [0, f, cy], [0, 0, 1]], pixels.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
     """
@@ -63,7 +62,7 @@ class PinholeCamera(FrozenArrays):
     height: int
 
     def __post_init__(self) -> None:
-        """Check the values; raises GeometryError."""
+        """Raise GeometryError if K is not finite and (3, 3), or a size is not an int from 1."""
         intrinsic = checked("PinholeCamera.intrinsic", self.intrinsic, (3, 3)).copy()
         if not np.isfinite(intrinsic).all():
             raise GeometryError(
@@ -75,7 +74,7 @@ class PinholeCamera(FrozenArrays):
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal: float) -> PinholeCamera:
-        """Return a camera with its optical axis in the middle of the image.
+        """Return a camera whose optical axis passes through the middle of the image.
 
         Args:
             width: Width of the image, pixels.
@@ -83,7 +82,7 @@ class PinholeCamera(FrozenArrays):
             horizontal: Horizontal field of view, radians.
 
         Raises:
-            GeometryError: the image has no pixels, or the field of view is not between 0 and π.
+            GeometryError: If the image has no pixels, or the field of view is not between 0 and π.
         """
         width = _pixels("width", width)
         height = _pixels("height", height)
@@ -92,29 +91,33 @@ class PinholeCamera(FrozenArrays):
             raise GeometryError(
                 f"horizontal: expected a field of view between 0 and π radians, found {horizontal}"
             )
-        focal = width / 2 / np.tan(angle / 2)
-        return cls(
-            np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height
-        )
+        middle_x = width / 2
+        middle_y = height / 2
+        focal_length = middle_x / np.tan(angle / 2)
+        intrinsic = np.array([[focal_length, 0, middle_x], [0, focal_length, middle_y], [0, 0, 1]])
+        return cls(intrinsic, width, height)
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """Return the camera of the same picture at another size, pixels; raises GeometryError."""
-        scale = np.diag([width / self.width, height / self.height, 1.0])
+        """Return the camera for the resized image; raise GeometryError if a size is below 1."""
+        x_scale = width / self.width
+        y_scale = height / self.height
+        scale = np.diag([x_scale, y_scale, 1.0])
         return PinholeCamera(scale @ self.intrinsic, width, height)
 
     def project(self, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return pixels (N, 2) as (u, v), and depths (N,) in metres, of points (N, 3).
+        """Project points (N, 3) to pixels (N, 2), as (u, v), and depths (N,), metres.
 
-        Pixels of points that are not in front of the camera (depth ≤ 0) or are infinite are NaN.
+        Points behind the camera (depth ≤ 0) and infinite points have NaN pixels.
 
         Args:
-            points: (N, 3) metres in the optical frame.
+            points: (N, 3) positions in the optical frame, metres.
         """
         xyz = checked("points", points, (None, 3))
         depth: FloatArray = xyz[:, 2]
         positive_depth = np.where(depth > 0, depth, np.nan)
         with np.errstate(invalid="ignore"):
-            pixels: FloatArray = (xyz / positive_depth[:, None]) @ self.intrinsic[:2].T
+            directions = xyz / positive_depth[:, None]
+            pixels: FloatArray = directions @ self.intrinsic[:2].T
         return pixels, depth
 
     def in_image(
@@ -125,16 +128,16 @@ class PinholeCamera(FrozenArrays):
         min_depth: float = 0.0,
         margin: float = 0.0,
     ) -> BoolArray:
-        """Return which pixels (N, 2) lie in the image, 0 ≤ u < width and 0 ≤ v < height.
+        """Return whether pixels lie in the image: 0 ≤ u < width and 0 ≤ v < height, shape (N,).
 
-        NaN does not.
+        NaN does not lie in the image.
 
         Args:
-            pixels: (N, 2) as (u, v).
-            depth: (N,) metres along the optical axis; without it only the pixels count.
-            min_depth: Points that are not deeper than this do not count, metres.
-            margin: Width of a strip along the edges that does not count, pixels; a negative one
-                makes the image larger.
+            pixels: (N, 2) pixels as (u, v).
+            depth: (N,) metres along the optical axis; None checks only the pixels.
+            min_depth: Depth that points must exceed, metres.
+            margin: Width of a strip along the edges that counts as outside, pixels; a negative
+                margin enlarges the image.
         """
         uv = checked("pixels", pixels, (None, 2))
         u = uv[:, 0]
@@ -148,16 +151,16 @@ class PinholeCamera(FrozenArrays):
     def box_visibility(self, boxes: Boxes) -> AnyArray:
         """Return the strictest `BoxVisibility` that each of N boxes meets, shape (N,), int8.
 
-        As in the nuScenes devkit, a corner is seen if it is in the image and deeper than 1 m, and a
-        box with a corner that is not deeper than 0.1 m is `NONE`. (There pixels with u = 0 or v = 0
-        are outside of the image; here they are inside.)
+        The depths are the nuScenes devkit's: a corner is seen if it is in the image and deeper than
+        1 m, and a box with a corner no deeper than 0.1 m is `NONE`. Pixels with u = 0 or v = 0 are
+        inside the image, unlike in the nuScenes devkit.
 
         Args:
             boxes: Boxes in this camera's optical frame.
 
         Raises:
-            GeometryError: they are not boxes, or are in the frame of world, ego, LiDAR or the BEV
-                camera.
+            GeometryError: If the argument is not `Boxes`, or the frame is world, ego, LiDAR or the
+                BEV camera.
         """
         if checked_boxes("boxes", boxes).frame in _NO_PINHOLE:
             raise GeometryError(
@@ -166,17 +169,18 @@ class PinholeCamera(FrozenArrays):
             )
         pixels, depth = self.project(boxes.corners().reshape(-1, 3))
         is_seen = self.in_image(pixels, depth, min_depth=VISIBLE_DEPTH).reshape(-1, 8)
-        in_front = (depth > IN_FRONT_DEPTH).reshape(-1, 8).all(axis=1)
-        conditions = [in_front & is_seen.all(axis=1), in_front & is_seen.any(axis=1)]
-        levels = [BoxVisibility.ALL, BoxVisibility.ANY]
-        return np.select(conditions, levels, BoxVisibility.NONE).astype(np.int8)
+        is_in_front = (depth > IN_FRONT_DEPTH).reshape(-1, 8).all(axis=1)
+        visibility = np.full(len(boxes), BoxVisibility.NONE, dtype=np.int8)
+        visibility[is_in_front & is_seen.any(axis=1)] = BoxVisibility.ANY
+        visibility[is_in_front & is_seen.all(axis=1)] = BoxVisibility.ALL
+        return visibility
 
     def boxes_in_image(self, boxes: Boxes, level: BoxVisibility = BoxVisibility.ANY) -> BoolArray:
-        """Return which of N boxes of this camera's optical frame meet `level`, shape (N,).
+        """Return whether each of N boxes in the optical frame meets `level`, shape (N,).
 
         Raises:
-            ChoiceError: there is no such level.
-            GeometryError: as in `box_visibility`.
+            ChoiceError: If the level is unknown.
+            GeometryError: For the reasons given in `box_visibility`.
         """
         if level not in list(BoxVisibility):
             names = ", ".join(f"BoxVisibility.{option.name}" for option in BoxVisibility)
@@ -185,7 +189,7 @@ class PinholeCamera(FrozenArrays):
 
 
 def _pixels(name: str, value: object) -> int:
-    """Return a number of pixels from 1 as an int; raises GeometryError."""
+    """Return `value` as an int; raise GeometryError unless it is a whole number from 1."""
     number = checked_whole(name, value, "a whole number of pixels from 1")
     if number < 1:
         raise GeometryError(f"{name}: expected a whole number of pixels from 1, found {number}")

@@ -1,4 +1,4 @@
-"""Outlines of the cells of a raster, as shapely's polygons."""
+"""Outlines of the cells of a raster, as shapely polygons."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ if TYPE_CHECKING:
 
 
 def outlines(cells: BoolArray, origin: FloatArray, resolution: float) -> MultiPolygon:
-    """Return the exact outline of the cells that are set: both cover the same area.
+    """Return the exact outline of the cells that are True.
 
     Args:
-        cells: (H, W), row = y index, column = x index.
-        origin: (2,) x and y of the corner of cell (0, 0).
-        resolution: Side of a cell.
+        cells: (H, W) mask of the cells, row = y index, column = x index.
+        origin: (2,) x and y of the lower corner of cell (0, 0).
+        resolution: Side length of a cell, in the unit of `origin`.
     """
     import shapely
 
-    column0, column1, row0, row1 = _rectangles(cells).T
-    # in whole numbers, so that all edges meet
-    joined = shapely.union_all(shapely.box(column0, row0, column1, row1))
-    polygons = shapely.transform(joined, lambda corners: origin + corners * resolution)
+    start_column, end_column, start_row, end_row = _rectangles(cells).T
+    # whole numbers, so that all edges meet exactly
+    rectangles = shapely.box(start_column, start_row, end_column, end_row)
+    outline = shapely.union_all(rectangles)
+    polygons = shapely.transform(outline, lambda corners: origin + corners * resolution)
     return multi_polygon(list(shapely.get_parts(polygons)))
 
 
 def multi_polygon(parts: list[Any]) -> MultiPolygon:
-    """Return polygons with outer rings counter-clockwise, in an order by their positions."""
+    """Combine polygons, with counter-clockwise outer rings and sorted by position."""
     import shapely
     from shapely.geometry.polygon import orient
 
@@ -40,17 +41,17 @@ def multi_polygon(parts: list[Any]) -> MultiPolygon:
 
 
 def _rectangles(cells: BoolArray) -> IntArray:
-    """Return rectangles that fill the cells: runs of cells, joined over equal rows.
+    """Split the True cells into rectangles: runs along a row, merged over equal successive rows.
 
     Returns:
-        (R, 4) first and past-the-last column, first and past-the-last row.
+        (R, 4) start and end column, start and end row; ends are exclusive.
     """
-    rows, columns = cells.shape
-    padded = np.zeros((rows, columns + 2), dtype=np.int8)
+    row_count, column_count = cells.shape
+    padded = np.zeros((row_count, column_count + 2), dtype=np.int8)
     padded[:, 1:-1] = cells
     edges = np.diff(padded, axis=1)
     row, start = np.nonzero(edges == 1)
-    end = np.nonzero(edges == -1)[1]
+    _, end = np.nonzero(edges == -1)
     order = np.lexsort((row, end, start))
     row = row[order]
     start = start[order]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,30 +23,30 @@ from deepaccident_devkit.support.arrays import (
     readonly,
 )
 from deepaccident_devkit.support.nuscenes_names import CLOUD, with_keywords_named, without_names
-from deepaccident_devkit.support.text import Pictured
+from deepaccident_devkit.support.text import PictureRepr
 
 CoordinateRange = tuple[float, float]
 # Columns that only some clouds have, and their dtypes.
-_OPTIONAL_COLUMNS: Final = {"agent": np.int8, "time_lag": np.float32}
+_OPTIONAL_COLUMNS = {"agent": np.int8, "time_lag": np.float32}
 
 
 @without_names(CLOUD)
 @dataclass(frozen=True, slots=True, eq=False)
-class LidarPointCloud(FrozenArrays, Pictured):
-    """N points in one right-handed coordinate frame; arrays are read-only views.
+class LidarPointCloud(FrozenArrays, PictureRepr):
+    """N points in one right-handed coordinate frame, as read-only views of the arrays.
 
-    Clouds are large, so arrays of the right type are not copied: a change of the caller's array
-    changes the cloud.
+    Clouds are large, so arrays of the right type are not copied: if you change your array, the
+    cloud changes too.
 
     Attributes:
-        xyz: (N, 3) float64, metres.
-        intensity: (N,) float32.
-        frame: `world`, `ego` or `lidar`.
-        agent: (N,) int8, agent that recorded each point, as a position in `taxonomy.AGENTS`;
-            None if it is not known. `aggregate_point_cloud` sets it.
-        time_lag: (N,) float32, seconds from the recording of each point to the sample's moment: 0
-            at the present, positive for earlier points, like the times of nuScenes'
-            `from_file_multisweep`; None if it is not known.
+        xyz: (N, 3) float64 positions, metres.
+        intensity: (N,) float32 intensities.
+        frame: Coordinate frame: `world`, `ego` or `lidar`.
+        agent: (N,) int8, the agent that recorded each point, as an index into `taxonomy.AGENTS`;
+            None if unknown. `aggregate_point_cloud` sets it.
+        time_lag: (N,) float32, age of each point in seconds at the time of the sample: 0 for points
+            of the sample's frame, positive for earlier points, as in nuScenes'
+            `from_file_multisweep`; None if unknown.
     """
 
     xyz: FloatArray
@@ -56,7 +56,7 @@ class LidarPointCloud(FrozenArrays, Pictured):
     time_lag: AnyArray | None = None
 
     def __post_init__(self) -> None:
-        """Check the shapes; raises GeometryError."""
+        """Raise GeometryError if the arrays have wrong shapes or the frame is no name."""
         checked_frame("LidarPointCloud.frame", self.frame)
         xyz = checked("LidarPointCloud.xyz", self.xyz, (None, 3))
         intensity = checked("LidarPointCloud.intensity", self.intensity, (len(xyz),), np.float32)
@@ -74,28 +74,32 @@ class LidarPointCloud(FrozenArrays, Pictured):
 
     def __repr__(self) -> str:
         """Return number, frame and ranges of the points."""
-        finite = self.xyz[np.isfinite(self.xyz).all(axis=1)]
+        is_finite = np.isfinite(self.xyz).all(axis=1)
         title = f"{len(self):,} points in {self.frame}"
-        if not len(finite):
+        if not is_finite.any():
             return f"LidarPointCloud({title})"
         ranges = []
-        for axis, values in zip("xyz", finite.T, strict=True):
+        for axis, values in zip("xyz", self.xyz[is_finite].T, strict=True):
             ranges.append(f"{axis} {values.min():.1f} to {values.max():.1f} m")
         return f"LidarPointCloud({title}: {', '.join(ranges)})"
 
     @property
     def points(self) -> FloatArray:
-        """(N, 4) float64 x, y, z and intensity in one new array."""
+        """(N, 4) float64 x, y, z and intensity, as a new array."""
         return np.column_stack([self.xyz, self.intensity])
 
     @with_keywords_named
     def transform(self, target_from_source: SE3, frame: str) -> LidarPointCloud:
-        """Return the same points in another frame. Raises GeometryError."""
+        """Transform the points to `frame`; raise GeometryError if an argument is invalid."""
         checked_transform("target_from_source", target_from_source)
         return replace(self, xyz=target_from_source.apply(self.xyz), frame=frame)
 
     def select(self, rows: ArrayLike) -> LidarPointCloud:
-        """Return the points of a mask (N,) or of an integer array of rows. Raises GeometryError."""
+        """Return the points that a mask (N,) or an array of rows selects.
+
+        Raises:
+            GeometryError: If `rows` is neither of the two, or a row does not exist.
+        """
         selection = np.asarray(rows)
         if not selection.size:
             selection = np.zeros(0, dtype=np.int64)
@@ -115,56 +119,63 @@ class LidarPointCloud(FrozenArrays, Pictured):
         y: CoordinateRange | None = None,
         z: CoordinateRange | None = None,
     ) -> LidarPointCloud:
-        """Return the points over the cells of `grid` (at any height) and within ranges, in order.
+        """Return the points above or below `grid` and within the ranges, in their order.
 
         Args:
-            grid: Cells, x forward and y left in the cloud's own coordinate frame; its orientation
-                does not matter.
-            x: Start (included) and end (not included), metres, as in a grid's cells; the same for
-                `y` and `z`. None for all.
-            y: See `x`.
-            z: See `x`.
+            grid: Area to keep, x forward and y left in the cloud's coordinate frame, at any height;
+                the grid's orientation does not matter. None keeps all points.
+            x: Start (inclusive) and end (exclusive) of the range along x, metres; None keeps all
+                points.
+            y: Range along y, in the same form.
+            z: Range along z, in the same form.
+
+        Raises:
+            GeometryError: If the grid is not a `BevGrid`, or a range ends before its start.
         """
         if grid is not None and not isinstance(grid, BevGrid):
             raise GeometryError(
-                f"grid: expected a BevGrid, found {grid!r}; ranges go by name, x=(start, end)"
+                f"grid: expected a BevGrid, found {grid!r}; pass ranges by name, such "
+                "as x=(start, end)"
             )
-        keep = np.ones(len(self), dtype=bool) if grid is None else grid.index_of(self.xyz)[1]
+        is_kept = np.ones(len(self), dtype=bool)
+        if grid is not None:
+            _, is_kept = grid.index_of(self.xyz)
         for name, values, limits in zip("xyz", self.xyz.T, (x, y, z), strict=True):
             if limits is not None:
-                keep &= _within(name, values, limits)
-        return self.select(keep)
+                is_kept &= _is_within(name, values, limits)
+        return self.select(is_kept)
 
     def remove_close(self, radius: float, sensor: ArrayLike | None = None) -> LidarPointCloud:
-        """Return the points that are `radius` or more from the sensor, in order.
+        """Return the points at least `radius` away from the sensor, in their order.
 
-        Distances are on the ground (x and y). The nuScenes devkit removes the points in a square
-        with this half side; here it is a circle.
+        Distances are horizontal (x and y). This removes the points in a circle; the nuScenes devkit
+        removes the ones in the square around it.
 
         Args:
-            radius: Metres.
-            sensor: (3,) position of the sensor in the cloud's coordinate frame, metres; by default
+            radius: Radius of the circle, metres.
+            sensor: (3,) position of the sensor in the cloud's coordinate frame, metres; None for
                 the origin.
 
         Raises:
-            GeometryError: the cloud is in the world frame and `sensor` is missing, or the radius is
-                negative.
+            GeometryError: If the cloud is in the world frame and `sensor` is missing, or the radius
+                is negative.
         """
-        distance = checked_number("radius", radius, "metres from 0 on")
+        distance = checked_number("radius", radius, "0 m or more")
         if not distance >= 0:
-            raise GeometryError(f"radius: expected metres from 0 on, found {radius}")
+            raise GeometryError(f"radius: expected 0 m or more, found {radius}")
         if sensor is None and self.frame == "world":
             raise GeometryError(
                 "a cloud in the world frame does not know its sensor; give sensor=(x, y, z), or "
-                "load the cloud with "
-                "frame='lidar' and remove there"
+                "load the cloud with frame='lidar' and remove the points in that frame"
             )
-        position = checked("sensor", (0.0, 0.0, 0.0) if sensor is None else sensor, (3,))
-        offset = self.xyz[:, :2] - position[:2]
-        return self.select(np.hypot(*offset.T) >= distance)
+        position = np.zeros(3)
+        if sensor is not None:
+            position = checked("sensor", sensor, (3,))
+        dx, dy = (self.xyz[:, :2] - position[:2]).T
+        return self.select(np.hypot(dx, dy) >= distance)
 
     def _columns(self) -> dict[str, Any]:
-        """Return the arrays of N rows that the cloud has, by attribute."""
+        """Return the cloud's arrays of N rows by attribute name, without the ones that are None."""
         columns = {"xyz": self.xyz, "intensity": self.intensity}
         for name in _OPTIONAL_COLUMNS:
             column = getattr(self, name)
@@ -174,10 +185,12 @@ class LidarPointCloud(FrozenArrays, Pictured):
 
 
 def concatenate_clouds(parts: Sequence[LidarPointCloud], frame: str) -> LidarPointCloud:
-    """Return all points of `parts`, in order.
+    """Join clouds into one cloud, in order.
 
-    A column that not every part has, such as `time_lag`, is None. Raises GeometryError if a part is
-    not in `frame`.
+    An optional column, such as `time_lag`, is None unless every cloud has it.
+
+    Raises:
+        GeometryError: If a cloud is not in `frame`.
     """
     for part in parts:
         if part.frame != frame:
@@ -186,17 +199,20 @@ def concatenate_clouds(parts: Sequence[LidarPointCloud], frame: str) -> LidarPoi
                 "first"
             )
     empty = LidarPointCloud(np.zeros((0, 3)), np.zeros(0), frame, np.zeros(0), np.zeros(0))
-    columns = [part._columns() for part in (empty, *parts)]  # noqa: SLF001 - its own kind
-    joined = {}
-    for name in columns[0]:
-        if all(name in part for part in columns):
-            joined[name] = np.concatenate([part[name] for part in columns])
-    return LidarPointCloud(**joined, frame=frame)
+    columns_of_parts = [part._columns() for part in (empty, *parts)]  # noqa: SLF001 - its own kind
+    columns = {}
+    for name in columns_of_parts[0]:
+        if all(name in part_columns for part_columns in columns_of_parts):
+            arrays = [part_columns[name] for part_columns in columns_of_parts]
+            columns[name] = np.concatenate(arrays)
+    return LidarPointCloud(**columns, frame=frame)
 
 
-def _within(name: str, values: FloatArray, limits: CoordinateRange) -> BoolArray:
-    """Return which values are within limits, the end not included; raises GeometryError."""
+def _is_within(name: str, values: FloatArray, limits: CoordinateRange) -> BoolArray:
+    """Return whether start ≤ value < end; raise GeometryError if the limits are invalid."""
     low, high = checked(name, limits, (2,)).tolist()
     if not low <= high:
-        raise GeometryError(f"{name}: expected a start and an end not before it, found {limits}")
+        raise GeometryError(
+            f"{name}: expected (start, end) with end not less than start, found {limits}"
+        )
     return np.asarray((values >= low) & (values < high))

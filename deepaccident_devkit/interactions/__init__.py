@@ -1,4 +1,4 @@
-"""Pairs of road users: how near and how fast they come, and how soon they would touch."""
+"""Interactions of pairs of road users: distances, speeds, and times to contact."""
 
 from deepaccident_devkit.collisions.recorded import CLASS_MASSES, masses_of
 from deepaccident_devkit.geometry import time_to_collision

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from deepaccident_devkit.support.arrays import (
     checked,
 )
 from deepaccident_devkit.support.files import write_bytes
-from deepaccident_devkit.support.text import choice, path_of
+from deepaccident_devkit.support.text import PathType, choice, path_of
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 Area = Literal["drivable", "road_line", "sidewalk"]
 AREAS: Final[tuple[Area, ...]] = get_args(Area)
 # Decimals of metres in GeoJSON.
-_DECIMALS: Final = 3
+_DECIMALS = 3
 _ROAD, _ROAD_LINE, _SIDEWALK, _OTHER = range(1, len(GROUND_CLASSES) + 1)
 
 
@@ -39,25 +38,25 @@ _ROAD, _ROAD_LINE, _SIDEWALK, _OTHER = range(1, len(GROUND_CLASSES) + 1)
 class TownMap(FrozenArrays):
     """A town's ground as the BEV cameras of its recordings saw it.
 
-    Coordinates are in world, right-handed, metres; arrays are read-only. Rasters are (H, W):
-    row = y index, column = x index, both rising. The middle of cell (i, j) is at
+    Coordinates are in world, right-handed, metres; arrays are read-only. Rasters have shape (H, W):
+    rows run along y and columns along x, both ascending. The centre of cell (i, j) is at
     x = origin[0] + (j + 0.5) · resolution, y = origin[1] + (i + 0.5) · resolution.
 
-    A picture shows nothing of a cell that a vehicle or a pedestrian hides, and is not counted
-    there. Where actors never moved, `hidden` has the class of the ground around them. Seen from
-    above, a bridge hides the ground under it.
+    A picture does not count for cells that a vehicle or a pedestrian hides in it. Where actors
+    never moved, `hidden` has the class of the ground around them. A bridge hides the ground under
+    it.
 
     Attributes:
         town: Name of the town.
         resolution: Side of a cell.
         origin: Lowest x and y of the raster, shape (2,), float64.
-        counts: Pictures that saw each of `GROUND_CLASSES` at the cell's middle, shape (4, H, W),
-            uint16.
-        agents: Recordings (an agent in a scenario) that saw the ground of the cell, shape (H, W),
-            uint16.
-        hidden: Class of the cells around small holes that no picture saw, 1 + the position in
-            `GROUND_CLASSES`, shape (H, W), uint8; 0 elsewhere.
-        scenarios: Number of scenarios recorded in the town and used.
+        counts: Number of pictures that show each of `GROUND_CLASSES` at the cell's centre, shape
+            (4, H, W), uint16.
+        agents: Number of recordings (an agent in a scenario) that show the ground of the cell,
+            shape (H, W), uint16.
+        hidden: In small holes that no picture shows, the class of the cells around them: 1 + the
+            index in `GROUND_CLASSES`, shape (H, W), uint8; 0 elsewhere.
+        scenarios: Number of the town's scenarios that were used.
         looks: Number of pictures that were read.
         missing: Number of pictures without a file.
         damaged: Number of pictures with an unreadable file.
@@ -83,28 +82,35 @@ class TownMap(FrozenArrays):
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """Lowest and highest x, lowest and highest y, for matplotlib's `imshow(origin="lower")`."""
-        x, y = self.origin.tolist()
-        high_x, high_y = (self.origin + np.array(self.shape[::-1]) * self.resolution).tolist()
-        return x, high_x, y, high_y
+        rows, columns = self.shape
+        size = np.array([columns, rows]) * self.resolution
+        low_x, low_y = self.origin.tolist()
+        high_x, high_y = (self.origin + size).tolist()
+        return low_x, high_x, low_y, high_y
 
     def seen(self) -> BoolArray:
-        """Return whether any picture saw the ground of a cell, shape (H, W)."""
+        """Return whether any picture shows the ground of each cell, shape (H, W)."""
         return np.asarray(self.agents > 0)
 
     def drivable(self) -> BoolArray:
-        """Return cells that most pictures saw as road or road line, and hidden ones amid these.
+        """Return whether each cell is drivable, shape (H, W).
 
-        The mask has shape (H, W); most pictures are more than half.
+        A cell is drivable if more than half of its pictures show it as road or road line, or if it
+        is hidden and surrounded by such cells.
         """
         surface, total = _surface_and_total(self.counts)
-        return np.asarray((2 * surface > total) | (self.hidden == _ROAD))
+        is_surface = 2 * surface > total
+        is_hidden_road = self.hidden == _ROAD
+        return np.asarray(is_surface | is_hidden_road)
 
     def classes(self) -> ByteArray:
-        """Return classes, shape (H, W), uint8: 0 if unknown, or 1 + index in `GROUND_CLASSES`.
+        """Return the classes of cells, shape (H, W), uint8.
 
-        Drivable cells are road or road line, whichever more pictures saw; others sidewalk or other.
+        A class is 0 if unknown, otherwise 1 + the index in `GROUND_CLASSES`. Drivable cells are
+        road or road line, whichever more pictures show; all others are sidewalk or other.
         """
-        return np.maximum(classes_of(self.counts), self.hidden)
+        seen_classes = classes_of(self.counts)
+        return np.maximum(seen_classes, self.hidden)
 
     def classes_at(self, points: ArrayLike) -> ByteArray:
         """Return the classes (N,) at points, as in `classes`; 0 beyond the raster.
@@ -113,35 +119,35 @@ class TownMap(FrozenArrays):
             points: x and y in world, shape (N, 2), metres.
 
         Raises:
-            GeometryError: The points have another shape, or are no numbers.
+            GeometryError: The points have another shape, or are not numbers.
         """
         xy = checked("points", as_floats(points), (None, 2))
-        column, row = np.floor((xy - self.origin) / self.resolution).T
-        rows, columns = self.shape
-        in_raster = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        result = np.zeros(len(xy), dtype=np.uint8)
-        cells = row[in_raster].astype(np.int64), column[in_raster].astype(np.int64)
-        classes = classes_of(self.counts[(slice(None), *cells)])
-        result[in_raster] = np.maximum(classes, self.hidden[cells])
-        return result
+        cells = np.floor((xy - self.origin) / self.resolution)
+        shape = self.shape[::-1]
+        in_raster = ((cells >= 0) & (cells < shape)).all(axis=1)
+        column, row = cells[in_raster].astype(np.int64).T
+        seen_classes = classes_of(self.counts[:, row, column])
+        classes = np.zeros(len(xy), dtype=np.uint8)
+        classes[in_raster] = np.maximum(seen_classes, self.hidden[row, column])
+        return classes
 
     def around(self, center: ArrayLike, reach: float) -> TownMap:
-        """Return the part of the map in a square, with all cells that the square touches.
+        """Return the part of the map that consists of all cells touched by a square.
 
         Args:
-            center: x and y of the square's middle, shape (2,), world, metres.
-            reach: Distance of the square's sides from its middle, metres.
+            center: x and y of the square's centre in world, shape (2,), metres.
+            reach: Half the side of the square, metres.
 
         Raises:
-            GeometryError: The centre is no two numbers.
+            GeometryError: The centre is not a pair of numbers.
         """
         middle = checked("center", as_floats(center), (2,)) - self.origin
         limits = np.array(self.shape[::-1])
-        low = np.floor((middle - reach) / self.resolution).clip(0, limits).astype(np.int64)
-        high = np.ceil((middle + reach) / self.resolution).clip(low, limits).astype(np.int64)
-        (column, row), (last_column, last_row) = low.tolist(), high.tolist()
-        rows = slice(row, last_row)
-        columns = slice(column, last_column)
+        low_cell = np.floor((middle - reach) / self.resolution)
+        high_cell = np.ceil((middle + reach) / self.resolution)
+        low = low_cell.clip(0, limits).astype(np.int64)
+        high = high_cell.clip(low, limits).astype(np.int64)
+        columns, rows = map(slice, low, high)
         return replace(
             self,
             origin=self.origin + low * self.resolution,
@@ -151,7 +157,7 @@ class TownMap(FrozenArrays):
         )
 
     def area(self, area: Area = "drivable") -> BoolArray:
-        """Return the cells of an area, shape (H, W).
+        """Return whether each cell belongs to an area, shape (H, W).
 
         Areas are `drivable` (road and road line), `road_line` and `sidewalk`.
 
@@ -161,7 +167,8 @@ class TownMap(FrozenArrays):
         area = choice("area", area, AREAS)
         if area == "drivable":
             return self.drivable()
-        return np.asarray(self.classes() == 1 + GROUND_CLASSES.index(area))
+        code = 1 + GROUND_CLASSES.index(area)
+        return np.asarray(self.classes() == code)
 
     def polygons(
         self, area: Area = "drivable", *, tolerance: float | None = None, least_area: float = 1.0
@@ -172,23 +179,26 @@ class TownMap(FrozenArrays):
 
         Args:
             area: `drivable` (road and road line), `road_line` or `sidewalk`.
-            tolerance: Distance of the outline from that of the cells, metres; None for the side of
-                a cell, which turns steps into straight lines. 0 keeps the cells' own outline.
+            tolerance: Largest distance of the result from the outline of the cells, metres. None
+                means the side of a cell, which turns steps into straight lines; 0 keeps the cells'
+                outline.
             least_area: Area of the smallest islands and holes to keep, square metres.
 
         Raises:
             ChoiceError: The area is unknown.
         """
         cell_outlines = outlines(self.area(area), self.origin, self.resolution)
-        tolerance = self.resolution if tolerance is None else tolerance
+        if tolerance is None:
+            tolerance = self.resolution
         return simplified_polygons(cell_outlines, tolerance, least_area)
 
-    def to_geojson(self, path: str | os.PathLike[str]) -> Path:
+    def to_geojson(self, path: PathType) -> Path:
         """Write the drivable area and the sidewalks as GeoJSON, a feature for each polygon.
 
-        Coordinates are x and y of the simulator's world, metres, right-handed, and no longitude and
-        latitude, which RFC 7946 asks for: a town of CARLA has no true ones. Open the file in a
-        plane coordinate system of metres. The same map gives the same bytes. Returns the path.
+        Coordinates are x and y in the simulator's world, right-handed, in metres. They are not
+        longitude and latitude, as RFC 7946 requires, because CARLA's towns have none. Open the file
+        in a planar coordinate system in metres. The same map gives the same bytes. Returns the
+        path.
         """
         target = path_of(path)
         areas: dict[Area, MultiPolygon] = {
@@ -200,22 +210,33 @@ class TownMap(FrozenArrays):
 
 
 def classes_of(counts: NDArray[np.uint16]) -> ByteArray:
-    """Return the classes (…), uint8, of cells by the pictures (4, …) of each of `GROUND_CLASSES`.
+    """Return the class that most pictures show in each cell, shape (…), uint8.
 
-    It is 0 without any picture. A tie between the road's surface and other ground is no road; one
-    between road and line is road, and one between sidewalk and other is sidewalk.
+    A class is 1 + the index in `GROUND_CLASSES`, or 0 if no picture shows the cell. If road surface
+    and other ground are tied, the cell is not road; if road and line are tied, it is road; if
+    sidewalk and other are tied, it is sidewalk.
+
+    Args:
+        counts: Number of pictures that show each of `GROUND_CLASSES` in the cell, shape (4, …).
     """
     surface, total = _surface_and_total(counts)
     road, line, sidewalk, other = counts
-    on_road = np.where(line > road, np.uint8(_ROAD_LINE), np.uint8(_ROAD))
-    beside = np.where(sidewalk >= np.maximum(other, 1), np.uint8(_SIDEWALK), np.uint8(_OTHER))
-    ground = np.where(2 * surface > total, on_road, beside)
-    return np.where(total == 0, np.uint8(0), ground)
+    classes = np.full(total.shape, _OTHER, dtype=np.uint8)
+    classes[sidewalk >= np.maximum(other, 1)] = _SIDEWALK
+    is_surface = 2 * surface > total
+    classes[is_surface] = _ROAD
+    classes[is_surface & (line > road)] = _ROAD_LINE
+    classes[total == 0] = 0
+    return classes
 
 
 def _surface_and_total(counts: NDArray[np.uint16]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Return how many pictures saw the road's surface, lines included, and how many saw ground."""
-    surface = counts[:_ROAD_LINE].sum(axis=0, dtype=np.uint32)
+    """Return how many pictures show road surface, and how many show any ground, in each cell.
+
+    The road surface includes lines: it is the first two of `GROUND_CLASSES`. Both arrays have the
+    shape of the cells.
+    """
+    surface = counts[:2].sum(axis=0, dtype=np.uint32)
     total = counts.sum(axis=0, dtype=np.uint32)
     return surface, total
 
@@ -223,7 +244,7 @@ def _surface_and_total(counts: NDArray[np.uint16]) -> tuple[NDArray[np.uint32], 
 def simplified_polygons(
     polygons: MultiPolygon, tolerance: float, least_area: float
 ) -> MultiPolygon:
-    """Return polygons with outlines moved by at most `tolerance` metres.
+    """Simplify the outlines of polygons, which move by at most `tolerance` metres.
 
     Islands and holes under `least_area` square metres are left out.
     """
@@ -235,18 +256,21 @@ def simplified_polygons(
     if not tolerance:
         return multi_polygon(islands)
     simplified = shapely.simplify(shapely.MultiPolygon(islands), tolerance)
-    # Parts are taken twice, as collections may hold several.
+    # Parts are taken twice, because collections may contain collections.
     parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(simplified)))
     return multi_polygon([part for part in parts if part.geom_type == "Polygon"])
 
 
 def geojson_of(town: str, areas: Mapping[Area, MultiPolygon]) -> bytes:
-    """Return a FeatureCollection with a feature for each polygon; coordinates have 3 decimals."""
+    """Return a FeatureCollection as JSON, with a feature for each polygon.
+
+    Coordinates have 3 decimals.
+    """
     features = []
     for area, polygons in areas.items():
-        for part in polygons.geoms:
-            properties = {"town": town, "area": area, "square_metres": round(part.area, 1)}
-            geometry = {"type": "Polygon", "coordinates": _rings(part)}
+        for polygon in polygons.geoms:
+            properties = {"town": town, "area": area, "square_metres": round(polygon.area, 1)}
+            geometry = {"type": "Polygon", "coordinates": _ring_coordinates(polygon)}
             feature = {"type": "Feature", "properties": properties, "geometry": geometry}
             features.append(feature)
     collection = {
@@ -258,19 +282,22 @@ def geojson_of(town: str, areas: Mapping[Area, MultiPolygon]) -> bytes:
         ),
         "features": features,
     }
-    return (json.dumps(collection, allow_nan=False, separators=(",", ":")) + "\n").encode()
+    text = json.dumps(collection, allow_nan=False, separators=(",", ":"))
+    return f"{text}\n".encode()
 
 
 def _fill_holes(polygon: Polygon, least_area: float) -> Polygon:
     """Return a polygon without its holes under `least_area` square metres."""
     import shapely
 
-    holes = [ring for ring in polygon.interiors if shapely.Polygon(ring).area >= least_area]
-    return shapely.Polygon(polygon.exterior, holes)
+    large_holes = [ring for ring in polygon.interiors if shapely.Polygon(ring).area >= least_area]
+    return shapely.Polygon(polygon.exterior, large_holes)
 
 
-def _rings(polygon: Polygon) -> list[list[list[float]]]:
+def _ring_coordinates(polygon: Polygon) -> list[list[list[float]]]:
+    """Return the coordinates of the outer ring and of the holes, rounded."""
     rings = []
     for ring in (polygon.exterior, *polygon.interiors):
-        rings.append(np.round(np.asarray(ring.coords), _DECIMALS).tolist())
+        rounded = np.round(np.asarray(ring.coords), _DECIMALS)
+        rings.append(rounded.tolist())
     return rings

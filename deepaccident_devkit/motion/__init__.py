@@ -1,7 +1,6 @@
 """Motion labels and model outputs: FIERY-style maps of the bird's-eye view, and their instances.
 
-These are the steps from a release to the labels for a model, and from a model's outputs to
-instances:
+The steps from a release to a model's training labels, and from a model's outputs to instances:
 
 | step | from → to | module |
 |---|---|---|
@@ -10,15 +9,15 @@ instances:
 | ids, centres, flow | footprints → centres, also at the next frame | `drawing` |
 | maps | centres and cells → `MotionLabels` | `drawing`, `labels` |
 | all frames in the present ego frame | `MotionLabels` → the same, warped | `labels`, `warping` |
-| to another code, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
+| to another code base, to disk | `MotionLabels` → batches; files | `batch_names`; `label_files` |
 | a prediction, and instances of a frame | arrays → `MotionHeads` → cells by centre | `grouping` |
 | the same id in all frames | instances → `LinkedInstances` | `instances` |
 | boxes along the paths | linked instances → their redrawn maps | `instances` |
 
-`reference_arithmetic` has the arithmetic of other libraries for these steps. A `MotionLabelConfig`
-decides what is rasterised, a `LabelProtocol` how (both are in `config`: every quirk of the released
-code is an option), and a grid's orientation how cells lie (`geometry.bev_grid`). `warping` also
-warps a model's own maps like labels.
+`reference_arithmetic` reproduces the arithmetic that other libraries use in these steps. A
+`MotionLabelConfig` decides what is rasterised, and a `LabelProtocol` how; both are in `config`, and
+every quirk of the released code is an option. A grid's orientation decides how its cells are stored
+in arrays (`geometry.bev_grid`). `warping` also warps a model's feature maps as it warps labels.
 """
 
 from deepaccident_devkit.motion.augmentation import Augmentation

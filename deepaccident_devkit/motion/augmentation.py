@@ -3,8 +3,6 @@
 See docs/released_code.md, Motion labels.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -16,12 +14,12 @@ from deepaccident_devkit.support.arrays import FloatArray, checked_flag, checked
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
-    """A change of the ground plane in training: rotation, then scale, then flip; right-handed.
+    """A training augmentation of the ground plane: rotation, then scale, then flip; right-handed.
 
     Attributes:
         rotation: Angle about z, radians, counter-clockwise.
-        scale: Factor of all lengths.
-        flip: Whether to mirror left and right: y changes its sign.
+        scale: Factor by which all lengths are multiplied.
+        flip: Whether to swap left and right by negating y.
     """
 
     rotation: float = 0.0
@@ -31,10 +29,13 @@ class Augmentation:
     def __post_init__(self) -> None:
         """Raise ConfigError unless the values are in range."""
         rotation = checked_setting("augmentation: rotation", self.rotation, "finite radians")
-        scale = checked_setting("augmentation: scale", self.scale, "a factor above 0, 1 for none")
+        scale = checked_setting(
+            "augmentation: scale", self.scale, "a factor above 0 (1 does not scale)"
+        )
         if scale <= 0:
             raise ConfigError(
-                f"augmentation: scale: expected a factor above 0, 1 for none, found {self.scale!r}"
+                "augmentation: scale: expected a factor above 0 (1 does not scale), "
+                f"found {self.scale!r}"
             )
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "scale", scale)
@@ -42,7 +43,7 @@ class Augmentation:
 
     @property
     def matrix(self) -> FloatArray:
-        """Matrix A = flip · scale · rotation from the ego frame to the augmented one, shape (4, 4).
+        """A = flip · scale · rotation, a matrix from the ego frame to the augmented frame, (4, 4).
 
         Right-handed, metres.
         """
@@ -50,6 +51,7 @@ class Augmentation:
         sine = math.sin(self.rotation)
         turn = np.eye(4)
         turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
-        mirror = np.diag([1.0, -1.0 if self.flip else 1.0, 1.0, 1.0])
+        y_sign = -1.0 if self.flip else 1.0
+        mirror = np.diag([1.0, y_sign, 1.0, 1.0])
         stretch = np.diag([self.scale, self.scale, self.scale, 1.0])
         return np.asarray(mirror @ stretch @ turn)

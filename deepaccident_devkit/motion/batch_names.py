@@ -1,4 +1,4 @@
-"""Names and axes of labels in the codes of FIERY, BEVerse and DeepAccident, and conversions.
+"""Names and axes of labels in the code bases of FIERY, BEVerse and DeepAccident, and conversions.
 
 | devkit | FIERY's batch | BEVerse's, DeepAccident's batch | models' heads |
 |---|---|---|---|
@@ -10,15 +10,13 @@
 | future_egomotion (R, 6) | same (R, 6) | future_egomotions (R, 6) | – |
 | valid (R,) | – | img_is_valid (R,), has_invalid_frame | – |
 
-Whole numbers are int64 in these codes, all others float32; one sample has no batch axis. FIERY's
-maps start with the past frames, which its trainer cuts off: they are empty here. The orientation of
-FIERY's cells is `fiery`, of BEVerse's `devkit`, and of DeepAccident's `released`: it keeps CARLA's
-left-handed coordinate frames, also in its egomotion. Sources: fiery/data.py and fiery/trainer.py of
-wayveai/fiery; projects/mmdet3d_plugin/datasets of zhangyp15/BEVerse and of
+Integers are int64 in these code bases, all other numbers float32; a sample has no batch axis.
+FIERY's maps start with the past frames, which its trainer cuts off; here these frames are empty.
+Cells have the orientation `fiery` in FIERY, `devkit` in BEVerse, and `released` in DeepAccident,
+which keeps CARLA's left-handed coordinate frames, also in its egomotion. Sources: fiery/data.py and
+fiery/trainer.py of wayveai/fiery; projects/mmdet3d_plugin/datasets of zhangyp15/BEVerse and of
 tianqi-wang1996/DeepAccident.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,6 +36,15 @@ from deepaccident_devkit.support.text import choice
 BatchNames = Literal["fiery", "beverse", "deepaccident"]
 MAPS: Final = ("segmentation", "instance", "centerness", "offset", "flow")
 VECTOR_MAPS: Final = ("offset", "flow")
+# Channel axes of the maps, between frame and cell axes; and dtypes of maps that are not float32.
+_MAP_CHANNELS = {
+    "segmentation": (),
+    "instance": (),
+    "centerness": (1,),
+    "offset": (2,),
+    "flow": (2,),
+}
+_MAP_DTYPES = {"segmentation": np.uint8, "instance": np.int32}
 HEAD_NAMES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "segmentation": "segmentation",
@@ -46,8 +53,8 @@ HEAD_NAMES: Final[Mapping[str, str]] = MappingProxyType(
         "flow": "instance_flow",
     }
 )
-"""Map of the devkit → output of the models that learns it, in all three codes."""
-_BEVERSE: Final = {
+"""The devkit's map → the model output that learns it, in all three code bases."""
+_BEVERSE = {
     "segmentation": "motion_segmentation",
     "instance": "motion_instance",
     "centerness": "instance_centerness",
@@ -55,7 +62,8 @@ _BEVERSE: Final = {
     "flow": "instance_flow",
     "future_egomotion": "future_egomotions",
 }
-_CONVERTER: Final = {
+# The devkit's setting → path of the setting in the other code bases' arguments.
+_CONVERTER_SETTINGS = {
     "receptive_field": ("receptive_field",),
     "future_frames": ("future_frames",),
     "x": ("grid_conf", "xbound"),
@@ -64,7 +72,7 @@ _CONVERTER: Final = {
     "only_vehicle": ("only_vehicle",),
     "filter_invisible": ("filter_invisible",),
 }
-_SETTINGS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
+_SETTINGS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "fiery": {
         "receptive_field": ("TIME_RECEPTIVE_FIELD",),
         "future_frames": ("N_FUTURE_FRAMES",),
@@ -73,21 +81,21 @@ _SETTINGS: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         "ignore_index": ("DATASET", "IGNORE_INDEX"),
         "filter_invisible": ("DATASET", "FILTER_INVISIBLE_VEHICLES"),
     },
-    "beverse": _CONVERTER,
-    "deepaccident": _CONVERTER,
+    "beverse": _CONVERTER_SETTINGS,
+    "deepaccident": _CONVERTER_SETTINGS,
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Batch:
-    """Form of the labels of one code.
+    """Layout of one code base's labels.
 
     Attributes:
-        names: Name in the devkit → name in the code.
+        names: Name in the devkit → name in the code base.
         orientation: Orientation of the cells.
         left_handed: Whether the egomotion is left-handed.
         past_frames: Whether the maps start with the past frames.
-        validity: Whether the batch has the validity of its frames.
+        validity: Whether the batch contains which of its frames are valid.
     """
 
     names: Mapping[str, str]
@@ -97,7 +105,7 @@ class _Batch:
     validity: bool = True
 
 
-_BATCHES: Final[Mapping[str, _Batch]] = {
+_BATCHES: Mapping[str, _Batch] = {
     "fiery": _Batch(
         names={name: name for name in (*MAPS, "future_egomotion")},
         orientation="fiery",
@@ -112,11 +120,11 @@ _BATCHES: Final[Mapping[str, _Batch]] = {
 def to_batch(
     labels: Mapping[str, AnyArray], config: MotionLabelConfig, names: BatchNames
 ) -> dict[str, AnyArray]:
-    """Return maps, `future_egomotion` and `valid` under a code's names.
+    """Convert maps, `future_egomotion` and `valid` to a code base's names and layout.
 
-    All arrays are new and writable. Raises ChoiceError.
+    All arrays are new and writable. Raise ChoiceError if there is no such code base.
     """
-    batch = _batch(names)
+    code = _find_batch_form(names)
     result = {}
     for name in MAPS:
         is_vector = name in VECTOR_MAPS
@@ -124,23 +132,23 @@ def to_batch(
             labels[name],
             vectors=is_vector,
             source=config.grid.orientation,
-            target=batch.orientation,
+            target=code.orientation,
             ignore=config.ignore_index,
         )
-        if batch.past_frames:
+        if code.past_frames:
             empty = config.ignore_index if is_vector else 0
             past_shape = (config.receptive_field - 1, *values.shape[1:])
-            past = np.full(past_shape, empty, dtype=values.dtype)
-            values = np.concatenate([past, values])
+            past_values = np.full(past_shape, empty, dtype=values.dtype)
+            values = np.concatenate([past_values, values])
             if name == "segmentation":
                 values = values[:, None]
         dtype = np.int64 if values.dtype.kind in "iu" else None
-        result[batch.names[name]] = np.array(values, dtype=dtype, order="C")
+        result[code.names[name]] = np.array(values, dtype=dtype, order="C")
     motion = labels["future_egomotion"]
-    if batch.left_handed:
+    if code.left_handed:
         motion = flip_six_vector(motion)
-    result[batch.names["future_egomotion"]] = np.array(motion, dtype=np.float32)
-    if batch.validity:
+    result[code.names["future_egomotion"]] = np.array(motion, dtype=np.float32)
+    if code.validity:
         result["img_is_valid"] = np.array(labels["valid"])
         result["has_invalid_frame"] = np.array(not labels["valid"].all())
     return result
@@ -149,42 +157,39 @@ def to_batch(
 def from_batch(
     batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames
 ) -> dict[str, AnyArray]:
-    """Return maps, `future_egomotion` and `valid` from a sample of another code.
+    """Convert a sample of another code base to maps, `future_egomotion` and `valid`.
 
-    This is the reverse of `to_batch`.
+    This is the inverse of `to_batch`.
 
     Args:
         batch: Arrays of any framework, without a batch axis.
         config: Configuration of the labels.
-        names: The code.
+        names: Name of the code base.
 
     Raises:
         FieldError: An array is missing.
-        ChoiceError: No such code.
-        GeometryError: An array has another shape than in the configuration.
+        ChoiceError: There is no such code base.
+        GeometryError: An array's shape does not match the configuration.
     """
-    code = _batch(names)
+    code = _find_batch_form(names)
     missing = sorted(set(code.names.values()) - set(batch))
     if missing:
         raise FieldError(
             f"batch: {names} labels have {missing[0]!r}; there are {', '.join(sorted(batch))}"
         )
     grid_shape = config.grid.with_orientation(code.orientation).shape
-    past = config.receptive_field - 1 if code.past_frames else 0
-    all_channels = {
-        "segmentation": (1,) if code.past_frames else (),
-        "instance": (),
-        "centerness": (1,),
-    }
-    dtypes = {"segmentation": np.uint8, "instance": np.int32}
+    past_frames = 0
+    channels: dict[str, tuple[int, ...]] = dict(_MAP_CHANNELS)
+    if code.past_frames:
+        past_frames = config.receptive_field - 1
+        channels["segmentation"] = (1,)
     result = {}
     for name in MAPS:
         batch_name = code.names[name]
-        channels = all_channels.get(name, (2,))
-        shape = (past + config.label_frames, *channels, *grid_shape)
-        dtype = dtypes.get(name, np.float32)
-        values = checked(batch_name, batch[batch_name], shape, dtype)[past:]
-        if name == "segmentation" and channels:
+        shape = (past_frames + config.label_frames, *channels[name], *grid_shape)
+        dtype = _MAP_DTYPES.get(name, np.float32)
+        values = checked(batch_name, batch[batch_name], shape, dtype)[past_frames:]
+        if name == "segmentation" and code.past_frames:
             values = values[:, 0]
         result[name] = to_orientation(
             values,
@@ -198,43 +203,49 @@ def from_batch(
     if code.left_handed:
         motion = flip_six_vector(motion).astype(np.float32)
     result["future_egomotion"] = motion
-    valid = batch["img_is_valid"] if "img_is_valid" in batch else np.ones(config.frames, dtype=bool)
+    valid: Any = np.ones(config.frames, dtype=bool)
+    if "img_is_valid" in batch:
+        valid = batch["img_is_valid"]
     result["valid"] = checked("img_is_valid", valid, (config.frames,), np.bool_)
     return result
 
 
 def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionLabelConfig:
-    """Return a code's preset with changes from the code's own settings.
+    """Return a code base's preset, changed by settings under that code base's own names.
 
     FIERY's settings are its `cfg` as nested dictionaries (TIME_RECEPTIVE_FIELD, N_FUTURE_FRAMES,
     LIFT.X_BOUND, LIFT.Y_BOUND, DATASET.IGNORE_INDEX, DATASET.FILTER_INVISIBLE_VEHICLES). BEVerse's
     and DeepAccident's are `receptive_field`, `future_frames`, and the arguments of
     ConvertMotionLabels: `grid_conf` (xbound, ybound), `ignore_index`, `only_vehicle`,
-    `filter_invisible`. Missing settings stay as in the preset; keys that do not concern labels are
-    ignored.
+    `filter_invisible`. Missing settings keep the preset's values; keys that do not concern labels
+    are ignored.
 
     Raises:
-        ChoiceError: No such code.
-        ConfigError: An impossible value.
+        ChoiceError: There is no such code base.
+        ConfigError: A value is not valid.
     """
     names = choice("names", names, get_args(BatchNames))
     changes: dict[str, Any] = {}
     for name, path in _SETTINGS[names].items():
-        value = _setting(settings, path)
+        value = _find_setting(settings, path)
         if value is not None:
             changes[name] = value
     preset = MotionLabelConfig.preset(names)
-    bounds = {axis: changes.pop(axis) for axis in ("x", "y") if axis in changes}
-    if bounds:
-        grid = {"x": preset.grid.x, "y": preset.grid.y, **bounds}
-        if names == "deepaccident" and "y" in bounds:  # left-handed
-            low, high, size = _checked_bound(grid["y"])
-            grid["y"] = (-high, -low, size)
-        changes["grid"] = BevGrid(grid["x"], grid["y"])
+    x = changes.pop("x", None)
+    y = changes.pop("y", None)
+    if x is not None or y is not None:
+        if names == "deepaccident" and y is not None:  # left-handed
+            low, high, size = _read_bound(y)
+            y = (-high, -low, size)
+        if x is None:
+            x = preset.grid.x
+        if y is None:
+            y = preset.grid.y
+        changes["grid"] = BevGrid(x, y)
     return MotionLabelConfig.preset(names, **changes)
 
 
-def _setting(settings: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+def _find_setting(settings: Mapping[str, Any], path: tuple[str, ...]) -> Any:
     """Return a nested setting; None if it is missing."""
     value: Any = settings
     for name in path:
@@ -244,10 +255,10 @@ def _setting(settings: Mapping[str, Any], path: tuple[str, ...]) -> Any:
     return value
 
 
-def _checked_bound(bound: Any) -> tuple[float, float, float]:
-    """Return start, end and cell size in metres, or raise ConfigError."""
+def _read_bound(bound: Any) -> tuple[float, float, float]:
+    """Return start, end and cell size, metres; raise ConfigError unless they are three numbers."""
     try:
-        low, high, size = (float(number) for number in bound)
+        low, high, size = map(float, bound)
     except (TypeError, ValueError) as error:
         raise ConfigError(
             f"ybound: expected start, end and cell size in metres, found {bound!r}"
@@ -255,6 +266,6 @@ def _checked_bound(bound: Any) -> tuple[float, float, float]:
     return low, high, size
 
 
-def _batch(names: str) -> _Batch:
-    """Return the form of a code's labels; raises ChoiceError."""
+def _find_batch_form(names: str) -> _Batch:
+    """Return the layout of a code base's labels; raise ChoiceError if it is unknown."""
     return _BATCHES[choice("names", names, _BATCHES)]

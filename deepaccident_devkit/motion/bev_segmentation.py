@@ -1,6 +1,4 @@
-"""Targets of BEV semantic segmentation, from the camera above the agent."""
-
-from __future__ import annotations
+"""Targets for BEV semantic segmentation, from the camera above the agent."""
 
 import functools
 import math
@@ -20,10 +18,9 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
 BEV_CLASSES: Final = ("road", "lane_line", "sidewalk", "vehicle", "pedestrian")
-"""Classes of the targets, in their order."""
-_TAGS: Final = tuple(
-    TAGS[tag] for tag in ("road", "road_line", "sidewalk", "vehicle", "pedestrian")
-)
+"""Classes of the targets, in the order of the masks."""
+# Names of these classes among the semantic tags, in the same order.
+_TAG_NAMES = ("road", "road_line", "sidewalk", "vehicle", "pedestrian")
 COVERAGE: Final[Mapping[str, float]] = {
     "road": 0.5,
     "lane_line": 0.0,
@@ -31,22 +28,22 @@ COVERAGE: Final[Mapping[str, float]] = {
     "vehicle": 0.5,
     "pedestrian": 0.0,
 }
-"""Smallest share of a cell that a class must cover.
+"""Smallest fraction of a cell that a class must cover.
 
-With 0 any part is enough, for classes that are thinner than a cell.
+With a fraction of 0, which suits classes thinner than a cell, one pixel is enough.
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BevSegmentation(ShortRepr):
-    """Classes that cover each cell around an agent; arrays are read-only.
+    """The classes that cover each cell around an agent; arrays are read-only.
 
     Attributes:
         grid: Cells and their orientation.
-        masks: Layer for each of `BEV_CLASSES`, shape (5, H, W), bool. Only the upper surface
-            counts: no road beneath a car, nothing beneath a bridge or a tree.
-        known: Whether the cell is within the camera's ±60 m, shape (H, W), bool; outside all masks
-            are False.
+        masks: One layer for each of `BEV_CLASSES`, shape (5, H, W), bool. Only the topmost surface
+            counts: the road beneath a car and anything beneath a bridge or a tree is not marked.
+        known: Whether each cell is within ±60 m of the agent, the view of the overhead BEV camera,
+            shape (H, W), bool. All masks are False outside it.
     """
 
     grid: BevGrid
@@ -59,9 +56,10 @@ class BevSegmentation(ShortRepr):
         object.__setattr__(self, "known", readonly(self.known))
 
     def mask(self, name: str) -> BoolArray:
-        """Return the layer of a class, shape (H, W), bool. Raises ChoiceError."""
+        """Return a class's layer, (H, W) bool; raise ChoiceError if there is no such class."""
         index = BEV_CLASSES.index(choice("class", name, BEV_CLASSES))
-        return np.asarray(self.masks[index])
+        layer: BoolArray = self.masks[index]
+        return layer
 
 
 def bev_segmentation(
@@ -71,7 +69,7 @@ def bev_segmentation(
     *,
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
-    """Return the segmentation targets of a sample on a grid of its ego frame.
+    """Return the segmentation targets of a sample on a grid in its ego frame.
 
     Args:
         dataset: The release.
@@ -80,11 +78,13 @@ def bev_segmentation(
         augmentation: Rotation, scale and flip of the ground, as for labels; None for no change.
 
     Raises:
-        TokenError: No such sample.
+        TokenError: There is no such sample.
         MissingFileError: The BEV camera's file was not downloaded (the test split has none).
         SensorFileError: The file cannot be read.
     """
-    return segmentation_of(dataset.load_bev(sample), grid or BevGrid(), augmentation=augmentation)
+    image = dataset.load_bev(sample)
+    target_grid = grid or BevGrid()
+    return segmentation_of(image, target_grid, augmentation=augmentation)
 
 
 def segmentation_of(
@@ -93,36 +93,40 @@ def segmentation_of(
     *,
     augmentation: Augmentation | None = None,
 ) -> BevSegmentation:
-    """Return the targets on a grid from the image of a BEV camera.
+    """Return the targets on a grid, computed from the image of a BEV camera.
 
     Arguments and errors are as in `bev_segmentation`.
     """
-    pixels = _pixels_of_cells(grid, augmentation)
-    tags = np.append(image.semantic.reshape(-1), np.uint8(0))[pixels]
+    pixels = _find_pixels(grid, augmentation)
+    padded_image = np.append(image.semantic.reshape(-1), np.uint8(0))
+    tags = padded_image[pixels]
     layers = []
-    for name, tag in zip(BEV_CLASSES, _TAGS, strict=True):
+    for name, tag_name in zip(BEV_CLASSES, _TAG_NAMES, strict=True):
         min_pixels = max(1, math.ceil(COVERAGE[name] * pixels.shape[-1]))
-        layers.append(np.count_nonzero(tags == tag, axis=-1) >= min_pixels)
+        num_pixels = np.count_nonzero(tags == TAGS[tag_name], axis=-1)
+        layers.append(num_pixels >= min_pixels)
     known = np.all(pixels < image.semantic.size, axis=-1)
     return BevSegmentation(grid=grid, masks=np.stack(layers), known=known)
 
 
 @functools.lru_cache(maxsize=4)
-def _pixels_of_cells(grid: BevGrid, augmentation: Augmentation | None) -> IntArray:
-    """Return flat indices of the pixels at P points spread evenly over each cell, shape (H, W, P).
+def _find_pixels(grid: BevGrid, augmentation: Augmentation | None) -> IntArray:
+    """Return the flat indices of the pixels at P points spread evenly over each cell.
 
-    Outside the image the index is the size of the image.
+    The shape is (H, W, P). The index of a point outside the image is the number of pixels.
     """
     offsets = []
-    for size in (grid.x[2], grid.y[2]):
-        count = max(1, round(size / BEV_RESOLUTION))
-        offsets.append(((np.arange(count) + 0.5) / count - 0.5) * size)
-    spread = np.stack(np.meshgrid(*offsets), axis=-1).reshape(-1, 2)
-    points = grid.centers()[:, :, None] + spread
+    for _, _, cell_size in (grid.x, grid.y):
+        count = max(1, round(cell_size / BEV_RESOLUTION))
+        shares = (np.arange(count) + 0.5) / count - 0.5
+        offsets.append(shares * cell_size)
+    cell_points = np.stack(np.meshgrid(*offsets), axis=-1).reshape(-1, 2)
+    points = grid.centers()[:, :, None] + cell_points
     if augmentation is not None:
-        points = points @ np.linalg.inv(augmentation.matrix)[:2, :2].T
+        ego_from_augmented = np.linalg.inv(augmentation.matrix)
+        points = points @ ego_from_augmented[:2, :2].T
     num_rows, num_columns = BEV_SHAPE
-    # From the middle of the image to a pixel's centre there are whole pixels and a half.
+    # A pixel's centre is an integer and a half pixels away from the middle of the image.
     row = np.rint(num_rows / 2 - 0.5 - points[..., 0] / BEV_RESOLUTION)
     column = np.rint(num_columns / 2 - 0.5 - points[..., 1] / BEV_RESOLUTION)
     inside = (row >= 0) & (row < num_rows) & (column >= 0) & (column < num_columns)

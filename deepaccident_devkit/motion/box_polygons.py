@@ -1,14 +1,15 @@
-"""Boxes that labels show at a frame, and the positions of their corners in the ego frame.
+"""The boxes that appear in the labels at each frame, and their corners in the ego frame.
 
 The released code turns label rows into mmdet3d boxes and moves the boxes, all in float32 and in
-CARLA's left-handed frames. The cells depend on the rounding, so its steps are repeated here one by
-one (docs/released_code.md, Conventions and samples, Motion labels).
+CARLA's left-handed frames. The resulting cells depend on the rounding, so its steps are reproduced
+here one by one (docs/released_code.md, Conventions and samples, Motion labels).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -36,14 +37,15 @@ from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 OWN_BOX_ID: Final = -101
 """Key of the ego's own box in `MotionLabels.id_map`, as in the released code."""
-# The released code's box of an agent without a row of its own, with the size of a Lincoln car.
-_DEFAULT_SIZE: Final = (3.99, 1.85, 1.62)
+# The box, the size of a Lincoln car, that the released code assumes for an agent that has no
+# row.
+_DEFAULT_SIZE = (3.99, 1.85, 1.62)
 # mmdet3d's corners 0, 3, 7, 4 from above, in lengths and widths.
-_CORNERS: Final = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
-_UP: Final = np.array([0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
-# Corners farther away are moved to this distance, which is far outside the grid.
-_MAX_CORNER_CELLS: Final = 2**24
-_PEDESTRIAN: Final = CATEGORIES.index("pedestrian")
+_CORNERS = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]], dtype=np.float32) / 2
+_UP = np.array([0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
+# Corners farther away are clamped to this distance, which is far outside the grid.
+_MAX_CORNER_CELLS = 2**24
+_PEDESTRIAN = CATEGORIES.index("pedestrian")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,13 +58,13 @@ class FrameBoxes(ShortRepr):
         center: Centres, shape (N, 3), float64, metres.
         size: Lengths, widths, heights, shape (N, 3), float64, metres.
         yaw: Headings about z, shape (N,), float64, radians.
-        actor_id: Actor ids, shape (N,), int64; −100 is the agent's own row, −1 an untracked
-            actor's.
-        category: Positions in `taxonomy.CATEGORIES`, shape (N,), int.
-        visible: Whether any agent that counts sees the actor, shape (N,), bool
+        actor_id: Actor ids, shape (N,), int64; −100 marks the agent's own row, −1 the row of an
+            untracked actor.
+        category: Indices into `taxonomy.CATEGORIES`, shape (N,), int.
+        visible: Whether the actor is seen by any agent whose view counts, shape (N,), bool
             (docs/released_code.md, Visibility and attributes).
         ego_from_lidar: Transform to the ego frame, shape (4, 4), float64; for a protocol with
-            `pose="yaw"` to the ego frame without its lean.
+            `pose="yaw"`, to the ego frame without roll and pitch.
     """
 
     center: FloatArray
@@ -74,7 +76,7 @@ class FrameBoxes(ShortRepr):
     ego_from_lidar: FloatArray
 
     def __post_init__(self) -> None:
-        """Check and freeze the arrays; raises GeometryError."""
+        """Check and freeze the arrays; raise GeometryError if one has a wrong shape or type."""
         count = len(checked("FrameBoxes.center", self.center, (None, 3)))
         shapes: dict[str, tuple[tuple[int, ...], type]] = {
             "center": ((count, 3), np.float64),
@@ -87,9 +89,10 @@ class FrameBoxes(ShortRepr):
         }
         for name, (shape, dtype) in shapes.items():
             array = checked(f"FrameBoxes.{name}", getattr(self, name), shape, dtype)
-            if dtype is np.float64 and not np.isfinite(array).all():
-                row = int(np.argwhere(~np.isfinite(array))[0, 0])
-                remedy = "leave out such rows"
+            is_finite = np.isfinite(array)
+            if not is_finite.all():
+                row = int(np.argwhere(~is_finite)[0, 0])
+                remedy = "remove such rows"
                 if name == "ego_from_lidar":
                     remedy = "give None for a frame without a pose"
                 raise GeometryError(f"FrameBoxes.{name}: row {row} is not finite; {remedy}")
@@ -98,7 +101,7 @@ class FrameBoxes(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FramePolygons(ShortRepr):
-    """Polygons of one moment, in the order in which they are rasterised; arrays are read-only.
+    """Polygons at one moment, in the order in which they are rasterised; arrays are read-only.
 
     Attributes:
         corners: x and y of the footprints' corners in the moment's ego frame, shape (n, 4, 2),
@@ -110,21 +113,23 @@ class FramePolygons(ShortRepr):
     key: IntArray
 
     def __post_init__(self) -> None:
-        """Check and freeze the arrays; raises GeometryError."""
+        """Check and freeze the arrays; raise GeometryError if one has a wrong shape or type."""
         is_double = getattr(self.corners, "dtype", None) == np.float64
-        dtype = np.float64 if is_double else np.float32
-        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), dtype)
+        corners_dtype = np.float64 if is_double else np.float32
+        corners = checked("FramePolygons.corners", self.corners, (None, 4, 2), corners_dtype)
         object.__setattr__(self, "corners", readonly(corners))
         key = checked("FramePolygons.key", self.key, (len(corners),), np.int64)
         object.__setattr__(self, "key", readonly(key))
 
 
 class Polygons(NamedTuple):
-    """Polygons of F frames in the order in which they are rasterised; fields as in `FramePolygons`.
+    """Polygons at F frames in the order in which they are rasterised.
+
+    The fields are as in `FramePolygons`.
 
     Attributes:
         corners: x and y of the corners, shape (n, 4, 2).
-        frame: Numbers of the frames, shape (n,), int64, ascending.
+        frame: Index of each polygon's frame, shape (n,), int64, ascending.
         key: Actor ids, shape (n,), int64.
     """
 
@@ -147,13 +152,13 @@ class Polygons(NamedTuple):
 
 
 class Footprints(NamedTuple):
-    """Rasterised polygons of all frames in the order of their frames, in native orientation.
+    """Rasterised polygons of all frames, sorted by frame, in native orientation.
 
     Attributes:
         corners: Columns and rows of the corners, shape (n, V, 2), int64.
-        frame: Numbers of the frames, shape (n,), int64, ascending.
+        frame: Index of each polygon's frame, shape (n,), int64, ascending.
         identity: Ids from 1, shape (n,), int64.
-        top: 1 + the number of the polygon on top of each cell, 0 where there is none, shape (frames
+        top: 1 + the index of the topmost polygon at each cell; 0 where there is none; shape (frames
             · cells,), int32.
     """
 
@@ -166,62 +171,64 @@ class Footprints(NamedTuple):
 def box_polygons(
     frames: Sequence[FrameBoxes | None], config: MotionLabelConfig, *, is_vehicle: bool = True
 ) -> list[FramePolygons | None]:
-    """Return the polygons of boxes that labels show, frame by frame from the present on.
+    """Return the polygons of the boxes that appear in labels, frame by frame from the present on.
 
     Args:
         frames: Boxes of each label frame; None where there is no recording.
         config: Configuration of the labels.
-        is_vehicle: Whether the agent is a vehicle, with a box of its own (the infrastructure has
-            none).
+        is_vehicle: Whether the agent is a vehicle, which has a box of its own; the infrastructure
+            has none.
 
     Returns:
-        Each frame's polygons, the ego's own first, then the others in the order of their rows; None
-        where there is no recording.
+        Each frame's polygons, the ego's own first, then the others in row order; None where there
+        is no recording.
 
     Raises:
         GeometryError: A frame is neither `FrameBoxes` nor None.
     """
-    polygons = polygons_of(BoxRows.of(frames, is_vehicle=is_vehicle), config)
-    ends = polygons.frame.searchsorted(np.arange(len(frames)), side="right").tolist()
+    polygons = make_polygons(BoxRows.of(frames, is_vehicle=is_vehicle), config)
+    bounds = polygons.frame.searchsorted(np.arange(len(frames) + 1)).tolist()
     frame_polygons: list[FramePolygons | None] = []
-    for frame, start, end in zip(frames, [0, *ends], ends, strict=False):
+    for frame, (start, end) in zip(frames, pairwise(bounds), strict=True):
         if frame is None:
             frame_polygons.append(None)
-        else:
-            corners = polygons.corners[start:end]
-            frame_polygons.append(FramePolygons(corners=corners, key=polygons.key[start:end]))
+            continue
+        corners = polygons.corners[start:end]
+        key = polygons.key[start:end]
+        frame_polygons.append(FramePolygons(corners=corners, key=key))
     return frame_polygons
 
 
-def polygons_of(boxes: BoxRows, config: MotionLabelConfig) -> Polygons:
-    """Return the polygons of boxes that labels show.
+def make_polygons(boxes: BoxRows, config: MotionLabelConfig) -> Polygons:
+    """Return the polygons of the boxes that appear in labels.
 
-    In each frame the ego's own is the first, then follow the others by their rows.
+    In each frame the ego's own box comes first; the others follow in row order.
     """
+    augmentation = config.augmentation
     pose = flip_pose(boxes.ego_from_lidar).astype(np.float32)
-    constructed = _constructed(boxes.center, boxes.size, boxes.yaw)
-    moved = _moved(constructed, pose[boxes.frame])
-    own, own_frame = _own_boxes(boxes, moved, pose, config)
-    drawn = _are_drawn(boxes, config)
+    lidar_boxes = _construct_boxes(boxes.center, boxes.size, boxes.yaw)
+    ego_boxes = _move_boxes(lidar_boxes, pose[boxes.frame])
+    own, own_frame = _own_boxes(boxes, ego_boxes, pose, config)
+    is_drawn = _are_drawn(boxes, config)
     other_corners: AnyArray
     if config.rules.pose == "yaw":
-        other_corners = _leaning_corners(boxes, config.augmentation)[drawn]
+        other_corners = _compute_leaning_corners(boxes, augmentation)[is_drawn]
     else:
-        other_corners = _corners(_augmented(moved[drawn], config.augmentation))
+        other_corners = _compute_corners(_augment_boxes(ego_boxes[is_drawn], augmentation))
     if not config.rules.own_box_not_augmented:
-        own = _augmented(own, config.augmentation)
+        own = _augment_boxes(own, augmentation)
     own_key = np.full(len(own), OWN_BOX_ID, dtype=np.int64)
-    corners = np.concatenate([_corners(own), other_corners])
-    frame = np.concatenate([own_frame, boxes.frame[drawn]])
-    key = np.concatenate([own_key, boxes.actor_id[drawn]])
+    corners = np.concatenate([_compute_corners(own), other_corners])
+    frame = np.concatenate([own_frame, boxes.frame[is_drawn]])
+    key = np.concatenate([own_key, boxes.actor_id[is_drawn]])
     order = np.argsort(frame, kind="stable")
     return Polygons(corners[order], frame[order], key[order])
 
 
-def footprints_of(
+def rasterise_polygons(
     polygons: Polygons, ids: IntArray, frames: int, config: MotionLabelConfig
 ) -> Footprints:
-    """Rasterise the polygons of frames in native orientation; later polygons lie on top.
+    """Rasterise the polygons of all frames in native orientation; later polygons lie on top.
 
     Args:
         polygons: Polygons of all frames.
@@ -237,12 +244,16 @@ def footprints_of(
     y = corners[..., 1]
     if not config.rules.right_handed:
         y = -y
-    position = np.stack((y, x) if native.orientation == "fiery" else (x, y), axis=-1)
+    column_and_row = (x, y)
+    if native.orientation == "fiery":
+        column_and_row = (y, x)
+    position = np.stack(column_and_row, axis=-1)
     low, _, size = np.array(axes_of(native)[::-1]).T
     if config.rules.half_cell_shift:
         first_center = (low + size / 2).astype(np.float32)
-        cell = size.astype(np.float32)
-        cells: AnyArray = np.rint((position - first_center + cell / np.float32(2)) / cell)
+        cell_size = size.astype(np.float32)
+        half_cell = cell_size / np.float32(2)
+        cells: AnyArray = np.rint((position - first_center + half_cell) / cell_size)
     else:
         cells = np.floor((position.astype(np.float64) - low) / size)
     vertices = np.clip(cells, -_MAX_CORNER_CELLS, _MAX_CORNER_CELLS).astype(np.int64)
@@ -252,22 +263,22 @@ def footprints_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BoxRows:
-    """M boxes of the label frames of S samples; frames are numbered through all samples, T of each.
+    """M boxes at the T label frames of each of S samples; all frames are numbered consecutively.
 
     Fields of the same name are as in `FrameBoxes`, finite and right-handed.
 
     Attributes:
-        frame: Numbers of the frames, shape (M,), int64, ascending.
+        frame: Index of each box's frame, shape (M,), int64, ascending.
         center: Centres, shape (M, 3), float64.
         size: Lengths, widths, heights, shape (M, 3), float64.
         yaw: Headings about z, shape (M,), float64.
         actor_id: Actor ids, shape (M,), int64.
-        category: Positions in `taxonomy.CATEGORIES`, shape (M,), int.
-        visible: Whether any agent that counts sees the actor, shape (M,), bool.
+        category: Indices into `taxonomy.CATEGORIES`, shape (M,), int.
+        visible: Whether the actor is seen by any agent whose view counts, shape (M,), bool.
         ego_from_lidar: Transforms to the ego frames, shape (S · T, 4, 4), float64; the identity
             where there is no recording.
-        has_own: Whether the agent, at this frame of its recording, is a vehicle with a box of its
-            own, shape (S, T), bool.
+        has_own: Whether the agent is a vehicle that has a box of its own at this frame, shape (S,
+            T), bool.
     """
 
     frame: IntArray
@@ -282,30 +293,32 @@ class BoxRows:
 
     @classmethod
     def of(cls, frames: Sequence[FrameBoxes | None], *, is_vehicle: bool) -> BoxRows:
-        """Return the boxes of one sample; raises GeometryError."""
+        """Return the boxes of one sample.
+
+        Raise GeometryError if a frame is neither `FrameBoxes` nor None.
+        """
         for frame in frames:
             if not isinstance(frame, FrameBoxes | None):
                 raise GeometryError(
                     f"frames: expected FrameBoxes, or None beyond the recording, found {frame!r}"
                 )
-        all_frames = [_NO_BOXES if frame is None else frame for frame in frames]
-        parts = [_NO_BOXES, *all_frames]
-        counts = [len(boxes.actor_id) for boxes in all_frames]
-        poses = [boxes.ego_from_lidar for boxes in all_frames]
+        frame_boxes = [frame or _NO_BOXES for frame in frames]
+        counts = [len(boxes.actor_id) for boxes in frame_boxes]
+        poses = [boxes.ego_from_lidar for boxes in frame_boxes]
+        has_own = [frame is not None and is_vehicle for frame in frames]
+        columns = {}
+        for name in ("center", "size", "yaw", "actor_id", "category", "visible"):
+            frame_columns = [getattr(boxes, name) for boxes in (_NO_BOXES, *frame_boxes)]
+            columns[name] = np.concatenate(frame_columns)
         return cls(
             frame=np.repeat(np.arange(len(frames)), counts),
-            center=np.concatenate([boxes.center for boxes in parts]),
-            size=np.concatenate([boxes.size for boxes in parts]),
-            yaw=np.concatenate([boxes.yaw for boxes in parts]),
-            actor_id=np.concatenate([boxes.actor_id for boxes in parts]),
-            category=np.concatenate([boxes.category for boxes in parts]),
-            visible=np.concatenate([boxes.visible for boxes in parts]),
             ego_from_lidar=np.reshape(poses, (-1, 4, 4)),
-            has_own=np.array([[frame is not None and is_vehicle for frame in frames]]),
+            has_own=np.array([has_own]),
+            **columns,
         )
 
 
-_NO_BOXES: Final = FrameBoxes(
+_NO_BOXES = FrameBoxes(
     center=np.zeros((0, 3)),
     size=np.zeros((0, 3)),
     yaw=np.zeros(0),
@@ -317,12 +330,15 @@ _NO_BOXES: Final = FrameBoxes(
 
 
 def _are_drawn(boxes: BoxRows, config: MotionLabelConfig) -> BoolArray:
-    """Return which rows are rasterised, shape (M,). Own rows are not: `_own_boxes` has them."""
-    rows: BoolArray = boxes.actor_id != OWN_ACTOR_ID
+    """Return whether each row is rasterised, shape (M,).
+
+    The agent's own rows are not rasterised here: `_own_boxes` returns their boxes.
+    """
+    is_drawn: BoolArray = boxes.actor_id != OWN_ACTOR_ID
     if config.only_vehicle:
-        rows &= boxes.category != _PEDESTRIAN
+        is_drawn &= boxes.category != _PEDESTRIAN
     if not config.filter_invisible:
-        return rows
+        return is_drawn
     ids, actor = np.unique(boxes.actor_id, return_inverse=True)
     visible = np.zeros((boxes.has_own.size, len(ids)), dtype=bool)
     visible[boxes.frame[boxes.visible], actor[boxes.visible]] = True
@@ -331,50 +347,53 @@ def _are_drawn(boxes: BoxRows, config: MotionLabelConfig) -> BoolArray:
         by_sample[:] = by_sample[:, :1]
     elif config.rules.drawn_when == "since":
         by_sample[:] = np.logical_or.accumulate(by_sample, axis=1)
-    by_id: BoolArray = visible[boxes.frame, actor]
+    is_visible: BoolArray = visible[boxes.frame, actor]
     if not config.rules.untracked_share_an_id:
-        by_id = np.where(boxes.actor_id == UNTRACKED_ID, boxes.visible, by_id)
-    return rows & by_id
+        is_untracked = boxes.actor_id == UNTRACKED_ID
+        is_visible = np.where(is_untracked, boxes.visible, is_visible)
+    return is_drawn & is_visible
 
 
 def _own_boxes(
-    boxes: BoxRows, moved: Float32Array, pose: Float32Array, config: MotionLabelConfig
+    boxes: BoxRows, ego_boxes: Float32Array, pose: Float32Array, config: MotionLabelConfig
 ) -> tuple[Float32Array, IntArray]:
-    """Return the ego's own boxes in the ego frames, at most one for each frame.
+    """Return the ego's own boxes in the ego frames, at most one per frame.
 
     Args:
         boxes: Boxes of all frames.
-        moved: The same boxes in mmdet3d's form in the ego frames, shape (M, 7).
+        ego_boxes: The same boxes in mmdet3d's layout, in the ego frames, shape (M, 7).
         pose: Left-handed transforms to the ego frames, shape (S · T, 4, 4).
         config: Configuration of the labels.
 
     Returns:
-        Boxes in mmdet3d's form, shape (n, 7), and the numbers of their frames, shape (n,).
+        Boxes in mmdet3d's layout, shape (n, 7), and the index of each box's frame, shape (n,).
     """
     rules = config.rules
     frames = np.arange(boxes.has_own.size)
     rows = np.flatnonzero(boxes.actor_id == OWN_ACTOR_ID)
     own = np.zeros((len(frames), 7), dtype=np.float32)
-    own[boxes.frame[rows[::-1]]] = moved[rows[::-1]]  # the first one of a frame counts
+    last_first = rows[::-1]
+    own[boxes.frame[last_first]] = ego_boxes[last_first]  # only a frame's first one counts
     if rules.own_box_moved_twice:
         own -= own[:, 5:6] / 2 * _UP
-    count = np.bincount(boxes.frame[rows], minlength=len(frames))
-    is_default = rules.own_box_default & (count != 1)
-    begin, end = boxes.frame.searchsorted([frames, frames + 1])
-    z = np.append(boxes.center[:, 2], 0)[np.where(begin < end, begin, -1)]
+    counts = np.bincount(boxes.frame[rows], minlength=len(frames))
+    is_default = rules.own_box_default & (counts != 1)
+    begins, ends = boxes.frame.searchsorted([frames, frames + 1])
+    first_rows = np.where(begins < ends, begins, -1)
+    z = np.append(boxes.center[:, 2], 0)[first_rows]
     zeros = np.zeros_like(z)
     center = np.stack([zeros, zeros, z], axis=1)
-    default_boxes = _constructed(center, np.tile(_DEFAULT_SIZE, (len(z), 1)), zeros)
+    default_boxes = _construct_boxes(center, np.tile(_DEFAULT_SIZE, (len(z), 1)), zeros)
     own[is_default] = default_boxes[is_default]
     is_moved = is_default | rules.own_box_moved_twice
-    own[is_moved] = _moved(own[is_moved], pose[is_moved])
-    exists = boxes.has_own.reshape(-1) & (is_default | (count > 0))
-    drawn = np.flatnonzero(exists & config.draw_ego)
-    return own[drawn], drawn
+    own[is_moved] = _move_boxes(own[is_moved], pose[is_moved])
+    exists = boxes.has_own.reshape(-1) & (is_default | (counts > 0))
+    drawn_frames = np.flatnonzero(exists & config.draw_ego)
+    return own[drawn_frames], drawn_frames
 
 
-def _constructed(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float32Array:
-    """Return right-handed boxes in mmdet3d's form, shape (N, 7), float32.
+def _construct_boxes(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float32Array:
+    """Convert right-handed boxes to mmdet3d's layout, shape (N, 7), float32.
 
     The columns are x, y (right), z of the bottom, length, width, height, yaw.
     """
@@ -383,26 +402,28 @@ def _constructed(center: FloatArray, size: FloatArray, yaw: FloatArray) -> Float
     return boxes
 
 
-def _moved(boxes: Float32Array, pose: Float32Array) -> Float32Array:
-    """Move boxes by left-handed poses (N, 4, 4) as mmdet3d's rotate and translate do.
+def _move_boxes(boxes: Float32Array, pose: Float32Array) -> Float32Array:
+    """Move boxes by left-handed poses (N, 4, 4), as mmdet3d's rotate and translate do.
 
-    It rotates by the transposed rotations of the poses.
+    mmdet3d rotates by the transposed rotation matrices of the poses.
     """
-    rotated = single_precision.product(pose[:, :3, :3], boxes[:, :3, None])[..., 0]
-    center = rotated + pose[:, :3, 3]
-    # Computed in float64 and then rounded: equal to torch's in nearly all cases, unlike numpy's own
+    rotation = pose[:, :3, :3]
+    rotated = single_precision.product(rotation, boxes[:, :3, None])
+    center = rotated[..., 0] + pose[:, :3, 3]
+    # Computed in float64 and then rounded: nearly always equal to torch's result, unlike numpy's
     # float32.
-    turn = np.arctan2(pose[:, 0, 1].astype(np.float64), pose[:, 0, 0]).astype(np.float32)
-    return np.column_stack([center, boxes[:, 3:6], boxes[:, 6] + turn])
+    turn = np.arctan2(rotation[:, 0, 1].astype(np.float64), rotation[:, 0, 0])
+    yaw = boxes[:, 6] + turn.astype(np.float32)
+    return np.column_stack([center, boxes[:, 3:6], yaw])
 
 
-def _augmented(boxes: Float32Array, augmentation: Augmentation | None) -> Float32Array:
-    """Turn, scale and flip mmdet3d's boxes; the flip swaps front and rear as old mmdet3d does."""
+def _augment_boxes(boxes: Float32Array, augmentation: Augmentation | None) -> Float32Array:
+    """Rotate, scale and flip mmdet3d's boxes; like old mmdet3d, the flip swaps front and rear."""
     if augmentation is None:
         return boxes
-    turn = replace(augmentation, scale=1.0, flip=False).matrix
-    pose = flip_pose(turn).astype(np.float32)
-    moved = _moved(boxes, np.broadcast_to(pose, (len(boxes), 4, 4)))
+    rotation = replace(augmentation, scale=1.0, flip=False)
+    pose = flip_pose(rotation.matrix).astype(np.float32)
+    moved = _move_boxes(boxes, np.broadcast_to(pose, (len(boxes), 4, 4)))
     moved[:, :6] *= np.float32(augmentation.scale)
     if augmentation.flip:
         moved[:, 1] *= -1
@@ -410,8 +431,8 @@ def _augmented(boxes: Float32Array, augmentation: Augmentation | None) -> Float3
     return moved
 
 
-def _corners(boxes: Float32Array) -> Float32Array:
-    """Return x forward and y left of the bottom corners 0, 3, 7, 4 of mmdet3d's boxes.
+def _compute_corners(boxes: Float32Array) -> Float32Array:
+    """Return x (forward) and y (left) of the bottom corners 0, 3, 7, 4 of mmdet3d's boxes.
 
     The shape is (N, 4, 2), float32.
     """
@@ -424,18 +445,18 @@ def _corners(boxes: Float32Array) -> Float32Array:
     return np.stack([x, -y], axis=-1)
 
 
-def _leaning_corners(boxes: BoxRows, augmentation: Augmentation | None) -> FloatArray:
-    """Return x forward and y left of the bottom corners of boxes that turn in all axes.
+def _compute_leaning_corners(boxes: BoxRows, augmentation: Augmentation | None) -> FloatArray:
+    """Return x (forward) and y (left) of the bottom corners of boxes with roll and pitch.
 
     The shape is (M, 4, 2).
     """
-    ends = boxes.frame.searchsorted(np.arange(len(boxes.ego_from_lidar)), side="right").tolist()
+    bounds = boxes.frame.searchsorted(np.arange(len(boxes.ego_from_lidar) + 1)).tolist()
     corners = []
-    for pose, start, end in zip(boxes.ego_from_lidar, [0, *ends], ends, strict=False):
+    for pose, (start, end) in zip(boxes.ego_from_lidar, pairwise(bounds), strict=True):
+        center = boxes.center[start:end]
         size = np.abs(boxes.size[start:end])  # labels may have negative sizes
-        lidar_boxes = Boxes.from_arrays(
-            boxes.center[start:end], size, boxes.yaw[start:end], frame="lidar"
-        )
+        yaw = boxes.yaw[start:end]
+        lidar_boxes = Boxes.from_arrays(center, size, yaw, frame="lidar")
         ego_boxes = lidar_boxes.transform(trusted_se3(pose), "ego")
         corners.append(ego_boxes.bottom_corners()[..., :2])
     matrix = np.eye(4) if augmentation is None else augmentation.matrix

@@ -1,6 +1,6 @@
-"""`MotionLabelConfig`: content and form of labels, with presets for the papers' settings.
+"""`MotionLabelConfig`: what labels contain and how, with presets for the papers' settings.
 
-A `LabelProtocol` has the quirks of the released label code, each with a name.
+A `LabelProtocol` lists the quirks of the released label code, each as a named option.
 """
 
 from __future__ import annotations
@@ -26,39 +26,39 @@ WarpRule = Literal["stretched", "exact", "fiery"]
 DrawnWhen = Literal["present", "since", "now"]
 SightRule = Literal["released", "camera"]
 PoseRule = Literal["whole", "yaw"]
-_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
+_CHOICES: Mapping[str, tuple[str, ...]] = {
     "warp": get_args(WarpRule),
     "drawn_when": get_args(DrawnWhen),
     "native": ORIENTATIONS,
     "sight": get_args(SightRule),
     "pose": get_args(PoseRule),
 }
-_STEPS_PER_SECOND: Final = 2
-_MAX_BYTE: Final = 255
-_MAX_FRAMES: Final = 1000
-_COUNTS: Final = {
+_STEPS_PER_SECOND = 2
+_MAX_BYTE = 255
+_MAX_FRAMES = 1000
+_COUNTS = {
     "receptive_field": "frames up to the present, the present included",
     "future_frames": "frames after the present; labels of motion need at least one",
     "step": "recorded frames from one label frame to the next, 5 for 2 Hz",
 }
-_MIN_SIGMA_CELLS: Final = 0.01
-_MAX_SIGMA_CELLS: Final = 10_000.0
+_MIN_SIGMA_CELLS = 0.01
+_MAX_SIGMA_CELLS = 10_000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelProtocol:
-    """Rules by which labels are rasterised and warped.
+    """Rules for rasterising and warping labels.
 
     A flag is True for the released code's quirk. Change one with
     `dataclasses.replace(LABEL_PROTOCOLS["released"], half_cell_shift=False)`. Sources:
     docs/released_code.md, Motion labels, Warps, and FIERY's own labels.
 
     Attributes:
-        own_box_moved_twice: Whether the ego's own row is moved to the ego frame twice, with the
-            released box constructor in between; if False, once.
-        own_box_default: Whether a box of 3.99 m x 1.85 m at the LiDAR replaces the ego's own box if
-            not exactly one row is the ego's own; if False, the first own row is rasterised, if
-            there is one.
+        own_box_moved_twice: Whether the ego's own row is transformed to the ego frame twice, with
+            the released box constructor in between; if False, it is transformed once.
+        own_box_default: Whether a box of 3.99 m x 1.85 m at the LiDAR replaces the ego's own box
+            unless exactly one row is the ego's; if False, the first of the ego's rows is
+            rasterised, if there is one.
         own_box_not_augmented: Whether an augmentation moves all boxes except the ego's own.
         half_cell_shift: Whether the corners of boxes are rounded to the nearest *edge* between
             cells, so that boxes lie half a cell too far along both axes; if False, corners are
@@ -71,31 +71,31 @@ class LabelProtocol:
             False, each row of each frame is an instance of its own.
         missing_frames_are_empty: Whether a frame beyond the recording is all zeros, as if it had no
             actors (offset and flow 255); if False, it is all `ignore_index`.
-        outside_is_zero: Whether cells that a warp samples outside the grid are 0 in every map; if
-            False, they are 0 in segmentation, instance and centerness, and `ignore_index` in offset
-            and flow.
+        outside_is_zero: Whether cells that a warp samples from outside the grid are 0 in every map;
+            if False, they are 0 in segmentation, instance and centerness, and `ignore_index` in
+            offset and flow.
         vectors_not_rotated: Whether offset and flow keep their values when a warp turns their
             cells; if False, they turn with the cells.
         ids_kept_between_samples: Whether samples may continue the ids of an earlier one (`id_map`).
             The released code does so while a worker reads samples of one scenario and agent: ids
             depend on the samples that the worker read before. If False, ids count from 1 in every
             sample.
-        warp: Sampling rule: `stretched` (released and BEVerse: sample points 0.50125 m apart),
-            `exact` (cell centres, complete transforms) or `fiery` (cell centres; only yaw and
-            planar translation of the 6-vector).
+        warp: Sampling rule of warps: `stretched` (released and BEVerse: sample points 0.50125 m
+            apart), `exact` (cell centres, complete transforms) or `fiery` (cell centres; only yaw
+            and planar translation of the 6-vector).
         native: Orientation in which corners are rounded, centres are computed and rasters are
-            sampled; boxes and motions have its handedness in these steps. The warp `fiery` needs
-            `fiery`. It decides how halves of a cell are rounded; `MotionLabelConfig.grid` has the
-            orientation of the labels.
-        sight: Rule for the actors that an agent sees: `released`, by points and cameras, and
-            untracked rows never; `camera`, if a camera of the agent sees the actor (FIERY drops
-            nuScenes' visibility 1), of any class in nuScenes (`Dataset.with_ignored`). Only the
-            sample's own agent then sees an untracked row.
-        pose: Transform of boxes to the ego's frame: `whole`, by the complete pose, each as an
-            upright box in that frame; `yaw` (FIERY), only by the position and the yaw of the pose,
-            in double precision, so that a box that leans has the footprint of its leaning bottom.
-            The yaw is the sixth number of the pose's 6-vector, which differs from the heading where
-            the agent leans.
+            sampled; boxes and motions have its handedness in these steps. The warp rule `fiery`
+            requires the orientation `fiery`. The native orientation decides how half cells are
+            rounded; the finished labels have the orientation of `MotionLabelConfig.grid`.
+        sight: Rule for which actors an agent sees. `released`: decided by LiDAR points and cameras;
+            untracked rows are never seen. `camera`: an actor is seen if a camera of the agent sees
+            it (FIERY drops nuScenes' visibility 1); in nuScenes it may be of any class
+            (`Dataset.with_ignored`), and an untracked row is seen only by the sample's own agent.
+        pose: Transform of boxes to the ego frame. `whole`: by the complete pose; each box is then
+            upright in that frame. `yaw` (FIERY): only by the pose's position and yaw, in double
+            precision, so that a box with roll or pitch has the footprint of its tilted bottom. The
+            yaw is the sixth number of the pose's 6-vector, which differs from the heading if the
+            agent has roll or pitch.
     """
 
     # Boxes.
@@ -117,7 +117,7 @@ class LabelProtocol:
     pose: PoseRule = "whole"
 
     def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
+        """Check the values; raise ChoiceError or ConfigError if one is not valid."""
         for option in fields(self):
             name = f"label protocol: {option.name}"
             value = getattr(self, option.name)
@@ -142,17 +142,19 @@ class LabelProtocol:
 
     @property
     def place_in_cell(self) -> tuple[float, float]:
-        """Point for which a rasterised cell stands, in cells along x and y from its low corner.
+        """The point that a rasterised cell represents, in cells along x and y from its low corner.
 
-        With `half_cell_shift` it is the corner with the lowest row and column in the native
-        orientation.
+        With `half_cell_shift`, it is the corner with the lowest row and column in the native
+        orientation; otherwise the cell's centre.
         """
         if not self.half_cell_shift:
             return 0.5, 0.5
-        return 0.0, 0.0 if self.right_handed else 1.0
+        if self.right_handed:
+            return 0.0, 0.0
+        return 0.0, 1.0
 
 
-_RELEASED: Final = LabelProtocol(
+_RELEASED = LabelProtocol(
     own_box_moved_twice=True,
     own_box_default=True,
     own_box_not_augmented=True,
@@ -166,7 +168,7 @@ _RELEASED: Final = LabelProtocol(
     warp="stretched",
     native="released",
 )
-_FIERY: Final = replace(
+_FIERY = replace(
     _RELEASED,
     drawn_when="now",
     untracked_share_an_id=False,
@@ -206,7 +208,8 @@ LABEL_PROTOCOLS: Final[Mapping[str, LabelProtocol]] = MappingProxyType(
 )
 """Protocols by name.
 
-They are the released code, the same without its quirks, and the two codes that it is based on.
+They are the rules of the released code, the same rules without its quirks, and the rules of the two
+code bases that it is based on.
 """
 NO_PRESETS: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -214,47 +217,57 @@ NO_PRESETS: Final[Mapping[str, str]] = MappingProxyType(
         for name in LABEL_PROTOCOLS
     }
 )
-"""Protocol's name → end of the error message if it is used as the name of a preset."""
-_PROTOCOL_NAMES: Final = {rules: name for name, rules in LABEL_PROTOCOLS.items()}
+"""Name of a protocol → end of the error message if it is used as the name of a preset."""
+_PROTOCOL_NAMES = {rules: name for name, rules in LABEL_PROTOCOLS.items()}
 
 
 def label_protocol(protocol: str | LabelProtocol) -> LabelProtocol:
-    """Return a protocol by its name, or a protocol unchanged; raises ChoiceError."""
+    """Look up a protocol by name; a `LabelProtocol` is returned unchanged.
+
+    Raise ChoiceError for an unknown name.
+    """
     if isinstance(protocol, LabelProtocol):
         return protocol
     return LABEL_PROTOCOLS[choice("protocol", protocol, LABEL_PROTOCOLS)]
 
 
 def slip_names() -> list[str]:
-    """Return the names of the flags of `LabelProtocol`."""
-    return [field.name for field in fields(LabelProtocol) if field.name not in _CHOICES]
+    """List the names of the flags of `LabelProtocol`."""
+    names = []
+    for option in fields(LabelProtocol):
+        if option.name not in _CHOICES:
+            names.append(option.name)
+    return names
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionLabelConfig:
-    """Content of motion labels; the defaults are the released ones in the devkit's orientation.
+    """Configuration of motion labels; defaults are the release's, in the devkit's orientation.
 
     Attributes:
-        grid: Cells, right-handed metres, and their orientation in arrays (`grid.orientation`).
-        receptive_field: Number of frames up to the present that a model sees, the present included.
-        future_frames: Number of frames after the present that labels show.
+        grid: Extent and size of the cells, right-handed metres, and their orientation in arrays
+            (`grid.orientation`).
+        receptive_field: Number of frames up to and including the present that a model sees.
+        future_frames: Number of frames after the present that labels cover.
         step: Number of recorded frames (0.1 s) from one label frame to the next; 5 is 2 Hz.
-        only_vehicle: leave out pedestrians (two-wheelers are vehicles, as in all three codes).
+        only_vehicle: Whether to leave out pedestrians; two-wheelers are vehicles, as in all three
+            public code bases.
         filter_invisible: Whether to rasterise only actors that the cooperating agents see, by the
             protocol's `sight` (docs/released_code.md, Visibility and attributes).
-        agents: Agents with views that count; None for all agents of the recording, as in the
-            released code; `single` for only the sample's own, as in FIERY. Names are stored as a
-            tuple, and `available` as None.
+        agents: Agents whose views count for visibility; None for all agents of the recording, as in
+            the released code; `single` for only the sample's own agent, as in FIERY. Names are
+            stored as a tuple, and `available` as None.
         draw_ego: Whether to rasterise the ego's own box (the infrastructure has none).
         ignore_index: Value of offset and flow outside instances, and of missing frames that are
-            ignored: 255, or a number of at least the grid's longer side in cells, which no vector
-            can have.
-        orientation: New orientation of `grid`, only an argument of the constructor; None keeps the
-            grid's own. The field itself is always None.
+            ignored: 255, or a number not less than the grid's longer side in cells, which no vector
+            component can reach.
+        orientation: Constructor argument that replaces the orientation of `grid`; None keeps the
+            grid's orientation. The field itself is always None.
         sigma: Radius of the centres' peaks, cells: exp(−d² / σ²), as in FIERY.
         protocol: `released`, `clean`, `beverse`, `fiery`, or a `LabelProtocol` of your own. A
             protocol that equals a named one is replaced by the name.
-        augmentation: Rotation, scale and flip in each frame's ego frame; None for no change.
+        augmentation: Rotation, scale and flip, applied in each frame's ego frame; None for no
+            change.
     """
 
     # Cells and frames.
@@ -275,7 +288,7 @@ class MotionLabelConfig:
     augmentation: Augmentation | None = None
 
     def __post_init__(self) -> None:
-        """Check and complete the values; raises ConfigError or ChoiceError with the remedy."""
+        """Check and complete the values; raise ConfigError or ChoiceError with the remedy."""
         if not isinstance(self.grid, BevGrid):
             raise ConfigError(
                 f"grid: expected a BevGrid, found {self.grid!r}; "
@@ -284,20 +297,23 @@ class MotionLabelConfig:
         grid = self.grid
         if self.orientation is not None:
             grid = grid.with_orientation(self.orientation)
+        ignore_index = _check_ignore_index(self.ignore_index, grid)
+        expected_sigma = "cells from 0.01 to 10,000, such as 3"
+        sigma = checked_setting(
+            "sigma", self.sigma, expected_sigma, _MIN_SIGMA_CELLS, _MAX_SIGMA_CELLS
+        )
+        agents = None
+        # `available` and None have the same digest.
+        if not is_available(self.agents):
+            agents = checked_agents(self.agents)
+        rules = label_protocol(self.protocol)
         values: dict[str, object] = {
             "grid": grid,
             "orientation": None,
-            "ignore_index": _checked_ignore_index(self.ignore_index, grid),
-            "sigma": checked_setting(
-                "sigma",
-                self.sigma,
-                "cells from 0.01 to 10,000, such as 3",
-                _MIN_SIGMA_CELLS,
-                _MAX_SIGMA_CELLS,
-            ),
-            # `available` and None have the same digest.
-            "agents": None if is_available(self.agents) else checked_agents(self.agents),
-            "protocol": _PROTOCOL_NAMES.get(label_protocol(self.protocol), self.protocol),
+            "ignore_index": ignore_index,
+            "sigma": sigma,
+            "agents": agents,
+            "protocol": _PROTOCOL_NAMES.get(rules, self.protocol),
         }
         for name, meaning in _COUNTS.items():
             values[name] = checked_count(name, getattr(self, name), meaning, _MAX_FRAMES)
@@ -314,18 +330,18 @@ class MotionLabelConfig:
     def preset(cls, name: str, **changes: Any) -> MotionLabelConfig:
         """Return a preset of `PRESETS`, with some fields changed.
 
-        A grid in the default orientation `devkit` gets the preset's orientation; any other grid
-        keeps its own.
+        If `changes` contains a grid with the default orientation `devkit`, it takes the preset's
+        orientation; any other grid keeps its own orientation.
 
         Raises:
-            ChoiceError: No such preset.
-            ConfigError: No such field, or an impossible value.
+            ChoiceError: There is no preset of that name.
+            ConfigError: There is no such field, or a value is not valid.
         """
         preset = PRESETS[choice("preset", name, PRESETS, elsewhere=NO_PRESETS)]
         unknown = sorted(set(changes) - set(cls.__dataclass_fields__))
         if unknown:
             names = ", ".join(cls.__dataclass_fields__)
-            raise ConfigError(f"preset: there is no field {unknown[0]!r}; there are {names}")
+            raise ConfigError(f"preset: no field {unknown[0]!r}; the fields are {names}")
         grid = changes.get("grid")
         if isinstance(grid, BevGrid) and grid.orientation == "devkit":
             if changes.get("orientation") is None:
@@ -339,7 +355,7 @@ class MotionLabelConfig:
 
     @property
     def label_frames(self) -> int:
-        """Number of frames that labels show: the present and the future ones."""
+        """Number of frames that labels cover: the present and the future ones."""
         return 1 + self.future_frames
 
     @property
@@ -352,16 +368,17 @@ class MotionLabelConfig:
 
     @property
     def offsets(self) -> range:
-        """Numbers of recorded frames from the present to each of `frames`, the past negative."""
+        """Offsets of `frames` from the present in recorded frames (0.1 s); the past is negative."""
         first = -(self.receptive_field - 1) * self.step
-        return range(first, self.future_frames * self.step + 1, self.step)
+        last = self.future_frames * self.step
+        return range(first, last + 1, self.step)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all that affects the labels' values, in types of JSON.
+        """Return everything that affects the labels' values, in JSON types.
 
-        The protocol is a dictionary of its options. An option with a default is newer than the
-        first label files. It appears only with another value, so that older configurations still
-        have the same digest.
+        The protocol is a dictionary of its options. Options that are newer than the first label
+        files have a default, and appear only with another value, so that older configurations keep
+        their digest.
         """
         rules = self.rules
         protocol = {}
@@ -374,7 +391,7 @@ class MotionLabelConfig:
             "grid": {"x": list(self.grid.x), "y": list(self.grid.y)},
             "orientation": self.grid.orientation,
             "protocol": protocol,
-            "agents": _agents_in_json(self.agents),
+            "agents": _encode_agents(self.agents),
         }
 
     @classmethod
@@ -382,48 +399,44 @@ class MotionLabelConfig:
         """Return the configuration that `as_dict` describes.
 
         Raises:
-            ConfigError: It is not the description of a configuration.
-            ChoiceError: A choice in it does not exist.
+            ConfigError: The dictionary does not describe a configuration.
+            ChoiceError: The dictionary contains an unknown choice, such as a protocol's name.
         """
         try:
             values = dict(described)
-            grid = values.pop("grid")
-            protocol = LabelProtocol(**values.pop("protocol"))
-            augmentation = values.pop("augmentation")
-            agents = values.pop("agents")
-            bev_grid = BevGrid(tuple(grid["x"]), tuple(grid["y"]))
+            grid = values["grid"]
+            values["protocol"] = LabelProtocol(**values["protocol"])
+            augmentation = values["augmentation"]
+            agents = values["agents"]
+            values["grid"] = BevGrid(tuple(grid["x"]), tuple(grid["y"]))
             if augmentation is not None:
-                augmentation = Augmentation(**augmentation)
+                values["augmentation"] = Augmentation(**augmentation)
             if isinstance(agents, dict):
-                agents = AgentConfig(agents["name"], tuple(agents["partners"]))
-            return cls(
-                grid=bev_grid,
-                protocol=protocol,
-                augmentation=augmentation,
-                agents=agents,
-                **values,
-            )
+                values["agents"] = AgentConfig(agents["name"], tuple(agents["partners"]))
+            return cls(**values)
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigError(f"label configuration: cannot be read ({error})") from error
 
     @property
     def digest(self) -> str:
-        """Short hash of `as_dict`: equal exactly for configurations that give the same labels."""
+        """Short hash of `as_dict`; equal if and only if two configurations give the same labels."""
         text = json.dumps(self.as_dict(), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _agents_in_json(agents: Agents) -> Any:
-    """Return agents in types of JSON."""
+def _encode_agents(agents: Agents) -> Any:
+    """Return the agents in JSON types."""
     if isinstance(agents, AgentConfig):
         return {"name": agents.name, "partners": list(agents.partners)}
-    return agents if agents is None or isinstance(agents, str) else list(agents)
+    if agents is None or isinstance(agents, str):
+        return agents
+    return list(agents)
 
 
 def resolved_label_config(config: MotionLabelConfig | str | None) -> MotionLabelConfig:
-    """Return a configuration unchanged, by a preset's name, or the released one for None.
+    """Return a configuration unchanged, the preset of a name, or for None the released preset.
 
-    Raises ChoiceError or ConfigError.
+    Raise ChoiceError if there is no such preset, and ConfigError for any other type.
     """
     if config is None:
         return MotionLabelConfig()
@@ -436,13 +449,13 @@ def resolved_label_config(config: MotionLabelConfig | str | None) -> MotionLabel
     return config
 
 
-def _checked_ignore_index(ignore_index: object, grid: BevGrid) -> int:
-    """Return the `ignore_index` if it fits into a byte and is no vector's; raises ConfigError.
+def _check_ignore_index(ignore_index: object, grid: BevGrid) -> int:
+    """Return `ignore_index`; raise ConfigError unless it fits into a byte and no vector reaches it.
 
-    Both components of a vector are less than the longer side, so that a larger number never occurs,
-    even after a turn. On grids with a side of more than 255 cells only 255 is possible. On them the
-    vector (255, 255) is 360 cells long, farther than an actor extends from its centre or moves in a
-    step.
+    Both components of a vector are less than the grid's longer side, so a number not less than that
+    never occurs, even after a rotation. On grids with a side of more than 255 cells, only 255 is
+    possible. There the vector (255, 255) is 360 cells long, farther than an actor extends from its
+    centre or moves in one step.
     """
     index = checked_count(
         "ignore_index", ignore_index, "a value that no vector has, such as 255", _MAX_BYTE
@@ -456,23 +469,20 @@ def _checked_ignore_index(ignore_index: object, grid: BevGrid) -> int:
     return index
 
 
-_DEEPACCIDENT: Final = MotionLabelConfig()
-_BEVERSE: Final = MotionLabelConfig(only_vehicle=True, draw_ego=False, protocol="beverse")
+_DEEPACCIDENT = MotionLabelConfig()
+_BEVERSE = MotionLabelConfig(only_vehicle=True, draw_ego=False, protocol="beverse")
 PRESETS: Final[Mapping[str, MotionLabelConfig]] = MappingProxyType(
     {
         "deepaccident": _DEEPACCIDENT,
-        **{
-            f"deepaccident-{seconds}s": replace(
-                _DEEPACCIDENT, future_frames=seconds * _STEPS_PER_SECOND
-            )
-            for seconds in (3, 4, 5)
-        },
+        "deepaccident-3s": replace(_DEEPACCIDENT, future_frames=3 * _STEPS_PER_SECOND),
+        "deepaccident-4s": replace(_DEEPACCIDENT, future_frames=4 * _STEPS_PER_SECOND),
+        "deepaccident-5s": replace(_DEEPACCIDENT, future_frames=5 * _STEPS_PER_SECOND),
         "beverse": _BEVERSE,
         "fiery": replace(_BEVERSE, agents="single", protocol="fiery", orientation="fiery"),
     }
 )
 """Presets by name.
 
-They are the released labels (2 s ahead), the same 3, 4 and 5 s ahead, and the labels of the two
-codes that they are based on.
+They are the released labels (2 s ahead), the same labels 3, 4 and 5 s ahead, and the labels of the
+two code bases that the released code is based on.
 """

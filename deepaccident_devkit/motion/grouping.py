@@ -1,14 +1,16 @@
 """Instances from the maps of a model's heads: cells grouped around centres, and linked over time.
 
-The rules are the released ones (docs/released_code.md, Post-processing), FIERY's: everything in
-float32, cells in row-major order, and the first one of equals counts; frames are linked with
-another distance than FIERY's. Arrays are in the orientation of `PostProcessing.scan`.
+The rules follow the released code (docs/released_code.md, Post-processing), which are FIERY's
+except for the distance at which frames are linked: everything is computed in float32, cells are in
+row-major order, and the first one wins a tie. Arrays are in the orientation of
+`PostProcessing.scan`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Final
 
@@ -31,12 +33,12 @@ from deepaccident_devkit.support.arrays import (
 from deepaccident_devkit.support.text import settle_choices
 
 LABEL_LOGIT: Final = 10.0
-"""Logit of the right class when the released evaluation treats labels as a prediction.
+"""Logit of the true class when the released evaluation treats labels as a prediction.
 
-The other class has 0.
+The other class has the logit 0.
 """
-# Offsets and flows may not be longer, since the squares of much longer ones overflow in float32.
-_MAX_VECTOR_CELLS: Final = 1e15
+# Maximum length of offsets and flows; the squares of much longer ones overflow in float32.
+_MAX_VECTOR_CELLS = 1e15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,12 +49,13 @@ class MotionHeads(ShortRepr):
         segmentation: Logits of background and actor, shape (T, 2, H, W), float32.
         centerness: Confidence that a cell is an instance's centre, shape (T, 1, H, W), float32; (T,
             H, W) is accepted, too.
-        offset: Rows and columns to the instance's centre, shape (T, 2, H, W), float32, cells.
-        flow: Rows and columns to the instance's position at the next frame, shape (T, 2, H, W),
-            float32, cells.
+        offset: Rows and columns from a cell to its instance's centre, shape (T, 2, H, W), float32,
+            cells.
+        flow: Rows and columns from an instance's centre to its position at the next frame, shape
+            (T, 2, H, W), float32, cells.
         orientation: Orientation of the cells; the vectors' channels follow its rows and columns.
-        ignore_index: Value of offset and flow where they are undefined, as in labels; it stays the
-            same in all orientations. None if all values are vectors.
+        ignore_index: Value of offset and flow where they are undefined, as in labels; a change of
+            orientation leaves it unchanged. None if all values are defined.
     """
 
     segmentation: AnyArray
@@ -63,7 +66,10 @@ class MotionHeads(ShortRepr):
     ignore_index: int | None = None
 
     def __post_init__(self) -> None:
-        """Check and freeze the maps; raises GeometryError, or ChoiceError for the orientation."""
+        """Check and freeze the maps.
+
+        Raise GeometryError for a wrong shape or value, and ChoiceError for an unknown orientation.
+        """
         settle_choices(self, {"orientation": ORIENTATIONS})
         _check_channels(np.shape(self.segmentation))
         segmentation = checked("segmentation", self.segmentation, (None, 2, None, None), np.float32)
@@ -77,21 +83,23 @@ class MotionHeads(ShortRepr):
             centerness = centerness[:, None]
         centerness = checked("centerness", centerness, (frames, 1, height, width), np.float32)
         shape = frames, 2, height, width
-        maps = {
-            "segmentation": segmentation,
-            "centerness": centerness,
-            "offset": checked("offset", self.offset, shape, np.float32),
-            "flow": checked("flow", self.flow, shape, np.float32),
-        }
-        for name, values in maps.items():
-            limit = np.inf if name in {"segmentation", "centerness"} else _MAX_VECTOR_CELLS
+        offset = checked("offset", self.offset, shape, np.float32)
+        flow = checked("flow", self.flow, shape, np.float32)
+        limited_maps = (
+            ("segmentation", segmentation, np.inf),
+            ("centerness", centerness, np.inf),
+            ("offset", offset, _MAX_VECTOR_CELLS),
+            ("flow", flow, _MAX_VECTOR_CELLS),
+        )
+        for name, values, limit in limited_maps:
             _check_values(name, values, limit)
             object.__setattr__(self, name, readonly(values))
 
     def __repr__(self) -> str:
         """Return the number of frames and cells, and the orientation."""
         frames, _, height, width = self.segmentation.shape
-        return f"MotionHeads({frames} frames of {height} × {width} cells, {self.orientation})"
+        cells = f"{height} × {width} cells"
+        return f"MotionHeads({frames} frames of {cells}, {self.orientation})"
 
     @classmethod
     def from_arrays(
@@ -104,15 +112,14 @@ class MotionHeads(ShortRepr):
         *,
         ignore_index: int | None = None,
     ) -> MotionHeads:
-        """Return heads from arrays of any framework or lists, in the order of models' outputs.
+        """Build heads from lists or arrays of any framework, in the order of models' outputs.
 
-        `support.arrays.as_numbers` reads the arrays. Float32 arrays in the processor's memory are
-        not copied.
+        `support.arrays.as_numbers` reads the arrays. Float32 arrays in CPU memory are not copied.
 
         Raises:
-            GeometryError: Another shape, NaN, or an array that cannot be read from here (see the
-                message's remedy).
-            ChoiceError: No such orientation.
+            GeometryError: An array has a wrong shape, contains NaN, or cannot be read on the CPU
+                (the message explains what to do).
+            ChoiceError: There is no such orientation.
         """
         return cls(
             segmentation=as_numbers("segmentation", segmentation, dtype=np.float32),
@@ -125,14 +132,15 @@ class MotionHeads(ShortRepr):
 
     @classmethod
     def from_labels(cls, labels: MotionLabels) -> MotionHeads:
-        """Return labels as the prediction of a perfect model, as the released evaluation uses them.
+        """Treat labels as the prediction of a perfect model, as the released evaluation does.
 
-        Segmentation is 10 for the right class and 0 for the other; centerness, offset and flow do
-        not change.
+        The segmentation's logits are 10 for the true class and 0 for the other; centerness, offset
+        and flow are unchanged.
         """
-        actor = np.asarray(labels.segmentation) == 1
+        is_actor = np.asarray(labels.segmentation) == 1
+        is_class = np.stack([~is_actor, is_actor], axis=1)
         return cls(
-            segmentation=np.stack([~actor, actor], axis=1) * np.float32(LABEL_LOGIT),
+            segmentation=is_class * np.float32(LABEL_LOGIT),
             centerness=labels.centerness,
             offset=labels.offset,
             flow=labels.flow,
@@ -141,27 +149,24 @@ class MotionHeads(ShortRepr):
         )
 
     def in_orientation(self, orientation: Orientation) -> MotionHeads:
-        """Return the same prediction with its cells, and its vectors, in another orientation.
+        """Return the same prediction with its cells and vectors in another orientation.
 
-        Raises ChoiceError.
+        Raise ChoiceError if there is no such orientation.
         """
         if orientation == self.orientation:
             return self
 
-        def turned(values: AnyArray, *, vectors: bool) -> AnyArray:
-            return to_orientation(
-                values,
-                vectors=vectors,
-                source=self.orientation,
-                target=orientation,
-                ignore=self.ignore_index,
-            )
-
+        turn = partial(
+            to_orientation,
+            source=self.orientation,
+            target=orientation,
+            ignore=self.ignore_index,
+        )
         return MotionHeads(
-            segmentation=turned(self.segmentation, vectors=False),
-            centerness=turned(self.centerness, vectors=False),
-            offset=turned(self.offset, vectors=True),
-            flow=turned(self.flow, vectors=True),
+            segmentation=turn(self.segmentation, vectors=False),
+            centerness=turn(self.centerness, vectors=False),
+            offset=turn(self.offset, vectors=True),
+            flow=turn(self.flow, vectors=True),
             orientation=orientation,
             ignore_index=self.ignore_index,
         )
@@ -171,9 +176,11 @@ def _check_channels(shape: tuple[int, ...]) -> None:
     """Raise GeometryError if the segmentation does not have two channels."""
     if len(shape) != 4 or shape[1] == 2:
         return
-    remedy = "; move the channels to the second axis" if shape[-1] == 2 else ""
+    remedy = ""
     if shape[1] == 1:
-        remedy = "; of a single logit x for actors, stack -x and x"
+        remedy = "; if the model has a single logit x for actors, stack -x and x"
+    elif shape[-1] == 2:
+        remedy = "; move the channels to the second axis"
     raise GeometryError(
         "segmentation: expected (T, 2, H, W), the logits of background and actor, "
         f"found {shape}{remedy}"
@@ -182,21 +189,22 @@ def _check_channels(shape: tuple[int, ...]) -> None:
 
 def _check_values(name: str, values: AnyArray, limit: float) -> None:
     """Raise GeometryError if a value is NaN or its magnitude exceeds a limit."""
-    if not (values.min() >= -limit and values.max() <= limit):  # NaN is neither
-        index = tuple(np.argwhere(~(np.abs(values) <= limit))[0].tolist())
+    if not (values.min() >= -limit and values.max() <= limit):  # NaN fails both comparisons
+        wrong_indices = np.argwhere(~(np.abs(values) <= limit))
+        index = tuple(wrong_indices[0].tolist())
         raise GeometryError(
-            f"{name}: {values[index]} at {index} cannot be used; did the model diverge, "
-            "or is there a mask in its output?"
+            f"{name}: {values[index]} at {index} is NaN or too large; did the model diverge, "
+            "or does its output contain a mask?"
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameGroups:
-    """Instances of one frame; ids run from 1 to I without gaps, (row, column) are cells.
+    """Instances of one frame; ids run from 1 to I without gaps, and positions are in cells.
 
     Attributes:
-        ids: Instance of each cell of the foreground, shape (P,), int64; 0 for cells that still
-            count as background.
+        ids: Instance of each foreground cell, shape (P,), int64; 0 for cells that are treated as
+            background nevertheless.
         count: Number of cells of each id, shape (I + 1,).
         position_sum: Sums of the cells' rows and columns, shape (2, I + 1), float64.
         moved_sum: Sums of the cells' rows and columns after the flow, shape (2, I + 1), float64.
@@ -216,54 +224,60 @@ class FrameGroups:
 def group_cells(
     peaks: IntArray, position: AnyArray, offset: AnyArray, flow: AnyArray, *, all_cells: bool
 ) -> FrameGroups:
-    """Return the instances of one frame: its foreground, grouped by the peak nearest to each cell.
+    """Group a frame's foreground cells by the peak nearest to where each cell's offset leads.
 
     Args:
         peaks: Rows and columns of the peaks, shape (K, 2).
         position: Rows and columns of the foreground's cells, shape (2, P), float32.
-        offset: Rows and columns to the instances' centres, shape (2, P), float32.
-        flow: Rows and columns to the positions at the next frame, shape (2, P), float32.
-        all_cells: Whether all cells of the frame are foreground. The lowest instance then becomes
-            the background: ids are the ranks of all ids that occur, from 0.
+        offset: Rows and columns from each cell to its instance's centre, shape (2, P), float32.
+        flow: Rows and columns from each cell to its position at the next frame, shape (2, P),
+            float32.
+        all_cells: Whether all cells of the frame are foreground. The instance with the lowest id
+            then becomes the background, because ids are replaced by their ranks, counted from 0.
     """
     nearest = nearest_peaks(position + offset, peaks.astype(np.float32)) + 1
     occurs = np.bincount(nearest, minlength=len(peaks) + 1) > 0
     occurs[0] = not all_cells
-    ids = (np.cumsum(occurs) - 1)[nearest]
+    new_ids = np.cumsum(occurs) - 1
+    ids = new_ids[nearest]
     num_ids = max(int(occurs.sum()), 1)
-    moved = position + flow
+    position_sum = [sum_by_id(ids, component, num_ids) for component in position]
+    moved_sum = [sum_by_id(ids, component, num_ids) for component in position + flow]
     return FrameGroups(
         ids=ids,
         count=np.bincount(ids, minlength=num_ids).astype(np.float64),
-        position_sum=np.stack([sums_by(ids, component, num_ids) for component in position]),
-        moved_sum=np.stack([sums_by(ids, component, num_ids) for component in moved]),
+        position_sum=np.stack(position_sum),
+        moved_sum=np.stack(moved_sum),
     )
 
 
-def sums_by(ids: IntArray, values: AnyArray, length: int) -> FloatArray:
+def sum_by_id(ids: IntArray, values: AnyArray, length: int) -> FloatArray:
     """Return the sums of `values` by `ids`, shape (length,), float64.
 
     Ids from `length` on are left out.
     """
-    return np.bincount(ids, values, length)[:length].astype(np.float64, copy=False)
+    sums = np.bincount(ids, values, length)[:length]
+    return sums.astype(np.float64, copy=False)
 
 
 def means(sums: FloatArray, counts: FloatArray) -> AnyArray:
-    """Return means of sums (2, N) over counts (N,), shape (N, 2), float32.
+    """Return sums (2, N) divided by counts (N,), shape (N, 2), float32.
 
-    They are equal to torch's means of float32 values.
+    The results equal torch's means of float32 values.
     """
-    return (sums / counts).T.astype(np.float32)
+    means_by_axis = sums / counts
+    return means_by_axis.T.astype(np.float32)
 
 
 def link_frames(groups: Sequence[FrameGroups], distance: float) -> list[IntArray]:
-    """Return consistent ids of the instances of consecutive frames.
+    """Assign ids to the instances of consecutive frames that stay the same from frame to frame.
 
-    Each frame has an array of shape (I + 1,), with 0 for 0.     Instances are paired one to one
-    with the instances of the frame before, moved by the flow, so that the sum of the distances is
-    smallest. Pairs closer than `distance`, cells, share an id. The others get new ids, counted from
-    the first frame's highest id. A frame without instances, and the frame after it, keep their own
-    ids, which do not count as used: later instances may get the same ids.
+    The result has one array of shape (I + 1,) per frame, which maps the frame's ids to the linked
+    ones, and 0 to 0. Instances are paired one to one with the instances of the previous frame,
+    moved by the flow, so that the sum of the distances is smallest. Pairs closer than `distance`
+    (cells) share an id. The others get new ids, counted on from the first frame's highest id. A
+    frame without instances, and the frame after it, keep their own ids; these do not count as used,
+    so later instances may get the same ids.
     """
     linked_ids = [np.arange(groups[0].instances + 1)]
     newest_id = groups[0].instances
@@ -271,37 +285,40 @@ def link_frames(groups: Sequence[FrameGroups], distance: float) -> list[IntArray
         if previous.instances == 0 or current.instances == 0:
             linked_ids.append(np.arange(current.instances + 1))
             continue
-        previous_ids, expected = _expected_positions(previous, linked_ids[-1])
+        previous_ids, expected = _move_instances(previous, linked_ids[-1])
         positions = means(current.position_sum[:, 1:], current.count[1:])
-        distances = _distances(expected, positions)
-        frame_ids, newest_id = _linked(previous_ids, distances, distance, newest_id)
+        distances = _compute_distances(expected, positions)
+        frame_ids, newest_id = _link_instances(previous_ids, distances, distance, newest_id)
         linked_ids.append(frame_ids)
     return linked_ids
 
 
-def _expected_positions(previous: FrameGroups, linked_ids: IntArray) -> tuple[IntArray, AnyArray]:
+def _move_instances(previous: FrameGroups, linked_ids: IntArray) -> tuple[IntArray, AnyArray]:
     """Return the ids of a frame (N,), and the positions (N, 2) to which the flow moves them.
 
-    Instances that share an id are one.
+    Instances that share an id are merged into one.
     """
     ids, instance = np.unique(linked_ids[1:], return_inverse=True)
-    moved_sum = [sums_by(instance, component[1:], len(ids)) for component in previous.moved_sum]
-    counts = sums_by(instance, previous.count[1:], len(ids))
+    moved_sum = []
+    for component in previous.moved_sum[:, 1:]:
+        moved_sum.append(sum_by_id(instance, component, len(ids)))
+    counts = sum_by_id(instance, previous.count[1:], len(ids))
     return ids, means(np.stack(moved_sum), counts)
 
 
-def _distances(first: AnyArray, second: AnyArray) -> AnyArray:
+def _compute_distances(first: AnyArray, second: AnyArray) -> AnyArray:
     """Return the distances between points (N, 2) and (M, 2), shape (N, M), float32."""
     offset = second - first[:, None]
     down = offset[..., 0]
     across = offset[..., 1]
-    return np.asarray(np.sqrt(down * down + across * across))
+    squared_distances = down * down + across * across
+    return np.asarray(np.sqrt(squared_distances))
 
 
-def _linked(
+def _link_instances(
     previous_ids: IntArray, distances: AnyArray, limit: float, newest_id: int
 ) -> tuple[IntArray, int]:
-    """Return the ids of the next frame (M + 1,), and the highest id used so far."""
+    """Return the linked ids of the next frame (M + 1,), and the highest id used so far."""
     from scipy.optimize import linear_sum_assignment
 
     previous, current = linear_sum_assignment(distances)
@@ -309,9 +326,12 @@ def _linked(
     matched = (current[is_close] + 1).tolist()
     linked_ids = np.zeros(distances.shape[1] + 1, dtype=np.int64)
     linked_ids[matched] = previous_ids[previous[is_close]]
-    # New ids follow the order of a Python set, as in the released code: it does not always ascend.
+    # New ids follow the order of a Python set, as in the released code; that order need not
+    # ascend.
     unmatched = set(range(len(linked_ids))).difference(set(matched))
     unmatched.remove(0)
-    new = list(unmatched)
-    linked_ids[new] = np.arange(newest_id + 1, newest_id + 1 + len(new))
-    return linked_ids, newest_id + len(new)
+    new_instances = list(unmatched)
+    first_new_id = newest_id + 1
+    newest_id += len(new_instances)
+    linked_ids[new_instances] = np.arange(first_new_id, newest_id + 1)
+    return linked_ids, newest_id

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
@@ -25,7 +24,7 @@ from deepaccident_devkit.motion.grouping import (
     MotionHeads,
     group_cells,
     link_frames,
-    sums_by,
+    sum_by_id,
 )
 from deepaccident_devkit.motion.reference_arithmetic.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.motion.reference_arithmetic.peaks import find_peaks
@@ -44,31 +43,32 @@ from deepaccident_devkit.support.text import choice
 
 Foreground = Literal["argmax", "sigmoid"]
 FOREGROUND_THRESHOLD: Final = 0.4
-"""Sigmoid of an actor's logit that a cell of the foreground `sigmoid` must exceed."""
-_MAX_CENTERS: Final = 2**24
+"""Threshold for the foreground rule `sigmoid`, compared with the sigmoid of the actor's logit."""
+_MAX_CENTERS = 2**24
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostProcessing:
-    """Rules by which instances are found in a model's maps.
+    """Rules for extracting instances from a model's maps.
 
-    The defaults are the released rules for VPQ. See docs/released_code.md, Post-processing.
+    The defaults are the rules that the released code uses for VPQ. See docs/released_code.md,
+    Post-processing.
 
     Attributes:
-        foreground: Rule for the cells of actors: `argmax` of both logits (background where they are
-            equal), or `sigmoid`: the cells with a sigmoid of the actor's logit above
-            `FOREGROUND_THRESHOLD`, for any logit of the background.
-        labels_bypass_sigmoid: Whether logits are treated as labels (`MotionHeads.from_labels`) with
-            `sigmoid`, if the highest of all logits is 10 and the lowest 0. The actor's logit itself
-            is then compared with the threshold: the sigmoid of its 0 would be above the released
-            threshold.
-        center_threshold: Centerness that a centre must exceed.
-        max_centers: Largest number of centres of a frame; if there are more, the first ones in
-            row-major order count, not the highest.
-        scan: Orientation in which cells are in that order; it also decides between equally near
-            centres. Heads in another orientation are turned to it, and the result is turned back.
-        link_distance: Distance below which an instance has the id of one of the frame before, moved
-            by the flow, cells.
+        foreground: Which cells are actors. `argmax`: the actor's logit is higher than the
+            background's. `sigmoid`: the sigmoid of the actor's logit exceeds
+            `FOREGROUND_THRESHOLD`, whatever the background's logit is.
+        labels_bypass_sigmoid: Whether `sigmoid` recognises labels (`MotionHeads.from_labels`) by a
+            highest logit of 10 and a lowest of 0. It then compares the actor's logit itself with
+            the threshold, because the sigmoid of a logit of 0 would exceed the released threshold.
+        center_threshold: Centerness that a cell must exceed to be a centre.
+        max_centers: Maximum number of centres per frame; if there are more, the first ones in
+            row-major order are kept, not the highest.
+        scan: Orientation in which row-major order is taken; the order also decides between equally
+            near centres. Heads in another orientation are converted to it, and the result is
+            converted back.
+        link_distance: Distance in cells. An instance takes over the id of an instance of the
+            previous frame if it is closer than this to where the flow moves that instance.
         redraw: Whether to rasterise boxes along the paths of the first frame's instances, for the
             accident evaluation.
     """
@@ -111,7 +111,7 @@ POST_PROCESSING: Final[Mapping[str, PostProcessing]] = MappingProxyType(
         "fiery": PostProcessing(link_distance=3.0, scan="fiery"),
     }
 )
-"""Settings of the released evaluation of motion (IoU, VPQ) and of accidents, and of FIERY."""
+"""Settings by name: the released motion (IoU, VPQ) and accident evaluations, and FIERY's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,10 +119,11 @@ class InstancePath(ShortRepr):
     """Path of an instance of the first frame; arrays are read-only.
 
     Attributes:
-        frames: Frames that have the instance, shape (n,), int64, rising from 0.
-        centers: Row and column of the mean of its cells in these frames, shape (n, 2), float64 (a
-            float32's value).
-        cell_counts: Number of its cells in each frame, shape (T,), int64, 0 in frames without it.
+        frames: Frames in which the instance occurs, shape (n,), int64, ascending from 0.
+        centers: Row and column of the mean of its cells in these frames, shape (n, 2), float64 with
+            values of float32.
+        cell_counts: Number of its cells in each frame, shape (T,), int64; 0 in frames where it does
+            not occur.
     """
 
     frames: IntArray
@@ -131,8 +132,9 @@ class InstancePath(ShortRepr):
 
     def __post_init__(self) -> None:
         """Freeze the arrays."""
-        for item in fields(self):
-            object.__setattr__(self, item.name, readonly(getattr(self, item.name)))
+        for field in fields(self):
+            values = getattr(self, field.name)
+            object.__setattr__(self, field.name, readonly(values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -140,16 +142,16 @@ class LinkedInstances(ShortRepr):
     """Instances of one prediction over T frames of H × W cells; arrays are read-only.
 
     Attributes:
-        settings: Rules by which they were found.
-        orientation: Orientation of the cells, that of the heads.
+        settings: Rules for extracting the instances.
+        orientation: Orientation of the cells, as in the heads.
         instance: Ids that are the same in all frames, shape (T, H, W), int32, 0 elsewhere.
         frame_instance: Ids of each frame before linking, shape (T, H, W), int32, 1 to I without
             gaps, 0 elsewhere.
         redrawn: Ids of boxes rasterised along the paths, shape (T, H, W), int32, 0 elsewhere; None
-            without `settings.redraw`.
-        frame_centers: Rows and columns of each frame's centres of groups, T arrays of shape (K, 2),
-            int64.
-        paths: Instances of the first frame by id, ascending.
+            unless `settings.redraw`.
+        frame_centers: Rows and columns of the centres around which each frame's cells were grouped,
+            T arrays of shape (K, 2), int64.
+        paths: Id → path, for the instances of the first frame; ids ascend.
     """
 
     settings: PostProcessing
@@ -173,29 +175,34 @@ class LinkedInstances(ShortRepr):
     @property
     def centers(self) -> dict[int, FloatArray]:
         """Id → row and column in each frame of `paths[id].frames`, shape (n, 2)."""
-        return {identity: path.centers for identity, path in self.paths.items()}
+        centers = {}
+        for identity, path in self.paths.items():
+            centers[identity] = path.centers
+        return centers
 
 
 def predict_instances(
     heads: MotionHeads, settings: PostProcessing | str = "motion"
 ) -> LinkedInstances:
-    """Return instances with the same id in all frames, as the released code finds them.
+    """Extract instances and link them, so that an instance has the same id in all frames.
 
-    See docs/released_code.md, Post-processing and FIERY's own labels.
+    The result equals the released code's. See docs/released_code.md, Post-processing and FIERY's
+    own labels.
 
     Args:
-        heads: Maps of a model, or `MotionHeads.from_labels`.
+        heads: A model's maps, or labels as a perfect prediction (`MotionHeads.from_labels`).
         settings: Name in `POST_PROCESSING`, or settings of your own.
 
     Raises:
-        ChoiceError: No settings have that name.
-        ConfigError: `heads` are no heads, or `settings` no settings.
+        ChoiceError: There are no settings of that name.
+        ConfigError: `heads` is not a `MotionHeads`, or `settings` is neither a name nor a
+            `PostProcessing`.
     """
     rules = post_processing(settings)
     if not isinstance(heads, MotionHeads):
         raise ConfigError(
-            f"heads: expected MotionHeads, found {type(heads).__name__}; MotionHeads.from_labels "
-            "takes labels, from_arrays a model's maps"
+            f"heads: expected MotionHeads, found {type(heads).__name__}; make them from labels "
+            "with MotionHeads.from_labels, or from a model's maps with from_arrays"
         )
     scan = _Scan(heads.segmentation.shape[-2:], heads.orientation, rules.scan)
     centerness = scan.maps(heads.centerness[:, 0])
@@ -203,26 +210,32 @@ def predict_instances(
     peaks = [find_peaks(frame, rules.center_threshold, rules.max_centers) for frame in centerness]
     positions = []
     for frame_foreground, frame_peaks in zip(foreground, peaks, strict=True):
-        positions.append(np.stack(np.nonzero(frame_foreground & (len(frame_peaks) > 0))))
-    groups = _grouped(heads, peaks, positions, scan)
+        has_peaks = len(frame_peaks) > 0
+        positions.append(np.stack(np.nonzero(frame_foreground & has_peaks)))
+    groups = _group_frames(heads, peaks, positions, scan)
     frame_ids = [group.ids for group in groups]
     linked_ids = link_frames(groups, rules.link_distance)
-    ids = [linked[own_ids] for linked, own_ids in zip(linked_ids, frame_ids, strict=True)]
-    centers, counts = _centers_and_counts(groups, linked_ids)
+    cell_ids = []
+    for linked, own_ids in zip(linked_ids, frame_ids, strict=True):
+        cell_ids.append(linked[own_ids])
+    centers, counts = _average_positions(groups, linked_ids)
     redrawn = None
     if rules.redraw:
         hulls = first_hulls(positions[0], groups[0].ids, groups[0].instances)
-        redrawn = scan.raster(*redrawn_cells(hulls, centers, counts > 0, scan.scanned_shape))
+        box_cells, box_ids = redrawn_cells(hulls, centers, counts > 0, scan.scanned_shape)
+        redrawn = scan.raster(box_cells, box_ids)
     paths = {}
     turned_centers = scan.points(centers)
-    for identity, (points, cells) in enumerate(zip(turned_centers, counts, strict=True), start=1):
-        paths[identity] = InstancePath(
-            frames=np.flatnonzero(cells), centers=points[cells > 0], cell_counts=cells
+    for index, cell_counts in enumerate(counts):
+        frames = np.flatnonzero(cell_counts)
+        path_centers = turned_centers[index, frames]
+        paths[index + 1] = InstancePath(
+            frames=frames, centers=path_centers, cell_counts=cell_counts
         )
     return LinkedInstances(
         settings=rules,
         orientation=heads.orientation,
-        instance=scan.raster(positions, ids),
+        instance=scan.raster(positions, cell_ids),
         frame_instance=scan.raster(positions, frame_ids),
         redrawn=redrawn,
         frame_centers=[scan.points(frame_peaks) for frame_peaks in peaks],
@@ -230,16 +243,17 @@ def predict_instances(
     )
 
 
-def _grouped(
+def _group_frames(
     heads: MotionHeads, peaks: Sequence[IntArray], positions: Sequence[IntArray], scan: _Scan
 ) -> list[FrameGroups]:
     """Return the instances of each frame before linking.
 
     Args:
         heads: Maps of a model.
-        peaks: Scanned rows and columns of each frame's peaks, shape (K, 2).
-        positions: Scanned rows and columns of each frame's foreground, shape (2, P).
-        scan: Change of orientation.
+        peaks: Rows and columns of each frame's peaks in the scanned orientation, shape (K, 2).
+        positions: Rows and columns of each frame's foreground cells in the scanned orientation,
+            shape (2, P).
+        scan: Conversion between the heads' and the scanned orientation.
     """
     groups = []
     for frame, (frame_peaks, position) in enumerate(zip(peaks, positions, strict=True)):
@@ -254,7 +268,7 @@ def _grouped(
 
 
 def foreground_cells(segmentation: AnyArray, rules: PostProcessing) -> BoolArray:
-    """Return which cells are actors by the settings, shape (T, H, W).
+    """Return whether each cell is an actor according to the settings, shape (T, H, W).
 
     Args:
         segmentation: Logits of background and actor of one prediction, shape (T, 2, H, W).
@@ -265,18 +279,22 @@ def foreground_cells(segmentation: AnyArray, rules: PostProcessing) -> BoolArray
     if rules.foreground == "argmax":
         return np.asarray(actor > background)
     threshold = np.float32(FOREGROUND_THRESHOLD)
-    if rules.labels_bypass_sigmoid:
-        if segmentation.max() == LABEL_LOGIT and segmentation.min() == 0:
+    if rules.labels_bypass_sigmoid and segmentation.max() == LABEL_LOGIT:
+        if segmentation.min() == 0:
             return np.asarray(actor > threshold)
-    # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. The logits are
-    # compared with that point's own logit, which needs no exponential of every cell.
+    # A float32 sigmoid exceeds the threshold from half-way to the next float32 on. Comparing the
+    # logits with the logit of that point avoids computing an exponential for every cell.
     next_value = np.nextafter(threshold, np.float32(1))
     half_way = (float(threshold) + float(next_value)) / 2
-    return np.asarray(actor > np.float32(np.log(half_way / (1 - half_way))))
+    logit_threshold = np.float32(np.log(half_way / (1 - half_way)))
+    return np.asarray(actor > logit_threshold)
 
 
 def post_processing(settings: PostProcessing | str) -> PostProcessing:
-    """Return settings by their name, or settings unchanged; raises ChoiceError or ConfigError."""
+    """Look up settings by name; a `PostProcessing` is returned unchanged.
+
+    Raise ChoiceError for an unknown name, and ConfigError for any other type.
+    """
     if isinstance(settings, PostProcessing):
         return settings
     if not isinstance(settings, str):
@@ -298,19 +316,19 @@ def trajectories(
     Args:
         linked: Result of `predict_instances`.
         grid: Ground that the cells cover, in any orientation.
-        protocol: Protocol of the labels, or of the labels that the model learned. If it has the
-            `half_cell_shift`, the shift is undone: a cell stands for its corner with the lowest row
-            and column in the protocol's native orientation.
-        half_cell_shift: Value that replaces the protocol's own; with False a cell always stands for
-            its middle.
+        protocol: Protocol of the labels, or of the labels that the model was trained on. If it has
+            the quirk `half_cell_shift`, the shift is undone: a cell then represents its corner with
+            the lowest row and column in the protocol's native orientation.
+        half_cell_shift: Replaces the protocol's value; if False, a cell always represents its
+            centre. None keeps the protocol's value.
 
     Returns:
-        Id → positions, shape (n, 2), x forward, y left, metres in the maps' ego frame, at the
-        frames `linked.paths[id].frames`.
+        Id → positions in the maps' ego frame at the frames `linked.paths[id].frames`, shape (n, 2):
+        x forward, y left, metres.
 
     Raises:
-        GeometryError: The grid has other rows and columns than the instances.
-        ChoiceError: No such protocol.
+        GeometryError: The grid does not have the shape of the instance maps.
+        ChoiceError: There is no protocol of that name.
     """
     shape = grid.with_orientation(linked.orientation).shape
     if linked.instance.shape[1:] != shape:
@@ -321,37 +339,38 @@ def trajectories(
     if half_cell_shift is not None:
         rules = replace(rules, half_cell_shift=half_cell_shift)
     point_in_cell = np.array(rules.place_in_cell)
-    low, size = np.array([(low, size) for low, _, size in (grid.x, grid.y)]).T
+    low, _, size = np.array([grid.x, grid.y]).T
     paths = {}
     for identity, points in linked.centers.items():
-        cells = _points_in(points, shape, linked.orientation, "devkit")[:, ::-1]
-        paths[identity] = low + (cells + point_in_cell) * size
+        cells = _reorient_points(points, shape, linked.orientation, "devkit")
+        paths[identity] = low + (cells[:, ::-1] + point_in_cell) * size
     return paths
 
 
-def _centers_and_counts(
+def _average_positions(
     groups: Sequence[FrameGroups], linked_ids: Sequence[IntArray]
 ) -> tuple[FloatArray, IntArray]:
     """Return the centres and cell counts of the first frame's instances 1 to I in T frames.
 
     Returns:
-        Mean rows and columns, shape (I, T, 2), 0 where there are none; and counts, shape (I, T).
+        Mean rows and columns, shape (I, T, 2), 0 where an instance has no cells; and cell counts,
+        shape (I, T).
     """
     num_ids = groups[0].instances + 1
-    frame_counts = []
     frame_sums = []
     for group, ids in zip(groups, linked_ids, strict=True):
-        frame_counts.append(sums_by(ids, group.count, num_ids))
-        frame_sums.append([sums_by(ids, component, num_ids) for component in group.position_sum])
-    counts = np.stack(frame_counts)
-    means = np.stack(frame_sums) / np.maximum(counts, 1)[:, None]
+        columns = [group.count, *group.position_sum]
+        frame_sums.append([sum_by_id(ids, column, num_ids) for column in columns])
+    sums = np.stack(frame_sums)
+    counts = sums[:, 0]
+    means = sums[:, 1:] / np.maximum(counts, 1)[:, None]
     centers = means.astype(np.float32).astype(np.float64)
     return centers.transpose(2, 0, 1)[1:], counts.T[1:].astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class _Scan:
-    """Change from the heads' orientation to the scanned orientation, and back.
+    """Conversion from the heads' orientation to the scanned orientation, and back.
 
     Attributes:
         shape: Rows and columns in the heads' orientation.
@@ -367,7 +386,9 @@ class _Scan:
     def scanned_shape(self) -> tuple[int, int]:
         """Rows and columns of the scanned orientation."""
         is_transposed = (self.heads == "fiery") != (self.scan == "fiery")
-        return self.shape[::-1] if is_transposed else self.shape
+        if is_transposed:
+            return self.shape[::-1]
+        return self.shape
 
     def maps(self, maps: AnyArray) -> AnyArray:
         """Return the heads' maps (…, H, W) in the scanned orientation."""
@@ -377,12 +398,13 @@ class _Scan:
         """Return the heads' vectors at some cells, in the scanned orientation, shape (2, P).
 
         Args:
-            position: Scanned rows and columns of the cells, shape (2, P).
+            position: Rows and columns of the cells in the scanned orientation, shape (2, P).
             vectors: Vectors in the heads' orientation, shape (2, H, W).
             ignore: Value of undefined vectors; None if all are defined.
         """
-        cell_vectors = np.take(vectors.reshape(2, -1), self._flat(position), axis=1)
-        # Rasters of one cell each: no cell moves, only the vectors turn.
+        flat_vectors = vectors.reshape(2, -1)
+        cell_vectors = flat_vectors.take(self._flatten_position(position), axis=1)
+        # Each cell is treated as a raster of its own: no cell moves, only the vectors rotate.
         rasters = cell_vectors.T[..., None, None]
         turned = to_orientation(
             rasters, vectors=True, source=self.heads, target=self.scan, ignore=ignore
@@ -390,29 +412,36 @@ class _Scan:
         return turned[..., 0, 0].T
 
     def raster(self, positions: Sequence[IntArray], ids: Sequence[IntArray]) -> AnyArray:
-        """Return rasters of ids in the heads' orientation, shape (T, H, W), int32.
+        """Draw ids into rasters in the heads' orientation, shape (T, H, W), int32.
 
         Args:
-            positions: Scanned rows and columns of each frame's cells, shape (2, P).
+            positions: Rows and columns of each frame's cells in the scanned orientation, shape (2,
+                P).
             ids: Ids of each frame's cells, shape (P,).
         """
-        result = np.zeros((len(positions), math.prod(self.shape)), dtype=np.int32)
-        for frame, position, values in zip(result, positions, ids, strict=True):
-            frame[self._flat(position)] = values
-        return result.reshape(-1, *self.shape)
+        rasters = np.zeros((len(positions), *self.shape), dtype=np.int32)
+        for raster, position, cell_ids in zip(rasters, positions, ids, strict=True):
+            raster.reshape(-1)[self._flatten_position(position)] = cell_ids
+        return rasters
 
     def points(self, points: AnyArray) -> AnyArray:
-        """Return scanned rows and columns (…, 2) in the heads' orientation."""
-        return _points_in(points, self.scanned_shape, self.scan, self.heads)
+        """Convert rows and columns (…, 2) from the scanned to the heads' orientation."""
+        return _reorient_points(points, self.scanned_shape, self.scan, self.heads)
 
-    def _flat(self, position: IntArray) -> IntArray:
-        """Return the indices of scanned cells in a flat raster of the heads' orientation."""
-        row, column = cells_in(position[0], position[1], self.scanned_shape, self.scan, self.heads)
-        return np.asarray(row * self.shape[1] + column)
+    def _flatten_position(self, position: IntArray) -> IntArray:
+        """Convert scanned rows and columns to flat indices in the heads' orientation."""
+        scanned_row, scanned_column = position
+        row, column = cells_in(
+            scanned_row, scanned_column, self.scanned_shape, self.scan, self.heads
+        )
+        cell = row * self.shape[1] + column
+        return np.asarray(cell)
 
 
-def _points_in(
+def _reorient_points(
     points: AnyArray, shape: tuple[int, int], source: Orientation, target: Orientation
 ) -> AnyArray:
-    """Return rows and columns (…, 2) of one orientation, with `shape` cells, in another."""
-    return np.stack(cells_in(points[..., 0], points[..., 1], shape, source, target), axis=-1)
+    """Convert rows and columns (…, 2) of a raster of `shape` cells to another orientation."""
+    rows = points[..., 0]
+    columns = points[..., 1]
+    return np.stack(cells_in(rows, columns, shape, source, target), axis=-1)

@@ -1,9 +1,10 @@
 """Motion labels of many samples in a folder: one npz file for each scenario and agent.
 
-Labels are read sample by sample; schema/motion_labels.md describes the files. Maps that follow from
-instance maps are not stored: segmentation, centerness and offset are derived from the instances'
-centres, flow from one vector for each instance. Training loops without the devkit can use another
-form: a plain npz file for each sample, with all maps as another code's loader returns them.
+Labels are read sample by sample; schema/motion_labels.md describes the files. Maps that can be
+derived from instance maps are not stored: segmentation, centerness and offset are computed from the
+instances' cells and centres, and flow from one vector per instance. Training loops without the
+devkit can use another format: a plain npz file for each sample, with all maps as another code
+base's loader returns them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -43,7 +44,7 @@ from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import place_in, replacing
 from deepaccident_devkit.support.parallel import Places
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_array
-from deepaccident_devkit.support.text import choice, counted
+from deepaccident_devkit.support.text import PathType, choice, counted
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
 from deepaccident_devkit.v2x import cooperating_agents
@@ -54,7 +55,17 @@ if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset, RowArgument
     from deepaccident_devkit.support.parallel import Engine
 
-_MAX_OPEN_FILES: Final = 8
+_MAX_OPEN_FILES = 8
+# Columns of annotations that labels depend on.
+_SOURCE_COLUMNS = (
+    "translation",
+    "size",
+    "yaw",
+    "actor_id",
+    "category",
+    "num_lidar_pts",
+    "camera_visible",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +85,7 @@ class LabelsWritten:
 
 def write_label_files(
     dataset: Dataset,
-    folder: str | os.PathLike[str],
+    folder: PathType,
     tokens: Iterable[RowArgument],
     config: MotionLabelConfig | str | None = None,
     *,
@@ -83,9 +94,9 @@ def write_label_files(
 ) -> LabelsWritten:
     """Write the motion labels of samples into a folder, one file for each scenario and agent.
 
-    Files are complete or absent. If a call is interrupted, the same call continues it; several
+    A file is either complete or absent. To continue an interrupted call, repeat it; several
     processes that make the same call share the scenarios. Samples can be added later; files are
-    written again if the release has changed in the meantime.
+    rewritten if the release has changed in the meantime.
 
     Args:
         dataset: The release.
@@ -94,29 +105,30 @@ def write_label_files(
         tokens: Tokens or records of labelled samples.
         config: Configuration of the labels, or the name of a preset; None for the released labels
             in the devkit's orientation.
-        names: Code to write batches for. `fiery`, `beverse` or `deepaccident` writes
-            `MotionLabels.as_batch(names)` of each sample into a file of its own, about 0.1 MB, for
-            loops that use only numpy; None writes files for `LabelFiles`, which are 25 times
-            smaller.
-        **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
+        names: Code base to write batches for. With `fiery`, `beverse` or `deepaccident`,
+            `MotionLabels.as_batch(names)` of each sample is written to a separate file of about 0.1
+            MB, for training loops that use only numpy. With None, the files are for `LabelFiles`,
+            and are 25 times smaller.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        ConfigError: The folder holds labels of another configuration, or with other names; it is
-            not changed.
-        LabelFilesError: The folder holds something else, its manifest cannot be read, or it cannot
-            be written to.
-        OutputFolderError: A link in the folder leads out of it; nothing is written there.
-        TokenError: No such sample.
-        ChoiceError: No sample at all, or no such agent, configuration of agents, or code.
-        NotAvailableError: A sample has no label, or an agent with a view that counts is not in this
+        ConfigError: The folder contains labels with other settings, or batches with other names;
+            it is not changed.
+        LabelFilesError: The folder holds something other than labels, its manifest cannot be read,
+            or it cannot be written to.
+        OutputFolderError: A link in the folder points outside it; nothing is written there.
+        TokenError: There is no such sample.
+        ChoiceError: `tokens` is empty, or there is no such agent, configuration of agents, or
+            code base.
+        NotAvailableError: A sample has no label, or an agent whose view counts is missing from this
             (partial) release.
-        SomeFailedError: Labels of some samples cannot be made; the others are written, and the same
-            call continues.
+        SomeFailedError: The labels of some samples cannot be made. All others are written, and a
+            repeated call tries only the missing ones.
     """
     root = folder_path(folder)
     label_config = resolved_label_config(config)
     names = choice("names", names, (*get_args(BatchNames), None))
-    requested = _by_recording(dataset, tokens)
+    requested = _group_by_recording(dataset, tokens)
     _check_agents(dataset, requested, label_config)
     LabelManifest.of(root, label_config, names)
     command = {"config": label_config.digest, "names": names, "samples": requested}
@@ -127,12 +139,13 @@ def write_label_files(
             manifest.write(root)
         tasks = {}
         for recording, frames in requested.items():
-            all_frames = _with_stored_frames(dataset, root, recording, frames, manifest)
+            all_frames = _add_stored_frames(dataset, root, recording, frames, manifest)
             tasks[recording] = (recording, all_frames)
+        writer = _LabelWriter(dataset, root, manifest.config, names)
         results = store.run(
-            _LabelWriter(dataset, root, manifest.config, names).write,
+            writer.write,
             tasks,
-            label="motion labels",
+            label="Writing motion labels",
             places=Places(reads=dataset.places, writes=(root,)),
             **engine,
         )
@@ -142,38 +155,38 @@ def write_label_files(
                 manifest.samples[recording] = list(all_frames)
             manifest.write(root)
             store.remove()
-    is_new = [new for recording_files in results.values() for new in recording_files]
     num_samples = sum(map(len, requested.values()))
-    num_written = sum(is_new)
-    return LabelsWritten(samples=num_samples, written=num_written, kept=len(is_new) - num_written)
+    num_files = sum(map(len, results.values()))
+    num_written = sum(map(sum, results.values()))
+    return LabelsWritten(samples=num_samples, written=num_written, kept=num_files - num_written)
 
 
 class LabelFiles(Mapping[str, MotionLabels]):
-    """Motion labels in a folder, by sample token; a read takes a few milliseconds.
+    """Motion labels in a folder, by sample token; reading a sample takes a few milliseconds.
 
-    Cheap to pickle, and safe in threads and in forked workers: each process opens its own files, a
-    few at a time. Labels that are added to the folder later appear when it is opened again.
+    The mapping is cheap to pickle, and safe to use from threads and forked workers: each process
+    opens its own files, a few at a time. Labels that are added to the folder later become visible
+    when the folder is opened again.
     """
 
-    def __init__(
-        self, folder: str | os.PathLike[str], config: MotionLabelConfig | str | None = None
-    ) -> None:
+    def __init__(self, folder: PathType, config: MotionLabelConfig | str | None = None) -> None:
         """Open a folder that `write_label_files` or `deepaccident labels` has written.
 
         Args:
             folder: Path of the folder.
-            config: Configuration that the labels must have, or the name of a preset; None for any.
+            config: Configuration that the labels must have, or the name of a preset; None accepts
+                any.
 
         Raises:
-            LabelFilesError: There is no such folder, its labels are not complete or are another
-                code's batches, or its manifest cannot be read.
+            LabelFilesError: There is no such folder, its labels are incomplete or are batches for
+                another code base, or its manifest cannot be read.
             ConfigError: The labels have another configuration.
         """
         self.folder = folder_path(folder)
         manifest = LabelManifest.read(self.folder)
         if manifest.names is not None:
             raise LabelFilesError(
-                f"{self.folder}: holds batches of {manifest.names}, which np.load opens "
+                f"{self.folder}: contains batches of {manifest.names}, which np.load opens "
                 "(schema/motion_labels.md); for LabelFiles run `deepaccident labels` without "
                 "--names on another folder"
             )
@@ -195,11 +208,13 @@ class LabelFiles(Mapping[str, MotionLabels]):
         """Return the state without open files."""
         return {**self.__dict__, "_open": OrderedDict()}
 
-    # The comparison of mappings would read all files.
-    __eq__, __hash__ = object.__eq__, object.__hash__
+    # Comparing mappings would read all files.
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
 
     def __repr__(self) -> str:
-        return f"<motion labels: {counted(len(self), 'sample')} in {self.folder}>"
+        sample_count = counted(len(self), "sample")
+        return f"<motion labels: {sample_count} in {self.folder}>"
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -208,27 +223,30 @@ class LabelFiles(Mapping[str, MotionLabels]):
     def __iter__(self) -> Iterator[str]:
         """Yield sample tokens by scenario, agent and time."""
         for recording, frames in self._frames.items():
-            yield from (f"{recording}/{frame:03d}" for frame in sorted(frames))
+            for frame in sorted(frames):
+                yield f"{recording}/{frame:03d}"
 
     def __contains__(self, token: object) -> bool:
         """Return whether the folder holds a sample's labels."""
-        recording, number = _token_parts(token)
-        return number in self._frames.get(recording, ())
+        recording, frame = _split_token(token)
+        frames = self._frames.get(recording, ())
+        return frame in frames
 
     def __getitem__(self, token: str) -> MotionLabels:
         """Return the labels of a sample, each frame in its own ego frame.
 
         Raises:
             TokenError: The folder does not hold the sample.
-            LabelFilesError: The file is missing, damaged or of another configuration.
+            LabelFilesError: The file is missing, is damaged, or has another configuration.
         """
         if token not in self:
             raise TokenError(
                 f"{self.folder}: has no labels of {token!r}; `deepaccident labels` can add them"
             )
-        recording, number = _token_parts(token)
+        recording, frame = _split_token(token)
         try:
-            stored = StoredLabels.read(self._archive(recording), f"{number:03d}")
+            archive = self._open_archive(recording)
+            stored = StoredLabels.read(archive, f"{frame:03d}")
             return stored.labels(self.config)
         except DAMAGED_ARCHIVE as error:
             self._open.pop(recording, None)
@@ -237,18 +255,19 @@ class LabelFiles(Mapping[str, MotionLabels]):
                 f"{path}: {error}; remove it and run `deepaccident labels` again"
             ) from error
 
-    def _archive(self, recording: str) -> zipfile.ZipFile:
+    def _open_archive(self, recording: str) -> zipfile.ZipFile:
         """Return the open file of a scenario and agent.
 
-        Threads may share it, so that the garbage collector closes files that are no longer used.
+        Several threads may share it; the garbage collector closes files that are no longer used.
         """
-        if self._process != os.getpid():  # a fork shares positions in open files with its parent
-            self._open, self._process = OrderedDict(), os.getpid()
+        if self._process != os.getpid():  # a forked process shares file positions with its parent
+            self._open = OrderedDict()
+            self._process = os.getpid()
         archive = self._open.get(recording)
         if archive is None:
             archive = open_zip(label_path(self.folder, recording))
             if read_array(archive, "config", "motion_labels").item() != self._digest:
-                raise ValueError("holds labels of another configuration")
+                raise ValueError("contains labels with other settings")
             self._open[recording] = archive
             while len(self._open) > _MAX_OPEN_FILES:
                 self._open.popitem(last=False)
@@ -259,7 +278,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
 
 @dataclass(frozen=True, slots=True)
 class _LabelWriter:
-    """The work of a worker; cheap to pickle."""
+    """Writer of a folder's label files; it is sent to workers, so it is cheap to pickle."""
 
     dataset: Dataset
     root: Path
@@ -270,28 +289,29 @@ class _LabelWriter:
         """Write the files of one scenario and agent.
 
         Args:
-            task: Scenario and agent, and the numbers of the frames to write.
+            task: Scenario and agent, and the frame numbers to write.
 
         Returns:
-            Whether each file was written now; the others already had the same content.
+            Whether each file was written by this call; the others already had the same content.
         """
         recording, frames = task
-        source = self._source(recording, frames)
+        source = self._compute_source(recording, frames)
+        frames_by_path = {}
         if self.names is None:
-            frames_by_path = {label_path(self.root, recording): frames}
+            frames_by_path[label_path(self.root, recording)] = frames
         else:
-            frames_by_path = {batch_path(self.root, recording, frame): (frame,) for frame in frames}
-        stale = {}
-        for path, file_frames in frames_by_path.items():
-            if _source_of(path, self.names) != source:
-                stale[path] = file_frames
+            for frame in frames:
+                frames_by_path[batch_path(self.root, recording, frame)] = (frame,)
+        stale_files = {}
         tokens = []
-        for file_frames in stale.values():
-            tokens += [f"{recording}/{frame:03d}" for frame in file_frames]
+        for path, file_frames in frames_by_path.items():
+            if _read_source(path, self.names) != source:
+                stale_files[path] = file_frames
+                tokens += [f"{recording}/{frame:03d}" for frame in file_frames]
         labels = motion_labels_of(self.dataset, tokens, self.config)
-        for path, file_frames in stale.items():
+        for path, file_frames in stale_files.items():
             self._write_file(path, file_frames, source, labels)
-        return [path in stale for path in frames_by_path]
+        return [path in stale_files for path in frames_by_path]
 
     def _write_file(
         self,
@@ -302,7 +322,8 @@ class _LabelWriter:
     ) -> None:
         """Write one file from the next labels.
 
-        A batch has only its code's arrays; its source is the comment of the zip file.
+        A batch contains only its code base's arrays; its source digest is the comment of the zip
+        file.
         """
         target = place_in(self.root, path.relative_to(self.root))
         with replacing(target) as temporary, zipfile.ZipFile(temporary, "w") as archive:
@@ -319,50 +340,47 @@ class _LabelWriter:
                     for name, array in labels.as_batch(self.names).items():
                         write_array(archive, name, array)
 
-    def _source(self, recording: str, frames: tuple[int, ...]) -> str:
-        """Return a digest of everything that files depend on.
+    def _compute_source(self, recording: str, frames: tuple[int, ...]) -> str:
+        """Return a digest of everything that the files of a recording depend on.
 
-        This is the configuration, the samples or names, and the scenario's rows.
+        These are the configuration, the frames, the names and the scenario's table rows.
         """
         digest = hashlib.blake2b(digest_size=16)
         # A batch does not depend on the other samples of its recording.
         content = frames if self.names is None else self.names
-        digest.update(f"{LABEL_FORMAT_VERSION} {self.config.digest} {recording} {content}".encode())
-        for array in _scenario_arrays(self.dataset, recording.rsplit("/", 1)[0]):
+        settings = f"{LABEL_FORMAT_VERSION} {self.config.digest} {recording} {content}"
+        digest.update(settings.encode())
+        scenario, _ = recording.rsplit("/", 1)
+        for array in _read_scenario_arrays(self.dataset, scenario):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
 
-def _scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
-    """Yield the columns of the tables that a scenario's labels depend on, of all agents."""
+def _read_scenario_arrays(dataset: Dataset, scenario: str) -> Iterator[AnyArray]:
+    """Yield the parts of the table columns that a scenario's labels depend on, for all agents."""
     dataset = dataset.with_ignored
     row = dataset.getind("scenario", scenario)
     samples = dataset.columns("sample")
     first, last = samples["scenario_row"].searchsorted((row, row + 1))
     yield dataset.columns("ego_pose")["matrix"][first:last]
-    lidars = slice(
-        first * len(CHANNELS) + CHANNELS.index(LIDAR), last * len(CHANNELS), len(CHANNELS)
-    )
+    num_channels = len(CHANNELS)
+    first_lidar = first * num_channels + CHANNELS.index(LIDAR)
+    lidars = slice(first_lidar, last * num_channels, num_channels)
     yield dataset.columns("sample_data")["matrix"][lidars]
     yield samples["agent"][first:last]
     counts = samples["num_annotations"][first:last]
     yield counts
     if counts.any():
-        start = int(samples["first_annotation_row"][first:last][counts > 0].min())
-        for name in (
-            "translation",
-            "size",
-            "yaw",
-            "actor_id",
-            "category",
-            "num_lidar_pts",
-            "camera_visible",
-        ):
-            yield dataset.columns("annotation")[name][start : start + int(counts.sum())]
+        annotation_rows = samples["first_annotation_row"][first:last]
+        start = int(annotation_rows[counts > 0].min())
+        end = start + int(counts.sum())
+        annotations = dataset.columns("annotation")
+        for name in _SOURCE_COLUMNS:
+            yield annotations[name][start:end]
 
 
-def _source_of(path: Path, names: BatchNames | None) -> str | None:
-    """Return the digest that a file was made with; None if there is no complete file."""
+def _read_source(path: Path, names: BatchNames | None) -> str | None:
+    """Return the source digest stored in a file; None if there is no complete file."""
     try:
         with open_zip(path) as archive:
             if names is not None:
@@ -372,8 +390,8 @@ def _source_of(path: Path, names: BatchNames | None) -> str | None:
         return None
 
 
-def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, list[int]]:
-    """Return scenario and agent → frame numbers, unique and ascending."""
+def _group_by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, list[int]]:
+    """Return the samples as scenario and agent → frame numbers, unique and ascending."""
     if isinstance(tokens, str | Mapping):
         raise ChoiceError(
             f"tokens: expected samples' tokens or records, found {tokens!r}; put it into a list"
@@ -385,8 +403,8 @@ def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, 
         token = sample if isinstance(sample, str) else sample["token"]
         if not labelled[row]:
             raise NotAvailableError(f"{token} has no label (the test split has none)")
-        recording, number = _token_parts(token)
-        frames.setdefault(recording, set()).add(number)
+        recording, frame = _split_token(token)
+        frames.setdefault(recording, set()).add(frame)
     if not frames:
         raise ChoiceError("tokens: expected at least one sample, found none")
     return {recording: sorted(frames[recording]) for recording in sorted(frames, key=_table_order)}
@@ -395,18 +413,21 @@ def _by_recording(dataset: Dataset, tokens: Iterable[RowArgument]) -> dict[str, 
 def _check_agents(
     dataset: Dataset, requested: Mapping[str, list[int]], config: MotionLabelConfig
 ) -> None:
-    """Raise NotAvailableError or ChoiceError now, and not later in a worker."""
+    """Check the cooperating agents of all samples before any work starts.
+
+    Raise NotAvailableError if the release lacks one, and ChoiceError if there is no such agent.
+    """
     if config.filter_invisible and config.agents is not None:
         for recording, frames in requested.items():
             cooperating_agents(dataset, f"{recording}/{frames[0]:03d}", config.agents)
 
 
-def _with_stored_frames(
+def _add_stored_frames(
     dataset: Dataset, root: Path, recording: str, frames: list[int], manifest: LabelManifest
 ) -> tuple[int, ...]:
-    """Return the frames that a file should have: the requested and the stored ones.
+    """Return the frames that a file should contain: the requested and the stored ones.
 
-    Raises LabelFilesError if the release no longer has a stored frame.
+    Raise LabelFilesError if the release no longer has a stored frame.
     """
     stored_frames = manifest.samples.get(recording, [])
     try:
@@ -426,7 +447,7 @@ def _table_order(recording: str) -> tuple[str, int]:
     return scenario, AGENTS.index(agent)
 
 
-def _token_parts(token: object) -> tuple[str, int]:
-    """Return a sample token's scenario and agent, and its frame number; 0 for other texts."""
+def _split_token(token: object) -> tuple[str, int]:
+    """Split a sample token into scenario and agent, and frame number; other text gives frame 0."""
     recording, _, number = str(token).rpartition("/")
     return recording, parse_number(number, 3) or 0

@@ -1,36 +1,37 @@
 """Warping rasters into another ego frame: transforms, and the source cell or point of each cell.
 
-Arguments are right-handed 6-vectors and matrices. Transforms of frames, past moments and agents are
-products of the motions in between, in the handedness of the protocol's native orientation;
-`stretched` and `fiery` compute them in float32 as their codes do, `exact` in float64.
+Arguments are right-handed 6-vectors and matrices. Transforms between frames, past moments and
+agents are products of the motions in between, in the handedness of the protocol's native
+orientation; `stretched` and `fiery` compute them in float32 as their source code does, `exact` in
+float64.
 
 Rasters are sampled in a protocol's `native` orientation, with matrices of that orientation's
 handedness, by one of three rules (`WarpRule`):
 
 - `stretched`: the released `FeatureWarper` (docs/released_code.md, Warps), which is BEVerse's.
-  Sample points stand at linspace(−49.75, 50, 200) along either axis instead of at the cells'
-  centres, and the outermost of them are treated as the grid's ends: without motion, cell i samples
-  0.4975 + 0.9975 i, which nearest sampling rounds to i, and which blurs bilinear sampling by up to
-  half a cell. Each rounding to float32 is repeated, since the last bit decides for points that lie
-  on the border between two cells (except for the angles of `egomotion`). Grids that are not centred
+  Sample points lie at linspace(−49.75, 50, 200) along either axis instead of at the cells' centres,
+  and the outermost of them are treated as the grid's ends: without motion, cell i samples 0.4975 +
+  0.9975 i, which nearest sampling rounds to i, and which blurs bilinear sampling by up to half a
+  cell. Each rounding to float32 is reproduced (except for the angles of `egomotion`), since the
+  last bit decides for points that lie on the border between two cells. Grids that are not centred
   on the ego do not occur in the released code; they are stretched about their own middle.
-- `exact`: cell centres, in float64; without motion every cell gets its own value, in either mode.
-- `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres;
-  of the motion only the 6-vector's yaw and planar translation count, combined as source =
-  Rot(−yaw) · target + (−tx, +ty): the sideways shift has the wrong sign, and neither shift is
-  turned. FIERY has only square grids centred on the ego; other grids are measured in metres from
+- `exact`: cell centres, in float64; without motion every cell keeps its value, in either mode.
+- `fiery`: FIERY's (docs/released_code.md, FIERY's own labels), native in `fiery`. Cell centres.
+  Only the yaw and the planar translation of the motion's 6-vector are used, combined as source =
+  Rot(−yaw) · target + (−tx, +ty): the lateral shift has the wrong sign, and neither shift is
+  rotated. FIERY has only square grids centred on the ego; other grids are measured in metres from
   the ego.
 
-The transform is rigid (or A · rigid · A⁻¹ with an augmentation A). Points lie on the plane z = 0;
-only x and y of the transformed points count. `source_from_target` maps points of the result's frame
-to points of the raster's frame: `sampling_matrix` gets it from the released code's arguments, which
-go the other way.
+The transform is rigid (or A · rigid · A⁻¹ with an augmentation A). Points lie on the plane z = 0,
+and only x and y of the transformed points are used. `source_from_target` maps points of the
+result's frame to points of the raster's frame; `sampling_matrix` computes it from the released
+code's arguments, which go the other way.
 """
 
 import functools
 from collections.abc import Callable, Mapping
 from itertools import accumulate
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,12 +58,12 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.v2x import future_egomotion
 
 WarpMode = Literal["nearest", "bilinear"]
-# Float32 can number this many cells.
-_MAX_CELLS: Final = 2**24
+# Maximum number of cells that float32 can index exactly.
+_MAX_CELLS = 2**24
 
 
 class _Arithmetic(NamedTuple):
-    """Functions for matrices in one precision."""
+    """The matrix functions for one precision."""
 
     matrices: Callable[[AnyArray], AnyArray]
     rigid_inverse: Callable[[AnyArray], AnyArray]
@@ -77,7 +78,7 @@ _SINGLE = _Arithmetic(
     single_precision.product,
 )
 _DOUBLE = _Arithmetic(conventions.matrices_of_six, np.linalg.inv, np.linalg.inv, np.matmul)
-_ARITHMETIC: Final[Mapping[str, _Arithmetic]] = {
+_ARITHMETIC: Mapping[str, _Arithmetic] = {
     "stretched": _SINGLE,
     "fiery": _SINGLE,
     "exact": _DOUBLE,
@@ -85,10 +86,11 @@ _ARITHMETIC: Final[Mapping[str, _Arithmetic]] = {
 
 
 def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    """Return `v2x.future_egomotion` of poses in a protocol's arithmetic, shape (T, 6), float32.
+    """Compute `v2x.future_egomotion` in a protocol's arithmetic, shape (T, 6), float32.
 
-    The poses have the shape (T + 1, 4, 4). The released code has the poses in float32. If a sample
-    point lies on a border between cells, their last bits decide to which cell it belongs.
+    The poses have the shape (T + 1, 4, 4), and `valid` marks the ones that exist. The released code
+    stores poses in float32. If a sample point lies on a border between cells, the poses' last bits
+    decide which cell it belongs to.
     """
     if rules.warp == "exact":
         return future_egomotion(world_from_ego, valid).astype(np.float32)
@@ -97,9 +99,9 @@ def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol)
     has_motion = known[:-1] & known[1:]
     motion = np.zeros((len(has_motion), 6), dtype=np.float32)
     next_from_world = single_precision.rigid_inverse(poses[1:][has_motion])
-    # torch's atan2 is not correctly rounded, so its angles can differ in the last bit: at a tie,
-    # where a sample point lies on a border between cells, a cell can differ (in one of three of
-    # about 330 warped outputs of the released code).
+    # torch's atan2 is not correctly rounded, so its angles can differ in the last bit: where a
+    # sample point lies on a border between cells, a cell can differ (seen in one cell of three
+    # among about 330 warped outputs of the released code).
     next_from_this = single_precision.fused_product(next_from_world, poses[:-1][has_motion])
     motion[has_motion] = conventions.six_vectors_of(next_from_this).astype(np.float32)
     return motion
@@ -108,21 +110,22 @@ def egomotion(world_from_ego: ArrayLike, valid: ArrayLike, rules: LabelProtocol)
 def present_from_frames(
     egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Return the transforms of the present and each future frame to the present.
+    """Return the transforms from the present and each future frame to the present.
 
-    They are C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹, shape (T, 4, 4). With an augmentation A, C becomes A C
-    A⁻¹.
+    The transform from frame i is C_i = E_0⁻¹ E_1⁻¹ … E_{i−1}⁻¹; the result has the shape (T, 4, 4).
+    With an augmentation A, C becomes A C A⁻¹.
 
     Args:
         egomotion: `next_from_this` from the present on, shape (T, 6); the last row is not used.
         rules: Protocol of the labels.
-        augmentation: Augmentation of all frames.
+        augmentation: Augmentation of all frames; None for none.
     """
     arithmetic = _ARITHMETIC[rules.warp]
-    this_from_next = arithmetic.rigid_inverse(_native_matrices(egomotion, rules)[:-1])
+    next_from_this = _make_native_matrices(egomotion, rules)[:-1]
+    this_from_next = arithmetic.rigid_inverse(next_from_this)
     identity = np.eye(4, dtype=this_from_next.dtype)
     chain = accumulate(this_from_next, arithmetic.product, initial=identity)
-    return _augmented(np.stack(list(chain)), rules, augmentation)
+    return _augment_transforms(np.stack(list(chain)), rules, augmentation)
 
 
 def frames_from_next(
@@ -130,74 +133,80 @@ def frames_from_next(
 ) -> AnyArray:
     """Return the transforms from each frame's next frame to that frame, shape (T, 4, 4).
 
-    The released code has a special method to invert `next_from_this` (T, 6).
+    `egomotion` is `next_from_this`, shape (T, 6). It is inverted by the protocol's own method.
     """
-    inverse = _ARITHMETIC[rules.warp].inverse(_native_matrices(egomotion, rules))
-    return _augmented(inverse, rules, augmentation)
+    next_from_this = _make_native_matrices(egomotion, rules)
+    this_from_next = _ARITHMETIC[rules.warp].inverse(next_from_this)
+    return _augment_transforms(this_from_next, rules, augmentation)
 
 
 def present_from_past(
     egomotion: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Return the transforms of past moments to the present, shape (P, 4, 4), the oldest first.
+    """Return the transforms from past moments to the present, shape (P, 4, 4), oldest first.
 
-    The released code and FIERY multiply the motions in the order of time, E_0 E_1, and are
-    therefore wrong from the second moment before the present on; `exact` multiplies E_1 E_0.
+    The released code and FIERY multiply the motions in chronological order, E_0 E_1, so their
+    transforms are wrong for all but the latest past moment; `exact` multiplies E_1 E_0.
 
     Args:
         egomotion: `next_from_this` of the past moments, shape (P, 6), the oldest first.
         rules: Protocol of the labels.
-        augmentation: Augmentation of all moments.
+        augmentation: Augmentation of all moments; None for none.
     """
     product = _ARITHMETIC[rules.warp].product
-    steps = _native_matrices(egomotion, rules)
-
-    def reversed_product(later: AnyArray, earlier: AnyArray) -> AnyArray:
-        return product(earlier, later)
-
-    combine = product if rules.warp == "exact" else reversed_product
-    chain = list(accumulate(steps[::-1], combine))
-    return _augmented(np.reshape(chain[::-1], steps.shape), rules, augmentation)
+    transforms = _make_native_matrices(egomotion, rules)
+    for moment in reversed(range(len(transforms) - 1)):
+        step = transforms[moment]
+        later = transforms[moment + 1]
+        if rules.warp == "exact":
+            transforms[moment] = product(later, step)
+        else:
+            transforms[moment] = product(step, later)
+    return _augment_transforms(transforms, rules, augmentation)
 
 
 def ego_from_agents(
     relative_pose: ArrayLike, rules: LabelProtocol, augmentation: Augmentation | None = None
 ) -> AnyArray:
-    """Return the transforms of agents' frames to the ego's, shape (K, 4, 4).
+    """Return the transforms from agents' frames to the ego's, shape (K, 4, 4).
 
-    The relative poses are right-handed 6-vectors (K, 6). Raises GeometryError.
+    The relative poses are right-handed 6-vectors (K, 6). Raise GeometryError for any other shape.
     """
-    return _augmented(_native_matrices(relative_pose, rules), rules, augmentation)
+    transforms = _make_native_matrices(relative_pose, rules)
+    return _augment_transforms(transforms, rules, augmentation)
 
 
-def _native_matrices(six_vectors: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    """Return the matrices of right-handed 6-vectors in the protocol's handedness and precision."""
+def _make_native_matrices(six_vectors: ArrayLike, rules: LabelProtocol) -> AnyArray:
+    """Convert right-handed 6-vectors to matrices in the protocol's handedness and precision."""
     vectors = checked("egomotion", six_vectors, (None, 6))
     if not rules.right_handed:
         vectors = flip_six_vector(vectors)
     return _ARITHMETIC[rules.warp].matrices(vectors)
 
 
-def _augmented(
+def _augment_transforms(
     transforms: AnyArray, rules: LabelProtocol, augmentation: Augmentation | None
 ) -> AnyArray:
     """Return A · transforms · A⁻¹ for an augmentation A."""
     if augmentation is None or not len(transforms):
         return transforms
     arithmetic = _ARITHMETIC[rules.warp]
-    native = augmentation.matrix if rules.right_handed else flip_pose(augmentation.matrix)
-    matrix = native[None].astype(transforms.dtype)
-    changed = arithmetic.product(matrix, transforms)
-    return arithmetic.product(changed, arithmetic.inverse(matrix))
+    matrix = augmentation.matrix
+    if not rules.right_handed:
+        matrix = flip_pose(matrix)
+    matrix = matrix[None].astype(transforms.dtype)
+    augmented = arithmetic.product(matrix, transforms)
+    return arithmetic.product(augmented, arithmetic.inverse(matrix))
 
 
 def sampling_matrix(target_from_source: ArrayLike, rules: LabelProtocol) -> AnyArray:
-    """Return `source_from_target` of transforms (N, 4, 4) in the protocol's float32 or float64."""
+    """Invert transforms (N, 4, 4) to `source_from_target`, in the protocol's float32 or float64."""
     shape = (None, 4, 4)
     if rules.warp == "stretched":
         transforms = checked("target_from_source", target_from_source, shape, np.float32)
         return single_precision.inverse(transforms)
-    return np.asarray(np.linalg.inv(checked("target_from_source", target_from_source, shape)))
+    exact_transforms = checked("target_from_source", target_from_source, shape)
+    return np.asarray(np.linalg.inv(exact_transforms))
 
 
 def nearest_indices(
@@ -209,8 +218,8 @@ def nearest_indices(
 ) -> CellIndices:
     """Return the source cell of each target cell, shape (H · W,): row · W + column.
 
-    It is `OUTSIDE` where the sample point is off the grid. Points half-way between two cells go to
-    the even one.
+    The index is `OUTSIDE` where the sample point is off the grid. A point half-way between two
+    cells belongs to the even one.
 
     Args:
         source_from_target: Transform in metres and the protocol's handedness, shape (4, 4).
@@ -231,10 +240,10 @@ def rounded_points(
     rules: LabelProtocol,
     orientation: Orientation | None = None,
 ) -> CellIndices:
-    """Return `nearest_indices` from the sample points."""
+    """Return the same as `nearest_indices`, from the sample points."""
     if grid.cells > _MAX_CELLS:
         raise GeometryError(
-            f"grid: {grid.cells} cells are more than a warp can number; choose at most {_MAX_CELLS}"
+            f"grid: {grid.cells} cells are more than a warp supports; choose at most {_MAX_CELLS}"
         )
     row = np.rint(points[0])
     column = np.rint(points[1])
@@ -243,9 +252,10 @@ def rounded_points(
     is_outside |= column < 0
     is_outside |= column >= columns
     native = rules.native
-    raster_orientation = native if orientation is None else orientation
-    first, row_step, column_step = _numbering(grid.with_orientation(raster_orientation), native)
-    # The rows become the indices, in place.
+    raster_orientation = orientation or native
+    raster_grid = grid.with_orientation(raster_orientation)
+    first, row_step, column_step = _number_cells(raster_grid, native)
+    # The array of rows is turned into the indices, in place.
     row *= row_step
     column *= column_step
     row += column
@@ -253,7 +263,8 @@ def rounded_points(
     np.copyto(row, OUTSIDE, where=is_outside)
     cells = row.astype(np.int32)  # first to int32, then to intp: three times as fast
     native_grid = grid.with_orientation(native)
-    return native_grid.reorient(cells, raster_orientation).astype(np.intp).ravel()
+    raster_cells = native_grid.reorient(cells, raster_orientation)
+    return raster_cells.astype(np.intp).ravel()
 
 
 def warp(
@@ -268,15 +279,15 @@ def warp(
 ) -> AnyArray:
     """Warp rasters (…, H, W) into another frame, all by the same transform.
 
-    Only cells move: vectors do not turn.
+    Only cells move: vectors in them are not rotated.
 
     Args:
         raster: Rasters, shape (…, H, W).
         source_from_target: Transform, as in `nearest_indices`.
         grid: Cells of the rasters.
         rules: Protocol of the labels.
-        mode: How to sample.
-        fill: Value outside the grid, which mixes with the border's cells if `bilinear`.
+        mode: Sampling mode.
+        fill: Value outside the grid; if `bilinear`, it blends into the cells at the border.
         orientation: Orientation of the rasters, as in `nearest_indices`.
 
     Returns:
@@ -284,12 +295,12 @@ def warp(
 
     Raises:
         GeometryError: As in `nearest_indices`.
-        ChoiceError: No such mode.
+        ChoiceError: There is no such mode.
     """
     native = rules.native
     raster_grid = grid.with_orientation(orientation or native)
     source = np.asarray(raster)
-    native_source = raster_grid.reorient(source, native)  # a view; refuses other shapes
+    native_source = raster_grid.reorient(source, native)  # a view; raises for other shapes
     if checked_mode(mode) == "nearest":
         indices = nearest_indices(source_from_target, grid, rules, orientation=orientation)
         flat_source = source.reshape(*source.shape[:-2], -1)
@@ -301,7 +312,7 @@ def warp(
 
 
 def checked_mode(mode: WarpMode) -> WarpMode:
-    """Return `mode`, or raise ChoiceError."""
+    """Return `mode`, or raise ChoiceError if there is no such mode."""
     return choice("mode", mode, get_args(WarpMode))
 
 
@@ -310,8 +321,8 @@ def sample_points(
 ) -> tuple[AnyArray, AnyArray]:
     """Return the rows and columns at which each target cell samples the source, each (H, W).
 
-    They are in cells, 0 the first cell's centre, in native orientation; float32, but float64 if
-    `exact`. Raises GeometryError.
+    Units are cells, where 0 is the first cell's centre, in native orientation; the dtype is float64
+    if the warp is `exact`, otherwise float32. Raise GeometryError if the transform is not finite.
     """
     matrix = checked("source_from_target", source_from_target, (4, 4))
     rows, columns = sampling_lines(matrix[None], grid, rules)
@@ -323,38 +334,47 @@ def sampling_lines(
 ) -> tuple[SamplingLine, SamplingLine]:
     """Return the lines from which `sample_points` computes its rows and columns.
 
-    With them only some cells can be sampled. The matrices have the shape (N, 4, 4). Raises
-    GeometryError.
+    The lines allow sampling of only some cells. The matrices have the shape (N, 4, 4). Raise
+    GeometryError if a number is not finite.
     """
     if not np.isfinite(matrices).all():
         raise GeometryError(
-            "source_from_target: not all numbers are finite; leave out frames without a pose"
+            "source_from_target: not all numbers are finite; remove frames without a pose"
         )
     if rules.warp == "fiery":
         six_vectors = conventions.six_vectors_of(np.linalg.inv(matrices)).astype(np.float32)
         components = six_vectors.T[..., None]
         return fiery_lines(components[0], components[1], components[5], grid.x, grid.y)
     native = grid.with_orientation(rules.native)
-    order = [0, 1] if native.orientation == "fiery" else [1, 0]
-    planes = matrices[:, order][:, :, [*order, 3]]  # z = 0: metres along rows and columns
+    if native.orientation == "fiery":
+        row_axis = 0
+    else:
+        row_axis = 1
+    column_axis = 1 - row_axis
+    # Keep the axes along rows and columns, in metres, for points with z = 0.
+    planes = matrices[:, [row_axis, column_axis]][:, :, [row_axis, column_axis, 3]]
     if rules.warp == "exact":
         return exact_lines(planes, axes_of(native))
     return stretched_lines(planes.astype(np.float32), axes_of(native))
 
 
 @functools.lru_cache(maxsize=64)
-def _numbering(grid: BevGrid, native: Orientation) -> tuple[int, int, int]:
-    """Return how the orientation of `grid` numbers the cells of the native one.
+def _number_cells(grid: BevGrid, native: Orientation) -> tuple[int, int, int]:
+    """Return how cells in native orientation are numbered in the orientation of `grid`.
 
     Returns:
-        Number of the first cell, step of a row, and step of a column.
+        Number of the first cell, step from one row to the next, and step from one column to the
+        next.
     """
-    numbers = grid.reorient(np.arange(grid.cells).reshape(grid.shape), native)
-    first, last_row, last_column = (
-        int(corner) for corner in (numbers[0, 0], numbers[-1, 0], numbers[0, -1])
-    )
-    row_steps, column_steps = (max(count - 1, 1) for count in numbers.shape)
-    return first, (last_row - first) // row_steps, (last_column - first) // column_steps
+    numbers = np.arange(grid.cells).reshape(grid.shape)
+    native_numbers = grid.reorient(numbers, native)
+    rows, columns = native_numbers.shape
+    first = native_numbers.item(0, 0)
+    row_span = native_numbers.item(rows - 1, 0) - first
+    column_span = native_numbers.item(0, columns - 1) - first
+    row_step = row_span // max(rows - 1, 1)
+    column_step = column_span // max(columns - 1, 1)
+    return first, row_step, column_step
 
 
 def past_to_present(
@@ -366,9 +386,9 @@ def past_to_present(
     mode: WarpMode = "nearest",
     augmentation: Augmentation | None = None,
 ) -> AnyArray:
-    """Warp an agent's maps of past moments into its present ego frame.
+    """Warp an agent's maps from past moments into its present ego frame.
 
-    The present, the last map, does not change.
+    The last map, which is the present's, is not changed.
 
     Args:
         features: Maps in the orientation of `grid`, shape (T, …, H, W), the oldest first.
@@ -377,25 +397,24 @@ def past_to_present(
         grid: Cells of the maps; None for the released cells in the devkit's orientation.
         protocol: Protocol with the sampling rule and the order of the motions (see
             `present_from_past`).
-        mode: How to sample.
-        augmentation: Augmentation of all maps.
+        mode: Sampling mode.
+        augmentation: Augmentation of all maps; None for none.
 
     Returns:
         Maps of the same shape; of the same dtype if `nearest`, float32 if `bilinear`.
 
     Raises:
-        GeometryError: Shapes that do not fit.
-        ChoiceError: No such protocol or mode.
+        GeometryError: The shapes do not fit together.
+        ChoiceError: There is no such protocol or mode.
     """
-    maps = _checked_maps(features)
+    maps = _check_maps(features)
     motion = checked("egomotion", egomotion, (None, 6))
-    if len(maps) > len(motion) + 1:
-        raise GeometryError(
-            f"egomotion: expected at least {len(maps) - 1} rows for {len(maps)} maps"
-        )
+    num_past = len(maps) - 1
+    if num_past > len(motion):
+        raise GeometryError(f"egomotion: expected at least {num_past} rows for {len(maps)} maps")
     rules = label_protocol(protocol)
-    transforms = present_from_past(motion[: len(maps) - 1], rules, augmentation)
-    return _warped(maps, list(range(len(maps) - 1)), transforms, rules, grid, mode)
+    transforms = present_from_past(motion[:num_past], rules, augmentation)
+    return _warp_maps(maps, range(num_past), transforms, rules, grid, mode)
 
 
 def agents_to_ego(
@@ -407,9 +426,9 @@ def agents_to_ego(
     mode: WarpMode = "nearest",
     augmentation: Augmentation | None = None,
 ) -> AnyArray:
-    """Warp agents' maps of one moment into the ego's frame.
+    """Warp agents' maps from one moment into the ego's frame.
 
-    The ego's own map, the first one, does not change. The result and the errors are as in
+    The first map, which is the ego's, is not changed. The result and the errors are as in
     `past_to_present`.
 
     Args:
@@ -418,17 +437,17 @@ def agents_to_ego(
             `v2x.relative_pose_to_ego` returns them.
         grid: Cells of the maps; None for the released cells in the devkit's orientation.
         protocol: Protocol with the sampling rule.
-        mode: How to sample.
-        augmentation: Augmentation of all maps.
+        mode: Sampling mode.
+        augmentation: Augmentation of all maps; None for none.
     """
-    maps = _checked_maps(features)
+    maps = _check_maps(features)
     poses = checked("relative_pose", relative_pose, (len(maps), 6))
     rules = label_protocol(protocol)
     transforms = ego_from_agents(poses[1:], rules, augmentation)
-    return _warped(maps, list(range(1, len(maps))), transforms, rules, grid, mode)
+    return _warp_maps(maps, range(1, len(maps)), transforms, rules, grid, mode)
 
 
-def _checked_maps(features: ArrayLike) -> AnyArray:
+def _check_maps(features: ArrayLike) -> AnyArray:
     """Return features as an array (K, …, H, W), or raise GeometryError."""
     maps = as_numbers("features", features, "maps (K, …, H, W)", dtype=None)
     if maps.ndim < 3 or not len(maps):
@@ -438,18 +457,22 @@ def _checked_maps(features: ArrayLike) -> AnyArray:
     return maps
 
 
-def _warped(
+def _warp_maps(
     maps: AnyArray,
-    moved: list[int],
+    moved: range,
     target_from_source: AnyArray,
     rules: LabelProtocol,
     grid: BevGrid | None,
     mode: WarpMode,
 ) -> AnyArray:
-    """Return a copy of the maps; the maps with numbers `moved` are warped by their transforms."""
-    cells = BevGrid() if grid is None else grid
-    orientation = cells.orientation
-    result = maps.astype(maps.dtype if checked_mode(mode) == "nearest" else np.float32)
-    for index, matrix in zip(moved, sampling_matrix(target_from_source, rules), strict=True):
-        result[index] = warp(maps[index], matrix, cells, rules, mode, orientation=orientation)
+    """Copy the maps, and warp the ones at the indices `moved` by their transforms."""
+    grid = grid or BevGrid()
+    orientation = grid.orientation
+    dtype = maps.dtype
+    if checked_mode(mode) == "bilinear":
+        dtype = np.dtype(np.float32)
+    result = maps.astype(dtype)
+    matrices = sampling_matrix(target_from_source, rules)
+    for index, matrix in zip(moved, matrices, strict=True):
+        result[index] = warp(maps[index], matrix, grid, rules, mode, orientation=orientation)
     return result

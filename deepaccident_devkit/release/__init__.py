@@ -1,6 +1,6 @@
-"""The files of a release on disk, exactly as they are: a reader and a writer for each kind.
+"""The files of a release on disk: a reader and a writer for each kind.
 
-Readers convert CARLA's left-handed values to the devkit's right-handed ones unless called with
+Readers convert CARLA's left-handed values to the devkit's right-handed ones, unless you pass
 `raw=True`.
 """
 

@@ -1,10 +1,10 @@
-"""Calib files `calib/*.pkl`: poses and cameras of an agent at a frame (docs/format.md, Calib)."""
+"""Calib files `calib/*.pkl`: poses and cameras of an agent in a frame (docs/format.md, Calib)."""
 
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Literal, TypeAlias, overload
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from deepaccident_devkit.support.arrays import (
     BoolArray,
     FloatArray,
     ShortRepr,
+    freeze_arrays,
     in_range,
     readonly,
 )
@@ -28,6 +29,8 @@ from deepaccident_devkit.taxonomy import CAMERAS
 _EGO_KEYS = ("lidar_to_ego", "ego_to_world")
 _CAMERA_KEYS = tuple(f"lidar_to_{camera}" for camera in CAMERAS)
 _INTRINSIC_KEYS = tuple(f"intrinsic_{camera}" for camera in CAMERAS)
+# Key → array of a calib file, with CARLA's signs and axes.
+RawCalib: TypeAlias = dict[str, AnyArray]
 # Every key of a calib file and the shape of its array.
 KEYS: dict[str, tuple[int, int]] = {
     **dict.fromkeys((*_EGO_KEYS, *_CAMERA_KEYS), (4, 4)),
@@ -39,7 +42,7 @@ _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibs(ShortRepr):
-    """Calibration of F frames, right-handed, cameras optical; arrays are read-only.
+    """Calibration of F frames, right-handed, with optical camera frames; arrays are read-only.
 
     Attributes:
         ego_from_lidar: Poses of the LiDAR on the agent, shape (F, 4, 4), float64.
@@ -57,8 +60,7 @@ class Calibs(ShortRepr):
 
     def __post_init__(self) -> None:
         """Freeze the arrays."""
-        for name in ("ego_from_lidar", "world_from_ego", "camera_from_lidar", "intrinsic"):
-            object.__setattr__(self, name, readonly(getattr(self, name)))
+        freeze_arrays(self)
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -67,7 +69,7 @@ class Calibs(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calib(ShortRepr):
-    """Calibration of one agent at one frame, right-handed.
+    """Calibration of one agent in one frame, right-handed.
 
     Attributes:
         ego_from_lidar: Pose of the LiDAR on the agent.
@@ -86,23 +88,23 @@ class Calib(ShortRepr):
 @overload
 def read_calib(path: ReleasePath, *, raw: Literal[False] = False) -> Calib: ...
 @overload
-def read_calib(path: ReleasePath, *, raw: Literal[True]) -> dict[str, AnyArray]: ...
-def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, AnyArray]:
-    """Return the calibration in one file.
+def read_calib(path: ReleasePath, *, raw: Literal[True]) -> RawCalib: ...
+def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | RawCalib:
+    """Read the calibration in one file.
 
     Args:
         path: The file.
-        raw: Whether to return the file's own dictionary: left-handed matrices, cameras with x
+        raw: Whether to return the file's dictionary unchanged: left-handed matrices, camera axes x
             depth, y right, z up.
 
     Raises:
-        MissingFileError: There is no such file.
-        CalibError: The file is damaged, lacks a key, holds an array of a wrong shape, NaN, a number
-            beyond 1e9 or a transform that is not rigid, or would make objects other than numpy
-            arrays (nothing of such a file is run).
+        MissingFileError: If the file does not exist.
+        CalibError: If the file is damaged, lacks a key, or contains an array of the wrong shape,
+            NaN, a number beyond 1e9, a transform that is not rigid, or objects other than numpy
+            arrays (nothing in the file is executed).
     """
     raw_arrays = read_unchecked_calib(path)
-    calibs = _converted([path], _stacked([raw_arrays]))
+    calibs = _convert_arrays([path], _stack_files([raw_arrays]))
     if raw:
         return raw_arrays
     camera_from_lidar = {}
@@ -119,21 +121,23 @@ def read_calib(path: ReleasePath, *, raw: bool = False) -> Calib | dict[str, Any
 
 
 def read_calibs(paths: Sequence[ReleasePath]) -> Calibs:
-    """Return the calibrations of several files as stacked arrays; raises as `read_calib` does."""
+    """Read the calibrations of several files as stacked arrays, with the errors of `read_calib`."""
     contents = [read_content(path, "calib", CalibError) for path in paths]
     # Load the first file to check its keys and shapes; files with the same layout are stacked.
-    files = [_loaded(path, content) for path, content in zip(paths[:1], contents[:1], strict=True)]
+    files = [
+        _load_file(path, content) for path, content in zip(paths[:1], contents[:1], strict=True)
+    ]
     arrays = load_stacked(contents)
     if arrays is None:
         for path, content in zip(paths[1:], contents[1:], strict=True):
-            files.append(_loaded(path, content))
-        arrays = _stacked(files)
-    return _converted(paths, arrays)
+            files.append(_load_file(path, content))
+        arrays = _stack_files(files)
+    return _convert_arrays(paths, arrays)
 
 
 def write_calib(path: Path, calib: Calib) -> None:
     """Write one calibration with CARLA's signs and axes; see `write_raw_calib`."""
-    raw: dict[str, AnyArray] = {
+    raw: RawCalib = {
         "lidar_to_ego": conventions.flip_pose(calib.ego_from_lidar.matrix),
         "ego_to_world": conventions.flip_pose(calib.world_from_ego.matrix),
     }
@@ -145,36 +149,33 @@ def write_calib(path: Path, calib: Calib) -> None:
 
 
 def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
-    """Write a file's own dictionary, as `read_calib(raw=True)` returns it.
+    """Write a raw dictionary, as `read_calib(raw=True)` returns it.
 
-    The arrays are not checked, so that `read_calib` may refuse the file. Old numpy versions can
-    also read it.
+    The arrays are not checked, so `read_calib` may refuse the file. Old numpy versions can read the
+    file too.
     """
     # Adding 0.0 removes negative zeros.
     arrays = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}
     write_bytes(path, pickled(arrays))
 
 
-def read_unchecked_calib(path: ReleasePath) -> dict[str, AnyArray]:
-    """Return a file's own dictionary like `read_calib(raw=True)`, without a check of its numbers.
+def read_unchecked_calib(path: ReleasePath) -> RawCalib:
+    """Read a raw dictionary like `read_calib(raw=True)`, without checking its numbers.
 
-    Raises as `read_calib` does, but not for NaN and transforms that are not rigid.
+    The errors are as in `read_calib`, except that NaN, large numbers and transforms that are not
+    rigid are accepted.
     """
-    return _loaded(path, read_content(path, "calib", CalibError))
+    content = read_content(path, "calib", CalibError)
+    return _load_file(path, content)
 
 
-def _loaded(path: ReleasePath, content: bytes) -> dict[str, AnyArray]:
-    """Return the arrays in a file's bytes, or raise CalibError."""
+def _load_file(path: ReleasePath, content: bytes) -> RawCalib:
+    """Load the arrays in a file's bytes; raise CalibError if they are damaged or incomplete."""
     try:
         value = load_arrays(content)
     except pickle.UnpicklingError as error:
         detail = str(error) if content else "the file is empty"
         raise CalibError(f"{path}: not a readable calibration ({detail}); {REMEDY}") from error
-    return _checked_raw(path, value)
-
-
-def _checked_raw(path: ReleasePath, value: Any) -> dict[str, AnyArray]:
-    """Return the value of a file if it has all arrays in their shapes, or raise CalibError."""
     if not isinstance(value, dict):
         raise CalibError(
             f"{path}: expected a dict of arrays, found {type(value).__name__}; {REMEDY}"
@@ -196,7 +197,7 @@ def _checked_raw(path: ReleasePath, value: Any) -> dict[str, AnyArray]:
     return value
 
 
-def _stacked(files: Sequence[Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
+def _stack_files(files: Sequence[Mapping[str, AnyArray]]) -> RawCalib:
     """Return the arrays of several files, stacked by key."""
     stacked = {}
     for key, shape in KEYS.items():
@@ -204,14 +205,14 @@ def _stacked(files: Sequence[Mapping[str, AnyArray]]) -> dict[str, AnyArray]:
     return stacked
 
 
-def _converted(paths: Sequence[ReleasePath], arrays: Mapping[str, AnyArray]) -> Calibs:
-    """Check the numbers of all files (N, …) at once and turn them right-handed."""
+def _convert_arrays(paths: Sequence[ReleasePath], arrays: Mapping[str, AnyArray]) -> Calibs:
+    """Check the numbers of N files, and convert them; raise CalibError if one is invalid."""
     poses = np.stack([arrays[key] for key in _POSE_KEYS], axis=1).astype(np.float64)
     intrinsics = np.stack([arrays[key] for key in _INTRINSIC_KEYS], axis=1).astype(np.float64)
-    rigid = _surely_rigid(poses).all(axis=1)
-    finite = in_range(intrinsics).all(axis=(1, 2, 3))
-    for index in np.flatnonzero(~(rigid & finite)).tolist():
-        fault = _first_value_fault(poses[index], intrinsics[index])
+    is_rigid = _find_surely_rigid(poses).all(axis=1)
+    is_finite = in_range(intrinsics).all(axis=(1, 2, 3))
+    for index in np.flatnonzero(~(is_rigid & is_finite)).tolist():
+        fault = _find_first_value_fault(poses[index], intrinsics[index])
         if fault:
             raise CalibError(f"{paths[index]}: {fault}; {REMEDY}")
     ego = conventions.flip_pose(poses[:, :2])
@@ -223,19 +224,21 @@ def _converted(paths: Sequence[ReleasePath], arrays: Mapping[str, AnyArray]) -> 
     )
 
 
-def _surely_rigid(poses: FloatArray) -> BoolArray:
-    """Return which transforms (…, 4, 4) are certainly rigid; the others are checked separately."""
+def _find_surely_rigid(poses: FloatArray) -> BoolArray:
+    """Return which transforms (…, 4, 4) are certainly rigid; the caller checks the others."""
     rotations = poses[..., :3, :3]
     with np.errstate(invalid="ignore", over="ignore"):
         products = rotations @ np.swapaxes(rotations, -1, -2)
         deviations = np.abs(products - np.eye(3)).max(axis=(-1, -2))
-        proper = (deviations < RIGID_TOLERANCE / 2) & (np.linalg.det(rotations) > 0)
-    finite = in_range(poses).all(axis=(-1, -2))
-    return np.asarray(proper & finite & (poses[..., 3, :] == _LAST_ROW).all(axis=-1))
+        is_orthogonal = deviations < RIGID_TOLERANCE / 2
+        is_proper = np.linalg.det(rotations) > 0
+    is_finite = in_range(poses).all(axis=(-1, -2))
+    has_last_row = (poses[..., 3, :] == _LAST_ROW).all(axis=-1)
+    return np.asarray(is_orthogonal & is_proper & is_finite & has_last_row)
 
 
-def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
-    """Return the first fault of a file's numbers, or None."""
+def _find_first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
+    """Return the first fault in a file's numbers, or None."""
     for key, pose in zip(_POSE_KEYS, poses, strict=True):
         fault = rigid_fault(pose)
         if fault:
@@ -243,5 +246,5 @@ def _first_value_fault(poses: FloatArray, intrinsics: FloatArray) -> str | None:
     keys = (*_POSE_KEYS, *_INTRINSIC_KEYS)
     for key, matrix in zip(keys, (*poses, *intrinsics), strict=True):
         if not in_range(matrix).all():
-            return f"{key}: holds NaN or infinity, or a number beyond {LARGEST_NUMBER:.0e}"
+            return f"{key}: contains NaN or infinity, or a number beyond {LARGEST_NUMBER:.0e}"
     return None

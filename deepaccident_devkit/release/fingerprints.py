@@ -32,12 +32,13 @@ if TYPE_CHECKING:
     from deepaccident_devkit.support.parallel import Engine
 
 _Reader: TypeAlias = Callable[[ReleasePath, FileKind], bytes]
-_DIGEST_BYTES: Final = 16
-# Number of LiDAR points in a line of a label.
-_POINTS_PATTERN: Final = re.compile(rb" (\d{1,7})(?= (?:True|False)[ \t\r]*$)", re.MULTILINE)
-_HASHES_WITHOUT_POINTS: Final = attrgetter("meta", "calib", "boxes")
-# The LiDAR points of a scenario's boxes may differ by this root of the sum of squares.
-# docs/benchmark.md has the measurement.
+_DIGEST_BYTES = 16
+# The number of LiDAR points in a line of a label file.
+_POINTS_PATTERN = re.compile(rb" (\d{1,7})(?= (?:True|False)[ \t\r]*$)", re.MULTILINE)
+_HASHES_WITHOUT_POINTS = attrgetter("meta", "calib", "boxes")
+# Largest accepted root of the sum of squared differences between the LiDAR point counts of a
+# scenario's boxes. Without numpy's code for newer processors, one box of 1.4 million had one more
+# point; without Embree, two boxes of 3,417 had.
 POINTS_TOLERANCE: Final = 12.0
 # Remedy for an index that was made from other files.
 INDEX_REMEDY: Final = "update it with: deepaccident check index DATAROOT"
@@ -47,8 +48,9 @@ INDEX_REMEDY: Final = "update it with: deepaccident check index DATAROOT"
 class ScenarioHashes:
     """Hashes of one scenario's files.
 
-    Each is a blake2b of 16 bytes in hexadecimal digits, or None if there is no such file. It covers
-    files by agent (`taxonomy.AGENTS`) and frame, each with its name, its length and its bytes.
+    Each is a 16-byte blake2b hash in hexadecimal digits, or None if there are no files of the kind.
+    It covers the name, length and bytes of each file, in the order of agents (`taxonomy.AGENTS`)
+    and frames.
 
     Attributes:
         label: Hash of all agents' label files.
@@ -65,13 +67,13 @@ class ScenarioHashes:
     points: Sketch = field(default=(), compare=False)
 
     def as_dict(self) -> dict[str, str | None]:
-        """Return the hashes of complete files by name."""
+        """Return kind of file → hash of all files of this kind."""
         return {"label": self.label, "meta": self.meta, "calib": self.calib}
 
     def is_like(self, other: ScenarioHashes | None) -> bool:
-        """Return whether the files are equal, except for the LiDAR points of some boxes.
+        """Return whether the files are equal but for the LiDAR point counts of some boxes.
 
-        The points may differ by `POINTS_TOLERANCE`.
+        The counts may differ by `POINTS_TOLERANCE`.
         """
         if other is None or None in (self.boxes, other.boxes):
             return self == other
@@ -81,7 +83,7 @@ class ScenarioHashes:
 
 
 class Located(Protocol):
-    """An opened release, such as a `Dataset`, with its location and the hashes of its index."""
+    """An opened release, such as a `Dataset`, with its location and its index's hashes."""
 
     @property
     def dataroot(self) -> ReleasePath:
@@ -97,20 +99,20 @@ class Located(Protocol):
 
 @runtime_checkable
 class HasTruth(Protocol):
-    """A source with a ground truth that is not in a release's files."""
+    """A source whose ground truth is not in a release's files."""
 
     def truth_hashes(self, scenario: str) -> ScenarioHashes:
-        """Return the hashes of a scenario's ground truth; raises TokenError."""
+        """Return the hashes of a scenario's ground truth; raise TokenError if it is unknown."""
 
 
 def scenario_hashes(
     dataset: Located, scenarios: Collection[str], **engine: Unpack[Engine]
 ) -> dict[str, ScenarioHashes]:
-    """Return the hashes of some scenarios' files by token, in order.
+    """Return scenario token → hashes of the scenario's files, sorted by token.
 
-    Scenarios that the release lacks are left out. The files are read, and compared with the hashes
-    of the index: the index does not notice a file that was overwritten, so that numbers and hashes
-    would belong to different files.
+    Scenarios that the release lacks are left out. The files are read and compared with the hashes
+    in the index. Opening an index does not notice an overwritten file, so without this check the
+    numbers and the hashes could come from different files.
 
     Args:
         dataset: The release.
@@ -118,10 +120,10 @@ def scenario_hashes(
         **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
 
     Raises:
-        DatarootError: The release's folder no longer exists, or one of its folders cannot be
+        DatarootError: If the release's folder no longer exists, or if one of its folders cannot be
             listed.
-        IndexStoreError: The index was made from other files.
-        ReleaseError: A file cannot be read.
+        IndexStoreError: If the index was made from other files.
+        ReleaseError: If a file cannot be read.
     """
     if isinstance(dataset, HasTruth):
         return {token: dataset.truth_hashes(token) for token in sorted(set(scenarios))}
@@ -136,7 +138,7 @@ def scenario_hashes(
 
 
 def checked_hashes(dataset: Located, scenario: ScenarioFolder) -> ScenarioHashes:
-    """Return the hashes of a scenario's present files; raises as `scenario_hashes`."""
+    """Return the hashes of a scenario's files as they are now, with errors of `scenario_hashes`."""
     hashes = folder_hashes(scenario)
     indexed_hashes = dataset.indexed_hashes(scenario.token)
     if indexed_hashes not in (None, hashes):
@@ -148,22 +150,22 @@ def checked_hashes(dataset: Located, scenario: ScenarioFolder) -> ScenarioHashes
 
 
 def scenario_folders(dataset: Located, scenarios: Collection[str]) -> dict[str, ScenarioFolder]:
-    """Return the folders of some scenarios by token in order, if they are in the release.
+    """Return scenario token → folders, sorted by token, for scenarios in the release.
 
-    Raises DatarootError.
+    DatarootError is raised if the release's folder no longer exists or cannot be listed.
     """
     layout = find_release(dataset.dataroot, dataset.version)
-    # Reversed, so that the first of two folders of a scenario remains.
+    # Reversed, so that the first of a scenario's two folders wins.
     folders = {folder.token: folder for folder in reversed(layout.scenarios)}
     return {token: folders[token] for token in sorted(set(scenarios)) if token in folders}
 
 
-def _read(path: ReleasePath, kind: FileKind) -> bytes:
-    """Return a file's bytes, or raise ReleaseError."""
+def _read_file(path: ReleasePath, kind: FileKind) -> bytes:
+    """Read a file's bytes; raise ReleaseError if it cannot be read."""
     return read_content(path, kind, ReleaseError)
 
 
-def folder_hashes(scenario: ScenarioFolder, read: _Reader = _read) -> ScenarioHashes:
+def folder_hashes(scenario: ScenarioFolder, read: _Reader = _read_file) -> ScenarioHashes:
     """Return the hashes of a scenario's files.
 
     Args:
@@ -171,39 +173,43 @@ def folder_hashes(scenario: ScenarioFolder, read: _Reader = _read) -> ScenarioHa
         read: Function that returns a file's bytes.
 
     Raises:
-        DatarootError: A folder cannot be listed.
-        ReleaseError: A file cannot be read.
+        DatarootError: If a folder cannot be listed.
+        ReleaseError: If a file cannot be read.
     """
 
-    def contents(kind: FileKind, ending: str) -> dict[ReleasePath, bytes]:
+    def read_files(kind: FileKind, ending: str) -> dict[ReleasePath, bytes]:
         paths = []
         for agent in AGENTS:
             frames, _ = frame_numbers(scenario.kind_folder(agent, kind), ending)
             paths += [scenario.file(agent, kind, frame, ending) for frame in frames]
         return {path: read(path, kind) for path in paths}
 
-    labels = contents("label", "txt")
-    counts = []
-    boxes = {}
+    labels = read_files("label", "txt")
+    point_counts = []
+    labels_without_points = {}
     for path, content in labels.items():
-        counts += _POINTS_PATTERN.findall(content)
-        boxes[path] = _POINTS_PATTERN.sub(b"", content)
+        point_counts += _POINTS_PATTERN.findall(content)
+        labels_without_points[path] = _POINTS_PATTERN.sub(b"", content)
     meta_path = scenario.meta_path
     meta = {meta_path: read(meta_path, "meta")} if meta_path.is_file() else {}
     base = scenario.root / scenario.folder / scenario.scenario_type
     return ScenarioHashes(
-        label=_digest(labels, base),
-        meta=_digest(meta, meta_path.parent),
-        calib=_digest(contents("calib", "pkl"), base),
-        boxes=_digest(boxes, base),
-        points=sketch(np.array(counts, dtype=np.float32)),
+        label=_hash_files(labels, base),
+        meta=_hash_files(meta, meta_path.parent),
+        calib=_hash_files(read_files("calib", "pkl"), base),
+        boxes=_hash_files(labels_without_points, base),
+        points=sketch(np.array(point_counts, dtype=np.float32)),
     )
 
 
 def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) -> str:
-    """Return a hash of frames and sizes of sensor files of a scenario's agents and channels.
+    """Return a hash of the frames and sizes of a scenario's sensor files.
 
-    Folders are only listed.
+    Folders are listed; no file is opened.
+
+    Args:
+        scenario: Folders of the files.
+        sensors: Pairs of agent and channel.
     """
     all_sizes = []
     for agent, channel in sensors:
@@ -214,8 +220,9 @@ def sensor_digest(scenario: ScenarioFolder, sensors: Iterable[tuple[str, str]]) 
 
 
 def fingerprint(hashes: Mapping[str, ScenarioHashes]) -> str:
-    """Return one hash for the ground truth of several scenarios, in any order."""
-    return digest_of({token: scenario.as_dict() for token, scenario in hashes.items()})
+    """Return one hash for the ground truth of several scenarios; their order does not matter."""
+    dicts = {token: scenario.as_dict() for token, scenario in hashes.items()}
+    return digest_of(dicts)
 
 
 def digest_of(value: Any) -> str:
@@ -224,8 +231,8 @@ def digest_of(value: Any) -> str:
     return hashlib.blake2b(text.encode(), digest_size=_DIGEST_BYTES).hexdigest()
 
 
-def _digest(contents: Mapping[ReleasePath, bytes], base: ReleasePath) -> str | None:
-    """Return a hash of files with their names below a base folder; None without files."""
+def _hash_files(contents: Mapping[ReleasePath, bytes], base: ReleasePath) -> str | None:
+    """Return a hash of files and their paths relative to `base`; None if there are no files."""
     if not contents:
         return None
     digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
+from deepaccident_devkit.errors import MAX_REASON_LENGTH, SensorFileError, shortened
 from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content, real_path
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.files import write_bytes
-from deepaccident_devkit.support.reading import check_size, fault_text, open_file
+from deepaccident_devkit.support.reading import check_size, open_file, reason_text
 
 JPEG_QUALITY = 90
 # Errors that decoding a damaged image can raise.
@@ -29,43 +29,50 @@ _DECODING_ERRORS = (
     OverflowError,
     zlib.error,
 )
-# Other formats have decoders that start programs.
+# Decoders of other formats may start programs.
 _FORMATS = ("JPEG", "PNG")
 _BYTES_PER_PIXEL = 3
-# Marker in the data of a JPEG.
+# Height and width; for the header of an image, width and height.
+ImageSize: TypeAlias = tuple[int, int]
+# Any marker in a JPEG's data, the marker that starts a scan, and the marker of the end.
 _MARKER_PATTERN = re.compile(rb"\xff[^\x00]", re.DOTALL)
+_SCAN_MARKER = b"\xff\xda"
+_END_MARKER = b"\xff\xd9"
 
 
 def read_image(
     path: ReleasePath,
     *,
     raw: bool = False,
-    min_size: tuple[int, int] | None = None,
-    size: tuple[int, int] | None = None,
+    min_size: ImageSize | None = None,
+    size: ImageSize | None = None,
 ) -> ByteArray:
     """Read an image as RGB, shape (H, W, 3), uint8.
 
     Args:
         path: The file.
-        raw: Whether to return the pixels in the file's own mode, without conversion to RGB: (H, W)
-            for a grey image.
-        min_size: Height and width that suffice: a JPEG is decoded at 1/2, 1/4 or 1/8 of its size
-            (rounded up) if that is no smaller, which takes less time. None decodes the full size.
-        size: Height and width to which the decoded image is resized, by Pillow's bilinear filter;
-            None for no change.
+        raw: Whether to return the pixels in the file's mode, without conversion to RGB: (H, W) for
+            a grey image.
+        min_size: Smallest acceptable height and width: a JPEG is decoded at 1/2, 1/4 or 1/8 of its
+            size (rounded up), which is faster, if the result is at least this large. None decodes
+            the full size.
+        size: Height and width to which the decoded image is resized with Pillow's bilinear filter;
+            None does not resize.
 
     Raises:
-        MissingFileError: There is no such file.
-        SensorFileError: The file is truncated, neither JPEG nor PNG, too large, or no file. (OpenCV
-            returns a half-grey picture for a truncated file.)
+        MissingFileError: If the file does not exist.
+        SensorFileError: If the file is truncated, neither JPEG nor PNG, too large, or not a regular
+            file. (OpenCV returns a half-grey picture for a truncated file.)
     """
-    return decode_image(path, read_image_bytes(path), raw=raw, min_size=min_size, size=size)
+    content = read_image_bytes(path)
+    return decode_image(path, content, raw=raw, min_size=min_size, size=size)
 
 
 def read_image_bytes(path: ReleasePath) -> bytes:
     """Read an image file's bytes.
 
-    Raises MissingFileError, and SensorFileError if it is no file or too large.
+    MissingFileError is raised if it does not exist, SensorFileError if it is too large or not a
+    regular file.
     """
     return read_content(path, "image", SensorFileError)
 
@@ -75,17 +82,23 @@ def decode_image(
     content: bytes,
     *,
     raw: bool = False,
-    min_size: tuple[int, int] | None = None,
-    size: tuple[int, int] | None = None,
+    min_size: ImageSize | None = None,
+    size: ImageSize | None = None,
 ) -> ByteArray:
-    """Decode the image in the bytes of a file, as `read_image` does; the path is for errors."""
+    """Decode the image in a file's bytes, like `read_image`; the path is for error messages."""
     from PIL import Image
 
-    with _opened(path, content, _FORMATS) as image:
+    with _open_picture(path, content, _FORMATS) as image:
         full_width = image.width
-        draft = None if min_size is None else image.draft(None, min_size[::-1])
+        draft = None
+        if min_size is not None:
+            draft = image.draft(None, min_size[::-1])
         if size is None and image.mode == "RGB" and _is_plain_jpeg(content):
-            return _decoded_jpeg(content, round(full_width / draft[1][2]) if draft else 1)
+            scale = 1
+            if draft:
+                _, draft_box = draft  # left, top, width and height
+                scale = round(full_width / draft_box[2])
+            return _decode_jpeg(content, scale)
         image.load()
         picture = image if raw or image.mode == "RGB" else image.convert("RGB")
         if size is not None and picture.size != size[::-1]:
@@ -94,16 +107,19 @@ def decode_image(
 
 
 def _is_plain_jpeg(content: bytes) -> bool:
-    """Return whether the only marker of a JPEG after the first start of a scan is its end.
+    """Return whether a JPEG has one scan, followed only by the end marker.
 
-    For other files, damaged or truncated, OpenCV returns the pixels that it could decode, and
-    raises nothing.
+    If other files are damaged or truncated, OpenCV raises no error and returns the pixels that it
+    could decode.
     """
-    marker = _MARKER_PATTERN.search(content, content.find(b"\xff\xda") + 2)
-    return marker is not None and marker[0] == b"\xff\xd9" and marker.end() == len(content)
+    scan_start = content.find(_SCAN_MARKER) + len(_SCAN_MARKER)
+    marker = _MARKER_PATTERN.search(content, scan_start)
+    if marker is None or marker[0] != _END_MARKER:
+        return False
+    return marker.end() == len(content)
 
 
-def _decoded_jpeg(content: bytes, scale: int) -> ByteArray:
+def _decode_jpeg(content: bytes, scale: int) -> ByteArray:
     """Decode a plain JPEG of three channels at 1/1, 1/2, 1/4 or 1/8 of its size.
 
     The pixels equal Pillow's, without its copies.
@@ -121,25 +137,25 @@ def _decoded_jpeg(content: bytes, scale: int) -> ByteArray:
     return np.asarray(pixels, dtype=np.uint8)
 
 
-def image_size(path: ReleasePath, content: bytes | None = None) -> tuple[int, int]:
-    """Return the width and height in an image's head.
+def image_size(path: ReleasePath, content: bytes | None = None) -> ImageSize:
+    """Return the width and height in an image's header.
 
-    Only the head of a real file is read, unless its bytes are known. Raises SensorFileError, as
-    `read_image` does.
+    Only the header is read from a file on disk, unless `content` is passed. SensorFileError is
+    raised under the same conditions as by `read_image`.
     """
     if content is None and not isinstance(path, Path):
         content = read_image_bytes(path)
-    with _opened(path, content, _FORMATS) as image:
+    with _open_picture(path, content, _FORMATS) as image:
         return image.width, image.height
 
 
-def read_jpeg(path: ReleasePath) -> tuple[bytes, tuple[int, int]]:
-    """Return a JPEG file's bytes, and the width and height in its head.
+def read_jpeg(path: ReleasePath) -> tuple[bytes, ImageSize]:
+    """Read a JPEG file's bytes, and the width and height in its header.
 
-    The picture itself is not decoded. Raises as `read_image` does.
+    The picture itself is not decoded. The errors are as in `read_image`.
     """
     content = read_image_bytes(path)
-    with _opened(path, content, _FORMATS[:1]) as image:
+    with _open_picture(path, content, _FORMATS[:1]) as image:
         return content, image.size
 
 
@@ -149,9 +165,9 @@ def write_image(path: Path, image: ByteArray) -> None:
 
 
 def encode_jpeg(path: ReleasePath, image: ByteArray, quality: int = JPEG_QUALITY) -> bytes:
-    """Return an RGB image (H, W, 3) uint8 as the bytes of a JPEG file.
+    """Encode an RGB image (H, W, 3) uint8 as the bytes of a JPEG file.
 
-    The path is for errors. Raises SensorFileError.
+    SensorFileError, with the path, is raised if the array has another shape or type.
     """
     import cv2
 
@@ -167,9 +183,9 @@ def encode_jpeg(path: ReleasePath, image: ByteArray, quality: int = JPEG_QUALITY
 
 
 def picture_bytes(picture: Any, form: str, **options: Any) -> bytes:
-    """Return a Pillow image as the bytes of a file of a format, such as PNG.
+    """Encode a Pillow image as the bytes of a file in the format `form`, such as PNG.
 
-    The options are Pillow's for that format.
+    The options are Pillow's for the format.
     """
     file = BytesIO()
     picture.save(file, form, **options)
@@ -177,10 +193,12 @@ def picture_bytes(picture: Any, form: str, **options: Any) -> bytes:
 
 
 @contextmanager
-def _opened(path: ReleasePath, content: bytes | None, formats: tuple[str, ...]) -> Iterator[Any]:
-    """Open a Pillow image of a file's bytes, or of a real file if they are None.
+def _open_picture(
+    path: ReleasePath, content: bytes | None, formats: tuple[str, ...]
+) -> Iterator[Any]:
+    """Open a Pillow image from a file's bytes; if they are None, from the file on disk.
 
-    Errors become SensorFileError, also for an image that is too large.
+    Every error becomes a SensorFileError, including the error for an image that is too large.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -194,7 +212,7 @@ def _opened(path: ReleasePath, content: bytes | None, formats: tuple[str, ...]) 
         if isinstance(error, UnidentifiedImageError):
             detail = f"expected {' or '.join(formats)}"
         else:
-            detail = fault_text(error)
+            detail = reason_text(error)
         raise SensorFileError(
-            f"{path}: not a readable image ({shortened(detail, MOST_TOLD)}); {REMEDY}"
+            f"{path}: not a readable image ({shortened(detail, MAX_REASON_LENGTH)}); {REMEDY}"
         ) from error

@@ -1,19 +1,19 @@
 """Label files, and the frames of their velocities.
 
-The release writes `(vx, vy) = Rz(yaw) · v_world`, with the row's own yaw in the agent's LiDAR
-frame. The rule is the same in CARLA's left-handed axes and in the devkit's: mirroring negates both
-the angle and y. The agent's own row has yaw 0, so it reads as the world's.
+The release writes `(vx, vy) = Rz(yaw) · v_world`, where yaw is the yaw of the row in the agent's
+LiDAR frame. The rule is the same in CARLA's left-handed axes and in the devkit's, because mirroring
+negates both the angle and y. The agent's own row has yaw 0, so its velocity is in the world frame.
 
 Files are parsed in bulk: the bodies of many files are joined, and Arrow casts their columns. Files
-that it cannot read (CRLF, blanks at line ends, one-token lines, faults) are normalised, or their
-fault is reported.
+that cannot be parsed like this (CRLF, blanks at line ends, one-token lines) are normalised first;
+faults are reported.
 """
 
 import codecs
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -27,8 +27,8 @@ from deepaccident_devkit.support.arrays import (
     FloatArray,
     IntArray,
     ShortRepr,
+    freeze_arrays,
     in_range,
-    readonly,
 )
 from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import write_bytes
@@ -55,18 +55,21 @@ LABEL_FIELDS = (
 _FINITE_FIELDS = LABEL_FIELDS[1:8]
 _FLOAT_FIELDS = LABEL_FIELDS[1:10]
 _INTEGER_FIELDS = ("id", "num_lidar_pts")
+# Name → values of all lines.
+_Columns: TypeAlias = dict[str, AnyArray]
+# The fields of the first line, the velocity of the recording agent.
 _HEADER = ("speed_x", "speed_y")
 _FILES_PER_CALL = 250
 _MAX_THREADS = 4
-# Length of the longest lines; it limits the number of lines of a file of the largest size.
+# Length of the longest lines, which determines how many lines a file of the largest size has.
 _MAX_BYTES_PER_LINE = 192
-# A fault is searched line by line among this many lines.
+# Number of lines that are searched one by one for a fault.
 _LINES_PER_STEP = 1000
 _REMEDY = "restore the file from its archive, or leave the scenario out with on_error='skip'"
 
 
 def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
-    """Return velocities in the form of a label, shape (N, 2), m/s.
+    """Convert world velocities to label velocities, shape (N, 2), m/s.
 
     Args:
         velocity: Velocities in the world frame, shape (N, 2), m/s.
@@ -77,7 +80,7 @@ def label_from_world_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArr
 
 
 def world_from_label_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArray:
-    """Return velocities in the world frame, shape (N, 2), m/s.
+    """Convert label velocities to world velocities, shape (N, 2), m/s.
 
     This is the inverse of `label_from_world_velocity`; NaN stays NaN.
     """
@@ -85,7 +88,7 @@ def world_from_label_velocity(velocity: FloatArray, yaw: FloatArray) -> FloatArr
 
 
 def turned_vectors(vectors: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return vectors (N, 2) turned by angles (N,), from the first axis to the second."""
+    """Rotate vectors (N, 2) by angles (N,), radians, from the first axis towards the second."""
     cos = np.cos(angle)
     sin = np.sin(angle)
     x = vectors[:, 0]
@@ -97,13 +100,13 @@ def turned_vectors(vectors: FloatArray, angle: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Labels(ShortRepr):
-    """N boxes of F label files, file after file; arrays are read-only.
+    """N boxes from F label files, in the order of the files; arrays are read-only.
 
-    Right-handed (x forward, y left, yaw counter-clockwise) unless read with `raw=True`, then in the
-    files' own axes (y right, yaw clockwise).
+    Values are right-handed (x forward, y left, yaw counter-clockwise). If read with `raw=True`,
+    they keep the files' axes (y right, yaw clockwise).
 
     Attributes:
-        raw: Whether the values are the files' own.
+        raw: Whether the values are left-handed, as in the files.
         num_boxes: Number of boxes of each file, shape (F,), int64.
         agent_velocity: Velocity of the recording agent in the world frame, shape (F, 2), float64,
             m/s; may be NaN.
@@ -111,11 +114,11 @@ class Labels(ShortRepr):
         center: Centre in the agent's LiDAR frame, shape (N, 3), float64, metres.
         size: Full length, width, height, shape (N, 3), float64, metres.
         yaw: Yaw about z in the LiDAR frame, shape (N,), float64, radians.
-        velocity: Velocity as in the label, shape (N, 2), float64, m/s; NaN where the label's is
-            NaN, infinite or beyond 1e9. It is the velocity in the world frame, turned once more by
-            `yaw` (`world_from_label_velocity`).
-        actor_id: Actor id, shape (N,), int64; −100 the recording agent, −1 untracked, from 20000 on
-            parked.
+        velocity: Velocity as in the label, shape (N, 2), float64, m/s; NaN if the label has NaN,
+            infinity or a number beyond 1e9. This is the world velocity rotated by `yaw` (see
+            `world_from_label_velocity`).
+        actor_id: Actor id, shape (N,), int64; −100 for the recording agent, −1 if untracked, 20000
+            and above for parked vehicles.
         num_lidar_pts: Number of LiDAR points, shape (N,), int64.
         camera_visible: Whether a camera sees the box, shape (N,), bool.
     """
@@ -134,17 +137,14 @@ class Labels(ShortRepr):
 
     def __post_init__(self) -> None:
         """Freeze the arrays."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, field.name, readonly(value))
+        freeze_arrays(self)
 
     def __len__(self) -> int:
         """Return the number of boxes."""
         return len(self.center)
 
     def boxes(self) -> Boxes:
-        """Return the boxes in the LiDAR frame, with the label's velocity; always right-handed."""
+        """Return the boxes in the LiDAR frame, always right-handed, with label velocities."""
         center = self.center
         velocity = self.velocity
         yaw = self.yaw
@@ -175,23 +175,25 @@ def read_label(path: ReleasePath, *, raw: bool = False) -> Labels:
 def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
     """Read the boxes of several label files.
 
-    Lines with one token or none are skipped (`read_lone_words` returns them), blanks at line ends
-    and CRLF are accepted, a file with only line 1 is valid.
+    Empty lines and lines with one token are skipped (`read_lone_words` returns the latter). Blanks
+    at line ends and CRLF are accepted. A file with only line 1 is valid.
 
     Args:
         paths: The files.
         raw: Whether to keep CARLA's left-handed values.
 
     Raises:
-        MissingFileError: A file does not exist.
-        LabelError: A file is truncated or too large, or a line has another number of fields, a word
-            instead of a number, an unknown class, NaN, infinity or more than 1e9 in a position,
-            size or yaw; the message names file and line.
+        MissingFileError: If a file does not exist.
+        LabelError: If a file is truncated or too large, or if a line has the wrong number of
+            fields, a word instead of a number, an unknown class, or NaN, infinity or a number
+            beyond 1e9 as a position, size or yaw. The message names file and line.
     """
     starts = range(0, len(paths), _FILES_PER_CALL)
     batches = [paths[start : start + _FILES_PER_CALL] for start in starts]
-    parts = _parse_batches(batches or [[]])
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    parsed_batches = _parse_batches(batches or [[]])
+    columns = {}
+    for name in parsed_batches[0]:
+        columns[name] = np.concatenate([parsed[name] for parsed in parsed_batches])
     if not raw:
         columns["agent_velocity"] = conventions.flip_vectors2(columns["agent_velocity"])
         columns["center"] = conventions.flip_points(columns["center"])
@@ -201,20 +203,21 @@ def read_labels(paths: Sequence[ReleasePath], *, raw: bool = False) -> Labels:
 
 
 def read_lone_words(path: ReleasePath) -> list[tuple[int, str, bool]]:
-    """Return the lines of a label file that are skipped since they have only one word.
+    """Read the lines of a label file that are skipped because they have only one word.
 
-    Raises as `read_label` does, if the file cannot be read.
+    If the file cannot be read, the errors are as in `read_label`.
 
     Returns:
-        Number of the line, word, and whether the file ends within the word.
+        For each such line its number, its word, and whether the file ends within the word.
     """
-    lines = _content(path, ended=False).splitlines(keepends=True)
+    lines = _read_label_bytes(path, ended=False).splitlines(keepends=True)
     lone_words = []
     for number, line in enumerate(lines, start=1):
         words = line.split(maxsplit=1)
         if len(words) == 1:
             word = shortened(words[0].decode(errors="replace"))
-            lone_words.append((number, word, not line.endswith((b"\n", b"\r"))))
+            is_cut_off = not line.endswith((b"\n", b"\r"))
+            lone_words.append((number, word, is_cut_off))
     return lone_words
 
 
@@ -224,17 +227,20 @@ def write_label(path: Path, labels: Labels) -> None:
     The last line has no line end.
 
     Raises:
-        LabelError: `labels` have another number of files than one.
+        LabelError: If `labels` do not come from exactly one file.
     """
     if len(labels.num_boxes) != 1:
         raise LabelError(f"{path}: expected the labels of one file, found {len(labels.num_boxes)}")
-    flip = 1.0 if labels.raw else -1.0
+    if labels.raw:
+        flip = 1.0
+    else:
+        flip = -1.0
     signs = np.array([1, flip, 1, 1, 1, 1, flip, 1, flip])
     values = np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity])
     # Adding 0.0 removes negative zeros.
     numbers = values * signs + 0.0
     speed = labels.agent_velocity[0] * (1.0, flip) + 0.0
-    lines = [_words(speed.tolist())]
+    lines = [_join_numbers(speed.tolist())]
     rows = zip(
         labels.category.tolist(),
         numbers.tolist(),
@@ -244,46 +250,48 @@ def write_label(path: Path, labels: Labels) -> None:
         strict=True,
     )
     for code, row, actor, points, visible in rows:
-        lines.append(f"{CATEGORIES[code]} {_words(row)} {actor} {points} {visible}")
+        lines.append(f"{CATEGORIES[code]} {_join_numbers(row)} {actor} {points} {visible}")
     write_bytes(path, "\n".join(lines).encode("ascii"))
 
 
-def _words(numbers: Iterable[float]) -> str:
-    """Return numbers as words with a blank between them."""
+def _join_numbers(numbers: Iterable[float]) -> str:
+    """Join numbers with blanks."""
     return " ".join(map(repr, numbers))
 
 
-def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[dict[str, AnyArray]]:
-    """Parse every batch; of several batches, this thread reads files while others parse."""
+def _parse_batches(batches: Sequence[Sequence[ReleasePath]]) -> list[_Columns]:
+    """Parse every batch; if there are several, this thread reads files while others parse."""
     if len(batches) < 2:
-        return [_parse_files(batch, [_content(path) for path in batch]) for batch in batches]
+        return [
+            _parse_files(batch, [_read_label_bytes(path) for path in batch]) for batch in batches
+        ]
     from concurrent.futures import ThreadPoolExecutor
 
     # Imported in this thread: pyarrow 25.0.0 crashes after the end of the thread that imports it.
     import pyarrow as pa  # noqa: F401
 
     with ThreadPoolExecutor(min(_MAX_THREADS, usable_cores())) as pool:
-        parts = []
+        futures = []
         for batch in batches:
-            contents = [_content(path) for path in batch]
-            parts.append(pool.submit(_parse_files, batch, contents))
-        return [part.result() for part in parts]
+            contents = [_read_label_bytes(path) for path in batch]
+            futures.append(pool.submit(_parse_files, batch, contents))
+        return [future.result() for future in futures]
 
 
-def _parse_files(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> dict[str, AnyArray]:
-    """Parse files from their bytes, or raise LabelError."""
+def _parse_files(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> _Columns:
+    """Parse files from their bytes; raise LabelError for the first faulty line."""
     columns = _parse_joined(contents)
     if columns is None and not any(b"\0" in content for content in contents):
-        columns = _parse_joined([_normalised(content) for content in contents])
+        columns = _parse_joined([_normalise(content) for content in contents])
     if columns is None or _has_fault(columns):
-        raise _first_fault(paths, contents)
+        raise _find_first_fault(paths, contents)
     return columns
 
 
-def _content(path: ReleasePath, *, ended: bool = True) -> bytes:
-    """Return a file's bytes, with a line end at the end if `ended`.
+def _read_label_bytes(path: ReleasePath, *, ended: bool = True) -> bytes:
+    """Read a file's bytes; if `ended`, add a line end to its last line if it lacks one.
 
-    Raises LabelError if the file has too many lines.
+    LabelError is raised if the file has too many lines.
     """
     content = read_content(path, "label", LabelError, _REMEDY).removeprefix(codecs.BOM_UTF8)
     num_lines = max(content.count(b"\n"), content.count(b"\r"))
@@ -292,13 +300,15 @@ def _content(path: ReleasePath, *, ended: bool = True) -> bytes:
         limit = f"{LIMITS_VARIABLE}=label={_MAX_BYTES_PER_LINE * num_lines}"
         raise LabelError(
             f"{path}: has {num_lines:,} lines, more than {max_lines:,}; "
-            f"if it is sound, set {limit}; {_REMEDY}"
+            f"if the file is correct, set {limit}; {_REMEDY}"
         )
-    return content if content.endswith(b"\n") or not ended else content + b"\n"
+    if ended and not content.endswith(b"\n"):
+        content += b"\n"
+    return content
 
 
-def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
-    """Parse files that end in a line end; return None if they are not normal or hold a fault."""
+def _parse_joined(contents: Sequence[bytes]) -> _Columns | None:
+    """Parse files that end in a line end; return None if their format is unusual or faulty."""
     import pyarrow as pa
 
     headers = []
@@ -312,8 +322,8 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
     if b"x" in body or b"X" in body:  # Arrow reads hexadecimal integers
         return None
     try:
-        header_words = _columns(header, _HEADER)
-        words = _columns(body, LABEL_FIELDS)
+        header_words = _split_columns(header, _HEADER)
+        words = _split_columns(body, LABEL_FIELDS)
         if header_words is None or words is None:
             return None
         num_boxes = np.array([content.count(b"\n") - 1 for content in contents], dtype=np.int64)
@@ -322,64 +332,65 @@ def _parse_joined(contents: Sequence[bytes]) -> dict[str, AnyArray] | None:
         return None
 
 
-def _columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
-    """Return the words of each column, by its name.
+def _split_columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
+    """Return column name → words; None unless each line has one word per name.
 
-    Return None unless each line has as many words, with one blank between them. Arrow's reader of
-    CSV is not used: up to version 19 it writes beyond its memory if a line has too many words
-    (apache/arrow 45497), and it starts a thread for each call.
+    Words must be separated by single blanks. Arrow's CSV reader is not used: up to version 19 it
+    writes out of bounds if a line has too many words (apache/arrow 45497), and it starts a thread
+    for each call.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
 
     characters = np.frombuffer(content, dtype=np.uint8)
-    ends = np.flatnonzero((characters == ord(" ")) | (characters == ord("\n")))
-    numbers = np.arange(len(ends))
+    word_ends = np.flatnonzero((characters == ord(" ")) | (characters == ord("\n")))
+    word_numbers = np.arange(len(word_ends))
     num_columns = len(names)
-    is_line_end = characters[ends] == ord("\n")
-    if not np.array_equal(is_line_end, numbers % num_columns == num_columns - 1):
+    is_line_end = characters[word_ends] == ord("\n")
+    if not np.array_equal(is_line_end, word_numbers % num_columns == num_columns - 1):
         return None
-    buffers = [None, pa.py_buffer(np.append(0, ends + 1)), pa.py_buffer(content)]
-    words = pa.Array.from_buffers(pa.large_binary(), len(ends), buffers).cast(pa.large_string())
+    buffers = [None, pa.py_buffer(np.append(0, word_ends + 1)), pa.py_buffer(content)]
+    words = pa.Array.from_buffers(pa.large_binary(), len(word_ends), buffers).cast(
+        pa.large_string()
+    )
     words = pc.ascii_rtrim(words, characters=" \n")
     columns = {}
     for index, name in enumerate(names):
-        columns[name] = words.take(pa.array(numbers[index::num_columns]))
+        columns[name] = words.take(pa.array(word_numbers[index::num_columns]))
     return columns
 
 
-def _parse_columns(
-    words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray
-) -> dict[str, AnyArray]:
-    """Convert the words of columns; an unknown class is −1.
+def _parse_columns(words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray) -> _Columns:
+    """Convert the words of all columns; an unknown class becomes −1.
 
-    Raises pyarrow.ArrowInvalid for a word of another type.
+    pyarrow.ArrowInvalid is raised if a word does not have the column's type.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    def numbers(columns: dict[str, Any], names: Sequence[str]) -> FloatArray:
-        return np.column_stack([columns[name].cast(pa.float64()).to_numpy() for name in names])
+    def parse_numbers(columns: dict[str, Any], names: Sequence[str]) -> FloatArray:
+        arrays = [columns[name].cast(pa.float64()) for name in names]
+        return np.column_stack([array.to_numpy() for array in arrays])
 
-    def codes(name: str, known_words: Sequence[str]) -> AnyArray:
+    def encode_words(name: str, known_words: Sequence[str]) -> AnyArray:
         value_set = pa.array(known_words, pa.large_string())
         indices = pc.index_in(words[name], value_set=value_set)
         return np.asarray(indices.fill_null(-1), dtype=np.int8)
 
-    velocity = numbers(words, ("vx", "vy"))
+    velocity = parse_numbers(words, ("vx", "vy"))
     velocity[~in_range(velocity)] = np.nan
-    agent_velocity = numbers(header, _HEADER)
+    agent_velocity = parse_numbers(header, _HEADER)
     agent_velocity[~in_range(agent_velocity)] = np.nan
-    visible = codes("camera_visible", ("False", "True"))
+    visible = encode_words("camera_visible", ("False", "True"))
     if (visible < 0).any():
-        raise pa.ArrowInvalid("a boolean is neither False nor True")
+        raise pa.ArrowInvalid("the last field is neither False nor True")
     return {
         "num_boxes": num_boxes,
         "agent_velocity": agent_velocity,
-        "category": codes("class", CATEGORIES),
-        "center": numbers(words, ("x", "y", "z")),
-        "size": numbers(words, ("l", "w", "h")),
-        "yaw": numbers(words, ("yaw",))[:, 0],
+        "category": encode_words("class", CATEGORIES),
+        "center": parse_numbers(words, ("x", "y", "z")),
+        "size": parse_numbers(words, ("l", "w", "h")),
+        "yaw": parse_numbers(words, ("yaw",)).reshape(-1),
         "velocity": velocity,
         "actor_id": words["id"].cast(pa.int64()).to_numpy(),
         "num_lidar_pts": words["num_lidar_pts"].cast(pa.int64()).to_numpy(),
@@ -387,96 +398,107 @@ def _parse_columns(
     }
 
 
-def _has_fault(columns: dict[str, AnyArray]) -> bool:
-    """Return whether a value is out of range, or a class unknown."""
-    all_in_range = all(in_range(columns[name]).all() for name in ("center", "size", "yaw"))
-    return not all_in_range or bool((columns["category"] < 0).any())
+def _has_fault(columns: _Columns) -> bool:
+    """Return whether a value is out of range, or a class is unknown."""
+    for name in ("center", "size", "yaw"):
+        if not in_range(columns[name]).all():
+            return True
+    is_unknown = columns["category"] < 0
+    return bool(is_unknown.any())
 
 
-def _normalised(content: bytes) -> bytes:
-    """Return the same label without blank lines, one-token lines, CRLF and superfluous blanks."""
+def _normalise(content: bytes) -> bytes:
+    """Return a label's bytes without blank lines, one-token lines, CRLF and superfluous blanks."""
     lines = []
     for line in content.splitlines():
-        words = _split(line)
+        words = _split_words(line)
         if len(words) > 1:
             lines.append(b" ".join(words))
     return b"\n".join([*lines, b""]) or b"\n"
 
 
-def _split(line: bytes) -> list[bytes]:
-    """Return the words of a line; superfluous words are one."""
+def _split_words(line: bytes) -> list[bytes]:
+    """Split a line into words; all superfluous words together are the last one."""
     return line.split(maxsplit=len(LABEL_FIELDS))
 
 
-def _first_fault(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> LabelError:
+def _find_first_fault(paths: Sequence[ReleasePath], contents: Sequence[bytes]) -> LabelError:
     """Return the error of the first wrong line."""
     for path, content in zip(paths, contents, strict=True):
-        faulty_line = _faulty_line(content)
+        faulty_line = _find_faulty_line(content)
         if faulty_line is not None:
             number, fault = faulty_line
             return LabelError(f"{path}:{number}: {fault}; {_REMEDY}")
-    odd_paths = []
+    odd_path = paths[0]
     for path, content in zip(paths, contents, strict=True):
-        if _parse_joined([_normalised(content)]) is None:
-            odd_paths.append(path)
-    path = (odd_paths or paths)[0]
-    return LabelError(f"{path}: cannot be parsed, though each line looks right; {_REMEDY}")
+        if _parse_joined([_normalise(content)]) is None:
+            odd_path = path
+            break
+    return LabelError(f"{odd_path}: cannot be parsed, though each line looks right; {_REMEDY}")
 
 
-def _faulty_line(content: bytes) -> tuple[int, str] | None:
+def _find_faulty_line(content: bytes) -> tuple[int, str] | None:
     """Return the number and the fault of the first wrong line; None if there is none."""
     has_header = False
-    for number, line in _suspicious_lines(content.splitlines()):
+    for number, line in _find_suspicious_lines(content.splitlines()):
         if b"\0" in line:
-            return number, "holds zero bytes, as a full disk leaves them"
-        words = [word.decode("utf-8", errors="replace") for word in _split(line)]
+            return number, "contains zero bytes, as happens when a disk is full"
+        words = [word.decode("utf-8", errors="replace") for word in _split_words(line)]
         if len(words) < 2:
             continue
-        fault = _line_fault(words) if has_header else _header_fault(words)
+        fault = _find_line_fault(words) if has_header else _find_header_fault(words)
         if fault:
             return number, fault
         has_header = True
-    return None if has_header else (1, "expected '<speed_x> <speed_y>', found an empty file")
+    if not has_header:
+        return 1, "expected '<speed_x> <speed_y>', found an empty file"
+    return None
 
 
-def _suspicious_lines(lines: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Yield lines and their numbers, without blocks that are parsed in bulk and hold no fault.
+def _find_suspicious_lines(lines: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Yield numbered lines, leaving out blocks in which bulk parsing finds no fault.
 
-    The first block is always yielded.
+    The lines of the first block are always yielded.
     """
     for start in range(0, len(lines), _LINES_PER_STEP):
         block = lines[start : start + _LINES_PER_STEP]
         joined = b"\n".join(block)
         columns = None
         if start and b"\0" not in joined:
-            columns = _parse_joined([b"0 0\n" + _normalised(joined)])
+            columns = _parse_joined([b"0 0\n" + _normalise(joined)])
         if columns is None or _has_fault(columns):
             yield from enumerate(block, start=start + 1)
 
 
-def _header_fault(words: Sequence[str]) -> str | None:
-    """Return the fault of the first line, or None."""
+def _find_header_fault(words: Sequence[str]) -> str | None:
+    """Describe the fault in the fields of the first line; return None if they are valid."""
     if len(words) != len(_HEADER):
-        return f"expected '<speed_x> <speed_y>', found {_counted(words)} fields: {_quoted(words)}"
+        return (
+            f"expected '<speed_x> <speed_y>', found {_count_words(words)} fields: "
+            f"{_quote_words(words)}"
+        )
     for word in words:
         if number_of(word) is None:
-            return f"{shortened(word)!r} is no number"
+            return f"{shortened(word)!r} is not a number"
     return None
 
 
-def _line_fault(words: Sequence[str]) -> str | None:
-    """Return the fault of a box's line, or None."""
+def _find_line_fault(words: Sequence[str]) -> str | None:
+    """Describe the fault in the fields of a box's line; return None if they are valid."""
     if len(words) != len(LABEL_FIELDS):
-        return f"expected {len(LABEL_FIELDS)} fields, found {_counted(words)}: {_quoted(words)}"
+        return (
+            f"expected {len(LABEL_FIELDS)} fields, found {_count_words(words)}: "
+            f"{_quote_words(words)}"
+        )
     for name, word in zip(LABEL_FIELDS, words, strict=True):
-        fault = _field_fault(name, word)
+        fault = _find_field_fault(name, word)
         if fault:
             return fault
     return None
 
 
-def _field_fault(name: str, word: str) -> str | None:
-    """Return the fault of a field, or None."""
+def _find_field_fault(name: str, word: str) -> str | None:
+    """Describe the fault in the word of a field; return None if it is valid."""
     expected = None
     if name == "class" and word not in CATEGORIES:
         expected = f"one of {', '.join(CATEGORIES)}"
@@ -493,11 +515,13 @@ def _field_fault(name: str, word: str) -> str | None:
     return expected and f"{name} is {shortened(word)!r}, expected {expected}"
 
 
-def _counted(words: Sequence[str]) -> str:
-    """Return the number of words for messages."""
-    return str(len(words)) if len(words) <= len(LABEL_FIELDS) else f"more than {len(LABEL_FIELDS)}"
+def _count_words(words: Sequence[str]) -> str:
+    """Return the number of words for a message."""
+    if len(words) <= len(LABEL_FIELDS):
+        return str(len(words))
+    return f"more than {len(LABEL_FIELDS)}"
 
 
-def _quoted(words: Sequence[str]) -> str:
-    """Return words as a short quotation."""
+def _quote_words(words: Sequence[str]) -> str:
+    """Return the words of a line as a short quotation."""
     return repr(shortened(" ".join(words)))

@@ -9,7 +9,7 @@ from typing import Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepaccident_devkit.errors import MOST_TOLD, SensorFileError, shortened
+from deepaccident_devkit.errors import MAX_REASON_LENGTH, SensorFileError, shortened
 from deepaccident_devkit.geometry import LidarPointCloud
 from deepaccident_devkit.geometry.conventions import flip_points
 from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content
@@ -18,17 +18,17 @@ from deepaccident_devkit.support.arrays import (
     ByteArray,
     ShortRepr,
     checked,
+    freeze_arrays,
     in_range,
-    readonly,
 )
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import (
     DAMAGED_ARCHIVE,
     FileKind,
     array_of,
-    fault_text,
     open_zip,
     read_member,
+    reason_text,
 )
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
@@ -39,40 +39,43 @@ _NPY_SIGNATURE = b"\x93NUMPY"
 _COMPRESSION_LEVEL = 1
 """Level of zlib's compression.
 
-A BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30 ms, for a quarter of the
-size. Half the bytes of a cloud's numbers are zeros, since they have single precision; a higher
-level saves little more.
+Compressing a BEV array of 4.3 MB takes 10 ms; zlib's default level takes 20 to 30 ms, for a quarter
+of the size. Half of a cloud's bytes are zeros, because its numbers have single precision; a higher
+level saves little.
 """
 # CARLA's semantic tags that the reference renderer uses.
 TAGS: dict[str, int] = {"pedestrian": 4, "road_line": 6, "road": 7, "sidewalk": 8, "vehicle": 10}
 
 
 def read_npz(path: ReleasePath, kind: FileKind) -> AnyArray:
-    """Return the array of numbers under `data`, or the only array in the file.
+    """Read the numeric array named `data`, or the only array in the file.
 
-    Raises MissingFileError and SensorFileError.
+    MissingFileError is raised if the file does not exist, SensorFileError if it cannot be read.
     """
     content = read_content(path, kind, SensorFileError)
     try:
         with open_zip(content) as archive:
-            return array_of(read_member(archive, _array_member(path, archive), kind), kind)
+            member = _find_array_member(path, archive)
+            return array_of(read_member(archive, member, kind), kind)
+    except SensorFileError:
+        raise
     except DAMAGED_ARCHIVE as error:
-        if isinstance(error, SensorFileError):
-            raise
         if content.startswith(_NPY_SIGNATURE):
             fault = "expected an npz archive, found a bare array"
         else:
-            fault = f"not a readable npz archive ({shortened(fault_text(error), MOST_TOLD)})"
+            fault = (
+                f"not a readable npz archive ({shortened(reason_text(error), MAX_REASON_LENGTH)})"
+            )
         raise SensorFileError(f"{path}: {fault}; {REMEDY}") from error
 
 
 def write_npz(path: Path, array: AnyArray, *, level: int = _COMPRESSION_LEVEL) -> None:
-    """Write `array` under `data`; the same array gives the same bytes.
+    """Write an array named `data`; equal arrays always produce equal bytes.
 
     Args:
         path: The file.
         array: The array.
-        level: Level of zlib's compression, 0 to 9.
+        level: zlib's compression level, 0 to 9.
     """
     member = io.BytesIO()
     np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
@@ -83,14 +86,13 @@ def write_npz(path: Path, array: AnyArray, *, level: int = _COMPRESSION_LEVEL) -
     write_bytes(path, archive.getvalue())
 
 
-def _array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
-    """Return the entry of the array under `data`, or of the only array; raises SensorFileError."""
+def _find_array_member(path: ReleasePath, archive: zipfile.ZipFile) -> zipfile.ZipInfo:
+    """Return the entry of `data`, or of the only array; raise SensorFileError without one."""
     entries = [entry for entry in archive.infolist() if entry.filename.endswith(_NPY_SUFFIX)]
     candidates = [entry for entry in entries if entry.filename == f"{KEY}{_NPY_SUFFIX}"] or entries
     if len(candidates) != 1:
-        names = (
-            ", ".join(entry.filename.removesuffix(_NPY_SUFFIX) for entry in entries) or "no array"
-        )
+        array_names = [entry.filename.removesuffix(_NPY_SUFFIX) for entry in entries]
+        names = ", ".join(array_names) or "no array"
         raise SensorFileError(
             f"{path}: expected an array named '{KEY}', found {shortened(names)}; {REMEDY}"
         )
@@ -102,18 +104,18 @@ def read_lidar(path: ReleasePath, *, raw: Literal[False] = False) -> LidarPointC
 @overload
 def read_lidar(path: ReleasePath, *, raw: Literal[True]) -> AnyArray: ...
 def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | AnyArray:
-    """Return a point cloud in its LiDAR frame, right-handed, metres.
+    """Read a point cloud in its LiDAR frame, right-handed, metres.
 
-    NaN where the file has infinity or a number beyond 1e9.
+    Infinite numbers and numbers beyond 1e9 become NaN.
 
     Args:
         path: The file.
-        raw: Whether to return the file's own array (N, 4): x, y **right**, z, intensity, in the
-            file's float type.
+        raw: Whether to return the file's array unchanged, (N, 4): x, y **right**, z, intensity, in
+            the file's float type.
 
     Raises:
-        MissingFileError: There is no such file.
-        SensorFileError: The archive cannot be read or its array is not (N, 4) of floats.
+        MissingFileError: If the file does not exist.
+        SensorFileError: If the archive cannot be read, or if its array is not (N, 4) of floats.
     """
     data = read_npz(path, "lidar")
     if data.ndim != 2 or data.shape[1] != 4 or data.dtype.kind != "f":
@@ -124,25 +126,28 @@ def read_lidar(path: ReleasePath, *, raw: bool = False) -> LidarPointCloud | Any
     if raw:
         return data
     data = np.where(in_range(data), data, np.nan)
-    return LidarPointCloud(flip_points(data[:, :3]), data[:, 3].astype(np.float32), "lidar")
+    points = flip_points(data[:, :3])
+    intensity = data[:, 3].astype(np.float32)
+    return LidarPointCloud(points, intensity, "lidar")
 
 
 def write_lidar(path: Path, xyz: ArrayLike, intensity: ArrayLike) -> None:
-    """Write points (N, 3) of the right-handed LiDAR frame, metres, and their intensity (N,).
+    """Write points (N, 3) in the right-handed LiDAR frame, metres, and intensities (N,).
 
-    As in the release, numbers have single precision and are stored as float64.
+    As in the release, numbers are rounded to single precision and stored as float64.
     """
     points = flip_points(checked("xyz", xyz, (None, 3)))
-    values = checked("intensity", intensity, (len(points),))
-    write_npz(path, np.column_stack([points, values]).astype(np.float32).astype(np.float64))
+    intensities = checked("intensity", intensity, (len(points),))
+    data = np.column_stack([points, intensities]).astype(np.float32)
+    write_npz(path, data.astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BevImage(ShortRepr):
-    """Image of a BEV camera above an agent; forward is up and left is left, as stored.
+    """Image of the BEV camera above an agent, as stored: forward is up, and left is left.
 
-    A point x forward, y left of the agent, metres, is at row 599.5 − x / resolution, column 599.5 −
-    y / resolution.
+    A point (x forward, y left of the agent, metres) is at row 599.5 − x / resolution and at column
+    599.5 − y / resolution.
 
     Attributes:
         semantic: CARLA's semantic tags (`TAGS`), shape (1200, 1200), uint8, read-only.
@@ -157,8 +162,7 @@ class BevImage(ShortRepr):
 
     def __post_init__(self) -> None:
         """Freeze the arrays."""
-        object.__setattr__(self, "semantic", readonly(self.semantic))
-        object.__setattr__(self, "instance", readonly(self.instance))
+        freeze_arrays(self)
 
 
 @overload
@@ -166,16 +170,16 @@ def read_bev(path: ReleasePath, *, raw: Literal[False] = False) -> BevImage: ...
 @overload
 def read_bev(path: ReleasePath, *, raw: Literal[True]) -> ByteArray: ...
 def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
-    """Return the image of a BEV camera.
+    """Read the image of a BEV camera.
 
     Args:
         path: The file.
-        raw: Whether to return the file's own array, shape (1200, 1200, 3), uint8; channel 2 is the
-            tag, 1 and 0 the id's low and high byte.
+        raw: Whether to return the file's array unchanged, shape (1200, 1200, 3), uint8; channel 2
+            is the tag, channels 1 and 0 are the low and the high byte of the id.
 
     Raises:
-        MissingFileError: There is no such file.
-        SensorFileError: The archive cannot be read or its array has another shape or type.
+        MissingFileError: If the file does not exist.
+        SensorFileError: If the archive cannot be read, or if its array has another shape or type.
     """
     data = read_npz(path, "bev")
     if data.shape != (*BEV_SHAPE, 3) or data.dtype != np.uint8:
@@ -185,8 +189,9 @@ def read_bev(path: ReleasePath, *, raw: bool = False) -> BevImage | ByteArray:
         )
     if raw:
         return data
-    instance = data[..., 1] + data[..., 0].astype(np.uint16) * 256
-    return BevImage(data[..., 2].copy(), instance)
+    high_byte = data[..., 0].astype(np.uint16)
+    low_byte = data[..., 1]
+    return BevImage(semantic=data[..., 2].copy(), instance=low_byte + high_byte * 256)
 
 
 def write_bev(
@@ -199,7 +204,7 @@ def write_bev(
     """Write tags and object ids, both (1200, 1200), forward up; `level` is as in `write_npz`."""
     import cv2
 
-    high = (instance >> 8).astype(np.uint8)
-    low = instance.astype(np.uint8)
-    channels = cv2.merge([high, low, np.ascontiguousarray(semantic)])
+    high_byte = (instance >> 8).astype(np.uint8)
+    low_byte = instance.astype(np.uint8)
+    channels = cv2.merge([high_byte, low_byte, np.ascontiguousarray(semantic)])
     write_npz(path, np.asarray(channels), level=level)

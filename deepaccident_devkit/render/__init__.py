@@ -1,6 +1,6 @@
 """All pictures.
 
-The function of a panel takes `ax=` and returns the Axes; nothing here opens a window.
+Functions that render one panel take `ax=` and return the Axes; none of them opens a window.
 """
 
 from typing import TYPE_CHECKING

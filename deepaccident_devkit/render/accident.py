@@ -1,4 +1,4 @@
-"""The countdown to an impact: a figure of several moments, and a video's picture of one moment."""
+"""The countdown to an impact: a figure of several moments, and a video picture of one moment."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from deepaccident_devkit.render.boxes import (
     draw_boxes_in_image,
     draw_trails,
     in_drawing_order,
+    recorders_of,
     role_colors,
 )
 from deepaccident_devkit.render.camera import (
@@ -32,9 +33,10 @@ from deepaccident_devkit.render.captions import has_sensor_file, set_scene_title
 from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.figures import (
     Layer,
+    Layers,
     figure_or_new,
+    lay_out_figure,
     layers_of,
-    settled,
     show_square,
     with_light_grid,
 )
@@ -61,42 +63,44 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PAIR_LAYERS: Final[tuple[Layer, ...]] = (*CAMERA_LAYERS, "bev", "trajectories", "grid")
-_DEFAULT_LAYERS: Final[tuple[Layer, ...]] = ("image", "bev", "boxes", "trajectories", "grid")
+PAIR_LAYERS: Final[Layers] = (*CAMERA_LAYERS, "bev", "trajectories", "grid")
+_DEFAULT_LAYERS: Layers = ("image", "bev", "boxes", "trajectories", "grid")
 # Frames for which the last camera that saw the pair stays selected.
-_CAMERA_MEMORY_FRAMES: Final = 10
-# Metres shown around the point of contact.
-_MIN_VIEW_RANGE_M, _MAX_VIEW_RANGE_M = 9.0, 24.0
-# Metres around the pair.
-_PAIR_MARGIN_M: Final = 2.5
-# Seconds of the paths that led to the contact.
-_PAST_S: Final = 3.0
-# Least share of an image's width: the viewer must still recognise the surroundings.
-_MIN_CROP_SHARE: Final = 0.4
-# Points: size of the cross at the point of contact.
-_CROSS_SIZE_PT: Final = 9.0
-# Share of a panel's width and height between the positions of tags and its edges.
-_EDGE_SHARE: Final = 0.01
-# Points at the top of an image, about, in which tags may cover a car: it may fill the image.
-_TAG_HEIGHT_PT: Final = 22.0
-_HIDDEN_LINE_STYLE: Final = (0, (3, 2))
-# Seconds before the impact.
+_CAMERA_MEMORY_FRAMES = 10
+# Minimum and maximum number of metres shown around the point of contact.
+_MIN_VIEW_RANGE_M = 9.0
+_MAX_VIEW_RANGE_M = 24.0
+# Metres shown around the pair.
+_PAIR_MARGIN_M = 2.5
+# How many seconds of the pair's paths are shown.
+_PAST_S = 3.0
+# Minimum share of an image's width: the viewer must still recognise the surroundings.
+_MIN_CROP_SHARE = 0.4
+# Size of the cross at the point of contact, in points.
+_CROSS_SIZE_PT = 9.0
+# Distance of tags from a panel's edges, as a share of its width and height.
+_EDGE_SHARE = 0.01
+# Height of the strip at the top of an image, in points, where tags may cover a box that fills it.
+_TAG_HEIGHT_PT = 22.0
+_HIDDEN_LINE_STYLE = (0, (3, 2))
+# The default moments, in seconds before the impact.
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
-_COLUMN_COUNTDOWN: Final = (1.0, 0.0)
-_PANEL_WIDTH_IN: Final = 3.3
-# Inches of a camera's panel below which agents are left out.
-_MIN_PANEL_WIDTH_IN: Final = 1.6
-# Letters of a line that fits above a panel of a small picture.
-_MAX_TITLE_LETTERS: Final = 16
-# Inches of words above a row, for letters of one point.
-_ROW_WORDS_HEIGHT_IN: Final = 0.03
-# Share of a small picture that panels should cover, by the estimate of `_panel_width`.
-_MIN_COVERED_SHARE: Final = 0.6
-# Inches of the height that titles take, about.
-_TITLE_HEIGHT_IN: Final = 1.0
+_COLUMN_COUNTDOWN = (1.0, 0.0)
+_PANEL_WIDTH_IN = 3.3
+# Minimum width of a camera's panel in inches; agents are left out until panels are this wide.
+_MIN_PANEL_WIDTH_IN = 1.6
+# Number of letters in a line that fits above a panel of a small picture.
+_MAX_TITLE_LETTERS = 16
+# Height of the words above a row in inches, per point of letter size.
+_ROW_WORDS_HEIGHT_IN = 0.03
+# Minimum share of a small picture that panels should cover, as estimated by `_panel_width`.
+_MIN_COVERED_SHARE = 0.6
+# Approximate height of titles, in inches, and of the two lines in a paper's column.
+_TITLE_HEIGHT_IN = 1.0
+_COLUMN_TITLE_HEIGHT_IN = 0.5
 # The panels of a video's picture.
-_MOSAIC: Final[list[Any]] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
-_LINE_STYLES: Final = ("-", "--")
+_MOSAIC: list[Any] = [[*AGENTS[:3]], ["above", *AGENTS[3:]], ["above", "speeds", "speeds"]]
+_LINE_STYLES = ("-", "--")
 
 
 @in_own_settings
@@ -111,55 +115,59 @@ def render_accident(
 ) -> Figure:
     """Render the countdown to an accident, in the agents' cameras and from above.
 
-    There is a column for each moment, a row for each agent, and one from above; in a wide figure
-    rows are columns. Each agent has the part of an image that shows the colliding pair best, of its
-    downloaded images; without any, a grey panel. If no camera shows the pair, it is the last one
-    that did, or the front one. The pair's boxes are dashed where the agent's label states that no
-    camera sees them. The view from above has the point of contact (a cross), the pair's speeds, and
-    the pair's paths up to the contact; its bar shows the scale. `E` is the ego vehicle, `O` the
-    other one.
+    There is a column for each moment, a row for each agent, and a row for the view from above; in
+    a wide figure, rows and columns are swapped. Each agent's panel shows the part of a downloaded
+    image that shows the colliding pair best; without downloaded images, the panel is grey. If no
+    camera shows the pair, the panel shows the last camera that did, otherwise the front camera.
+    The pair's boxes are dashed where, by the agent's label, none of its cameras sees them.
+    The view from above shows the point of contact (a cross), the pair's speeds, the pair's paths up
+    to the contact, and a scale bar. `E` is the ego vehicle, `O` the other one.
 
     Args:
         dataset: The release.
         scenario: Token or record of a scenario with a collision.
-        seconds: Seconds before the recording's last frame, which the impact is near; moments before
-            the first frame are left out. None stands for `COUNTDOWN`, or in a paper's column for
-            one second before the impact and the impact.
-        agents: Agents with images in the figure; an empty list for none. None stands for all
-            present agents or, where their images would be narrower than 1.6 inches, as on a slide,
-            for the ego and the agents that see the pair best; the title then states their number.
-        layers: `image`, `bev` (the road), `boxes`, `trajectories` and `grid` are the default; also
-            `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image` no image
-            file is read.
+        seconds: Moments to show, in seconds before the recording's last frame, which is close to
+            the impact. Moments before the first frame are left out. None means `COUNTDOWN`; in a
+            paper's column, it means the impact and one second before it.
+        agents: Agents whose images the figure shows; an empty list shows none. None means all
+            present agents. If their images would be narrower than 1.6 inches, as on a slide, it
+            means the ego and the agents that see the pair best; the title then states their number.
+        layers: Any of `image`, `bev` (the road), `boxes`, `trajectories`, `grid` (these are the
+            default), `points` (of the LiDAR, in images), `ids` and `velocities`. Without `image`,
+            no image file is read.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
-        The figure; its title states which actor hits which, how fast and at which angle, and
-        whether the recording ends before the pair are near enough to touch.
+        The figure. Its title states which actor hits which, how fast and at which angle, and
+        whether the recording ends before the pair is close enough to touch. In a paper's column,
+        speeds, angle, actor ids and the number of agents are left to the caption.
 
     Raises:
         TokenError: No such scenario.
-        NotAvailableError: Nobody collides in it (the nearest approach of a normal scenario is no
-            accident), it has no meta, or an agent is not in this release.
+        NotAvailableError: The scenario has no collision (the closest approach of a normal scenario
+            is no accident) or no meta, or an agent is not in this release.
         ChoiceError: No such agent, configuration or layer, or none of the moments was recorded.
     """
     shown_layers = layers_of(layers, _DEFAULT_LAYERS, PAIR_LAYERS)
-    contact = _contact(dataset, scenario, "look at moments of this one with render_frame")
+    contact = _contact(dataset, scenario, "show moments of this scenario with render_frame")
     record = dataset.get("scenario", scenario)
     frames = record["num_frames"]
     cut_words = _cut_words(contact, frames)
+    is_column = current_style().layout == "column"
     default_seconds: Sequence[float] = COUNTDOWN
-    if current_style().room == "column":
+    if is_column:
         default_seconds = _COLUMN_COUNTDOWN
     moments = _moments(seconds or default_seconds, frames)
     names = _agent_names(dataset, record, agents)
     size = (_PANEL_WIDTH_IN * len(moments) + 0.8, 1.95 * len(names) + _PANEL_WIDTH_IN + 1.1)
-    fig = figure_or_new(fig, size, column=1.45)
-    pair, selection_words = CollidingPair.of(dataset, contact), ""
+    fig = figure_or_new(fig, size, column=1.5)
+    pair = CollidingPair.of(dataset, contact)
+    selection_words = ""
     if agents is None:
         count = _fitting_agents(fig, len(names), len(moments))
         if count < len(names):
-            selection_words = f"{count} of {len(names)} agents"
+            if not is_column:
+                selection_words = f"{count} of {len(names)} agents shown"
             names = _best_agents(pair, names, [frame for _, frame in moments], count)
     axes, is_wide = _panels(fig, len(names), len(moments))
     last_word = "the last frame" if cut_words or contact.touching else "the impact"
@@ -172,12 +180,14 @@ def render_accident(
         _write_head(head, "black", axes[0, column], above=not is_wide)
     for agent, ax in zip(names, axes[:, 0], strict=False):
         _write_head(short_name(agent), AGENT_COLORS[agent], ax, above=is_wide)
-    head = "from above,\nspeeds in m/s" if current_style().few else "from above"
+    head = "from above,\nspeeds in m/s" if current_style().shows_few_panels else "from above"
     _write_head(head, "black", axes[-1, 0], above=is_wide)
-    lines = [accident_words(dataset, contact), cut_words]
-    words = "\n".join(line for line in lines if line)
+    contact_text = accident_words(dataset, contact)
+    if is_column:
+        contact_text = _roles_and_sides(dataset, contact, with_ids=False)
+    words = "\n".join(filter(None, [contact_text, cut_words]))
     set_scene_title(fig, dataset, record["token"], selection_words, below=words)
-    return settled(fig)
+    return lay_out_figure(fig)
 
 
 def _agent_names(dataset: Dataset, record: Any, agents: Agents) -> list[str]:
@@ -198,11 +208,11 @@ def draw_countdown(
 ) -> None:
     """Render a moment of an accident: five cameras, the contact from above, the pair's speeds.
 
-    The figure is an empty one of about 16 to 9. Cameras are selected and layers named as in
-    `render_accident`.
+    The figure must be empty, with an aspect ratio of about 16:9. Cameras are selected and layers
+    named as in `render_accident`.
 
     Raises:
-        NotAvailableError: Nobody collides.
+        NotAvailableError: The scenario has no collision.
     """
     shown_layers = layers_of(layers, _DEFAULT_LAYERS, PAIR_LAYERS)
     record = dataset.get("frame", frame)
@@ -227,40 +237,46 @@ def draw_countdown(
 
 
 def accident_words(dataset: Dataset, contact: Contact) -> str:
-    """Return two lines on a contact: its actors and sides, and its speeds and angle.
+    """Describe a contact in lines: its actors and the sides that touch, then its speeds and angle.
 
-    The time follows if the contact is not at the last frame.
+    If the contact is not at the last frame, a third line gives its time.
     """
+    hitting, hit = _hitting_and_hit(contact)
+    speeds = f"{number_words(contact.speeds[hitting])} and {number_words(contact.speeds[hit])} m/s"
+    closing_speed = f"closing at {number_words(contact.closing_speed)} m/s"
+    angle = f"{np.degrees(contact.impact_angle):.0f}° between their headings"
+    lines = [_roles_and_sides(dataset, contact), f"{speeds}, {closing_speed}, {angle}"]
+    if contact.touching != 0:
+        lines.append(contact_words(contact.touching, contact.gap))
+    return "\n".join(lines)
+
+
+def _hitting_and_hit(contact: Contact) -> tuple[int, int]:
+    """Return the indices of the actor that hits with its front, if only one does, and the other."""
+    if contact.sides[1] == "front" and contact.sides[0] != "front":
+        return 1, 0
+    return 0, 1
+
+
+def _roles_and_sides(dataset: Dataset, contact: Contact, *, with_ids: bool = True) -> str:
+    """Describe who hits whom, and the sides that touch; agents may be named without their ids."""
     scenario = contact.frame.rsplit("/", 1)[0]
-    agent_names = {}
-    for agent in agents_of(dataset, scenario):
-        actor = dataset.agent.get(f"{scenario}/{agent}")["actor_id"]
-        agent_names[actor] = short_name(agent)
+    agents = recorders_of(dataset, scenario)
     names = []
     for instance, actor in zip(contact.instances, contact.actor_ids, strict=True):
         name = f"{dataset.instance.get(instance)['category']} {actor}"
-        if actor in agent_names:
-            name = f"{agent_names[actor]} ({name})"
+        if actor in agents:
+            role = short_name(agents[actor])
+            name = f"{role} ({name})" if with_ids else role
         names.append(name)
-    hitting, hit = 0, 1
-    if contact.sides[1] == "front" and contact.sides[0] != "front":
-        hitting, hit = 1, 0
+    hitting, hit = _hitting_and_hit(contact)
     if contact.apart:
         verb = "and"
     elif contact.sides[hitting] == "front":
         verb = "hits"
     else:
         verb = "touches"
-    speeds = f"{number_words(contact.speeds[hitting])} and {number_words(contact.speeds[hit])} m/s"
-    closing_speed = f"closing at {number_words(contact.closing_speed)} m/s"
-    angle = f"{np.degrees(contact.impact_angle):.0f}° between their headings"
-    lines = [
-        f"{names[hitting]} {verb} {names[hit]}, {contact.sides[hitting]} to {contact.sides[hit]}",
-        f"{speeds}, {closing_speed}, {angle}",
-    ]
-    if contact.touching != 0:
-        lines.append(contact_words(contact.touching, contact.gap))
-    return "\n".join(lines)
+    return f"{names[hitting]} {verb} {names[hit]}, {contact.sides[hitting]} to {contact.sides[hit]}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -269,10 +285,10 @@ class CollidingPair:
 
     Attributes:
         dataset: The release.
-        scenario: Token.
+        scenario: Token of the scenario.
         contact: How they collide.
         tracks: Boxes of all actors of the scenario.
-        tags: Actor id → short name of the two.
+        tags: Short name of each of the two, by actor id.
     """
 
     dataset: Dataset
@@ -283,7 +299,7 @@ class CollidingPair:
 
     @classmethod
     def of(cls, dataset: Dataset, contact: Contact) -> CollidingPair:
-        """Return the pair of a contact."""
+        """Load the pair that collides in a contact."""
         scenario = contact.frame.rsplit("/", 1)[0]
         tracks = scenario_tracks(dataset, scenario)
         return cls(
@@ -295,9 +311,9 @@ class CollidingPair:
         )
 
     def at(self, index: int, seen_by: str | None = None) -> Boxes:
-        """Return the pair's existing boxes in world in a frame (number from 1).
+        """Return the pair's boxes in a frame (numbered from 1), in the world frame.
 
-        The agent that sees them is left out.
+        An actor without a box in the frame is left out, and so is the agent named by `seen_by`.
         """
         boxes = self.tracks.at(index)
         own_actor = None
@@ -307,11 +323,15 @@ class CollidingPair:
         return boxes.select(np.isin(boxes.actor_id, actors))
 
     def view(self, agent: str, index: int) -> tuple[str, BestView | None, int | None]:
-        """Return the camera of an agent that shows the pair best in a frame, and its view.
+        """Select the camera of an agent that shows the pair best in a frame (numbered from 1).
 
-        The third value is the last frame in which it had the pair. Cameras with present images come
-        first. If none has the pair in its image, it is the last one that had, and otherwise the
-        front camera; then there is no view.
+        If any images are present, only their cameras count. If no image shows the pair, the camera
+        that showed it last is selected; without one in the last `_CAMERA_MEMORY_FRAMES` frames, the
+        first camera (the front one, if present) is.
+
+        Returns:
+            The channel of the camera; its view in this frame, or None if its image does not show
+            the pair; and the last frame in which it showed the pair, or None.
         """
         sample = sample_token(self.scenario, agent, index)
         cameras: Sequence[str] = [
@@ -320,22 +340,26 @@ class CollidingPair:
         cameras = cameras or CAMERAS
         for frame in range(index, max(0, index - _CAMERA_MEMORY_FRAMES), -1):
             frame_sample = sample_token(self.scenario, agent, frame)
-            view = best_view(self.dataset, [frame_sample], self.at(frame, agent), cameras)
+            boxes = self.at(frame, agent)
+            view = best_view(self.dataset, [frame_sample], boxes, cameras)
             if view is not None:
                 channel = view.camera.rsplit("/", 1)[1]
-                return channel, view if frame == index else None, frame
+                if frame == index:
+                    return channel, view, frame
+                return channel, None, frame
         return cameras[0], None, None
 
 
 def draw_pair_in_camera(
     pair: CollidingPair, agent: str, index: int, layers: Collection[Layer], ax: Axes
 ) -> str:
-    """Render the part of an agent's image with the pair, and tags, in a frame (number from 1).
+    """Render the part of an agent's image that shows the pair, with tags.
 
-    Boxes are dashed if no camera of the agent sees them. Returns the camera's short name, and how
-    long ago it saw the pair if it does not see it now.
+    Frames are numbered from 1. Boxes are dashed if no camera of the agent sees them. Returns the
+    camera's short name and, if it does not see the pair in this frame, how long ago it did.
     """
-    dataset, sample = pair.dataset, sample_token(pair.scenario, agent, index)
+    dataset = pair.dataset
+    sample = sample_token(pair.scenario, agent, index)
     channel, view, seen_frame = pair.view(agent, index)
     name = camera_name(channel)
     camera = dataset.get("sample_data", f"{sample}/{channel}")
@@ -344,7 +368,7 @@ def draw_pair_in_camera(
     if view is None:
         if seen_frame is None:
             return name
-        return f"{name}:\nseen {(index - seen_frame) * FRAME_PERIOD:.1f} s ago"
+        return f"{name}: last\nseen {(index - seen_frame) * FRAME_PERIOD:.1f} s ago"
     lens = camera_of(dataset, camera)
     left, top, right, bottom = crop_about(
         view.bounds, width=lens.width, height=lens.height, share=_MIN_CROP_SHARE
@@ -355,26 +379,29 @@ def draw_pair_in_camera(
     optical_from_world = dataset.world_from(sample, channel).inverse()
     boxes = pair.at(index, agent).transform(optical_from_world, channel)
     visible_ids = dataset.boxes(sample, visible="camera").actor_id
-    hidden = boxes.select(~np.isin(boxes.actor_id, visible_ids))
-    colors = [COLLIDER_COLOR] * len(hidden)
-    draw_boxes_in_image(hidden, lens, ax, colors, linestyle=_HIDDEN_LINE_STYLE)
-    _write_tags_in_image(pair, boxes.actor_id.tolist(), bounds_in_image(boxes, lens), ax)
+    hidden_boxes = boxes.select(~np.isin(boxes.actor_id, visible_ids))
+    colors = [COLLIDER_COLOR] * len(hidden_boxes)
+    draw_boxes_in_image(hidden_boxes, lens, ax, colors, linestyle=_HIDDEN_LINE_STYLE)
+    tags = [pair.tags[actor] for actor in boxes.actor_id.tolist()]
+    _write_tags_in_image(tags, bounds_in_image(boxes, lens), ax)
     return name
 
 
 def draw_pair_from_above(
     pair: CollidingPair, index: int, layers: Collection[Layer], ax: Axes
 ) -> None:
-    """Render a frame (number from 1) around the point of contact, in world.
+    """Render a frame (numbered from 1) around the point of contact, in the world frame.
 
-    The view is as close as the pair allows. The layers are `bev` (the road), `boxes`, `velocities`,
-    `ids`, `trajectories` (of the pair, up to the contact) and `grid`; the title is the pair's
-    speeds.
+    The view is as close-up as it can be with both actors in it. The layers are `bev` (the road),
+    `boxes`, `velocities`, `ids`, `trajectories` (the pair's, up to the contact) and `grid`. The
+    title gives the pair's speeds.
     """
-    dataset, point = pair.dataset, pair.contact.point[:2]
-    token = sample_token(pair.scenario, agents_of(dataset, pair.scenario)[0], index)
-    sample = dataset.get("sample", token)
-    boxes, pair_boxes = pair.tracks.at(index), pair.at(index)
+    dataset = pair.dataset
+    point = pair.contact.point[:2]
+    first_agent = agents_of(dataset, pair.scenario)[0]
+    sample = dataset.get("sample", sample_token(pair.scenario, first_agent, index))
+    boxes = pair.tracks.at(index)
+    pair_boxes = pair.at(index)
     distances = np.abs(pair_boxes.bottom_corners()[..., :2] - point)
     view_range = _PAIR_MARGIN_M + float(distances.max(initial=0.0))
     view_range = min(max(view_range, _MIN_VIEW_RANGE_M), _MAX_VIEW_RANGE_M)
@@ -402,12 +429,13 @@ def draw_pair_from_above(
 
 
 def _speeds_title(pair: CollidingPair, boxes: Boxes) -> str:
+    """Return the pair's speeds as a title, on two lines if one is too long for a panel."""
     speeds = []
     for actor, velocity in zip(boxes.actor_id.tolist(), boxes.velocity, strict=True):
         speed = float(np.linalg.norm(velocity))
         speeds.append(f"{pair.tags[actor]} {number_words(speed)}")
     line = ", ".join(speeds)
-    if not current_style().few:
+    if not current_style().shows_few_panels:
         return f"{line} m/s"
     if len(line) > _MAX_TITLE_LETTERS:
         return "\n".join(speeds)
@@ -415,51 +443,49 @@ def _speeds_title(pair: CollidingPair, boxes: Boxes) -> str:
 
 
 def number_words(value: float) -> str:
-    """Return a number with one digit, or `unknown`."""
+    """Format a number with one decimal, or as `unknown` if it is not finite."""
     if np.isfinite(value):
         return f"{value:.1f}"
     return "unknown"
 
 
 def _draw_road(pair: CollidingPair, index: int, view_range: float, ax: Axes) -> None:
-    """Render the ground from the BEV camera nearest to the contact, if a file is present."""
-    dataset, point = pair.dataset, pair.contact.point[:2]
-    samples, poses, distances = [], [], []
+    """Render the ground from the BEV camera closest to the contact whose file is present."""
+    dataset = pair.dataset
+    distances = {}
     for agent in agents_of(dataset, pair.scenario):
         sample = sample_token(pair.scenario, agent, index)
         if has_sensor_file(dataset, f"{sample}/{BEV_CAMERA}"):
-            pose = dataset.world_from(sample, "ego")
-            samples.append(sample)
-            poses.append(pose)
-            distances.append(float(np.abs(pose.translation[:2] - point).max()))
-    if samples:
-        nearest = int(np.argmin(distances))
+            position = dataset.world_from(sample, "ego").translation[:2]
+            offset = position - pair.contact.point[:2]
+            distances[sample] = float(np.abs(offset).max())
+    if distances:
+        nearest_sample = min(distances, key=distances.__getitem__)
         draw_underlay(
-            dataset.load_bev(samples[nearest]),
+            dataset.load_bev(nearest_sample),
             ax,
-            target_from_ego=poses[nearest],
-            view_range=view_range + distances[nearest],
+            target_from_ego=dataset.world_from(nearest_sample, "ego"),
+            view_range=view_range + distances[nearest_sample],
         )
 
 
 def _draw_scale(view_range: float, ax: Axes, *, grid: bool) -> None:
-    """Render a bar of 5 or 10 m, and cells of that size, instead of numbers at the axes."""
+    """Render a scale bar of 5 or 10 m, and a grid of that spacing, instead of axis labels."""
     from matplotlib.ticker import MultipleLocator
 
-    metres = 10.0
-    if view_range < 1.25 * _MIN_VIEW_RANGE_M:
-        metres = 5.0
+    metres = 5.0 if view_range < 1.25 * _MIN_VIEW_RANGE_M else 10.0
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)
         ax.set_axisbelow(True)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MultipleLocator(metres))
     ax.tick_params(labelbottom=False, labelleft=False, length=0)
-    start, low = (edge + 0.1 * view_range for edge in ax.viewLim.min)
-    ax.plot([start, start + metres], [low, low], color="black", linewidth=2)
+    left, low = (edge + 0.1 * view_range for edge in ax.viewLim.min)
+    right = left + metres
+    ax.plot([left, right], [low, low], color="black", linewidth=2)
     background = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
     ax.text(
-        start,
+        left,
         low + 0.06 * view_range,
         f"{metres:.0f} m",
         fontsize=text_size(),
@@ -467,71 +493,82 @@ def _draw_scale(view_range: float, ax: Axes, *, grid: bool) -> None:
         zorder=6,
         bbox=background,
     )
-    keep_free(ax, [[(start, low), (start + metres, low)]], margin=(-2, -2, 2, 2 * text_size()))
+    keep_free(ax, [[(left, low), (right, low)]], margin=(-2, -2, 2, 2 * text_size()))
 
 
-def _write_tags_in_image(
-    pair: CollidingPair, actors: list[int], bounds: FloatArray, ax: Axes
-) -> None:
-    """Write tags above the visible parts of boxes with bounds (N, 4), pixels.
+def _write_tags_in_image(tags: list[str], bounds: FloatArray, ax: Axes) -> None:
+    """Write tags above the visible parts of boxes in an image.
 
-    The tags of two boxes are at their outer sides.
+    If two boxes are visible, each tag is at the box's outer side, away from the other box.
+
+    Args:
+        tags: One tag for each of the N boxes.
+        bounds: Left, top, right and bottom of the boxes, shape (N, 4), pixels.
+        ax: Axes of the image.
     """
-    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    cars = bounds.reshape(-1, 2, 2).clip((left, top), (right, bottom))
-    visible = np.flatnonzero((cars[:, 1] > cars[:, 0]).all(axis=1))
-    from_left = np.argsort(cars[visible, :, 0].mean(axis=1))
-    rows = visible[from_left]
-    cars = cars[rows]
-    positions = np.column_stack([cars[..., 0].mean(axis=1), cars[:, 0, 1]])
-    if len(cars) > 1:
-        positions[:, 0] = cars[0, 0, 0], cars[1, 1, 0]
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    box_left, box_top, box_right, box_bottom = bounds.T
+    box_left, box_right = np.clip([box_left, box_right], left, right)
+    box_top, box_bottom = np.clip([box_top, box_bottom], top, bottom)
+    visible_rows = np.flatnonzero((box_right > box_left) & (box_bottom > box_top))
+    middle = (box_left + box_right) / 2
+    rows = visible_rows[np.argsort(middle[visible_rows])]
+    tag_u = middle[rows]
+    if len(rows) > 1:
+        tag_u = np.array([box_left[rows[0]], box_right[rows[1]]])
     tag_share = min(0.5, _TAG_HEIGHT_PT * ax.figure.dpi / 72 / ax.bbox.height)
     tag_bottom = top + (bottom - top) * tag_share
-    positions[positions[:, 1] < tag_bottom, 1] = top
-    cars[..., 1] = cars[..., 1].clip(tag_bottom)
-    _write_tags([pair.tags[actors[row]] for row in rows.tolist()], positions, ax)
-    keep_free(ax, cars)
+    tag_v = box_top[rows]
+    tag_v[tag_v < tag_bottom] = top
+    _write_tags([tags[row] for row in rows.tolist()], np.column_stack([tag_u, tag_v]), ax)
+    low_corners = np.column_stack([box_left, box_top.clip(tag_bottom)])
+    high_corners = np.column_stack([box_right, box_bottom.clip(tag_bottom)])
+    keep_free(ax, np.stack([low_corners, high_corners], axis=1)[rows])
 
 
 def _write_tags_from_above(pair: CollidingPair, boxes: Boxes, ax: Axes) -> None:
-    """Write tags beside boxes of the pair, each at the end farther from the other actor."""
+    """Write a tag next to each box of the pair, at the end farther from the other actor."""
     centers = boxes.center[:, :2]
     middle = pair.contact.point[:2]
     if len(boxes) > 1:
         middle = centers.mean(axis=0)
-    directions = centers - middle
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
-    ends = boxes.bottom_corners()[..., :2] - boxes.center[:, None, :2]
-    lengths = (ends @ directions[..., None]).max(axis=1)
+    offsets = centers - middle
+    distances = np.linalg.norm(offsets, axis=1, keepdims=True)
+    directions = offsets / np.maximum(distances, 1e-9)
+    corners = boxes.bottom_corners()[..., :2] - centers[:, None]
+    lengths = (corners @ directions[..., None]).max(axis=1)
     positions = centers + directions * lengths
-    _write_tags([pair.tags[actor] for actor in boxes.actor_id.tolist()], positions, ax)
+    tags = [pair.tags[actor] for actor in boxes.actor_id.tolist()]
+    _write_tags(tags, positions, ax)
 
 
 def _write_tags(tags: list[str], positions: FloatArray, ax: Axes) -> None:
-    """Write tags near positions (N, 2) or, if these are not in the panel, at its edge."""
-    low, high = np.array(ax.viewLim.min), np.array(ax.viewLim.max)
+    """Write tags near positions (N, 2) in data coordinates, but always within the panel."""
+    low = np.array(ax.viewLim.min)
+    high = np.array(ax.viewLim.max)
     edge = _EDGE_SHARE * (high - low)
     positions = positions.clip(low + edge, high - edge)
-    place_chips(ax, zip(tags, positions, strict=True), colors=[COLLIDER_COLOR] * len(tags))
+    chips = zip(tags, positions, strict=True)
+    place_chips(ax, chips, colors=[COLLIDER_COLOR] * len(tags))
 
 
 def _cut_words(contact: Contact, frames: int) -> str:
-    """Return a warning if a recording does not end with its accident; empty if it does."""
+    """Return a warning if the recording does not end at the contact, otherwise an empty text."""
     contact_frame = int(contact.frame.rsplit("/", 1)[1])
     if contact_frame == frames and contact.gap <= CONTACT_GAP:
         return ""
     return (
-        f"cut short? the pair are {contact.gap:.1f} m apart at frame {contact_frame} of {frames}, "
-        "the last that shows both"
+        f"cut short? The pair is {contact.gap:.1f} m apart at frame {contact_frame} of {frames}, "
+        "the last frame that shows both"
     )
 
 
 def _contact(dataset: Dataset, scenario: RowArgument, alternative: str) -> Contact:
-    """Return how the accident of a scenario happened.
+    """Return how the two actors of a scenario collide.
 
     Raises:
-        NotAvailableError: Nobody collides; the message has the alternative as a remedy.
+        NotAvailableError: The scenario has no collision; the message suggests the alternative.
     """
     contact = collision(dataset, scenario)
     if contact is None:
@@ -544,7 +581,7 @@ def _contact(dataset: Dataset, scenario: RowArgument, alternative: str) -> Conta
 
 
 def _moments(seconds: Sequence[float], frames: int) -> list[tuple[float, int]]:
-    """Return the recorded moments as seconds before the impact and frame numbers."""
+    """Return (seconds before the impact, frame number) of each requested moment on record."""
     recorded = []
     for time_left in seconds:
         frame = frames - round(time_left / FRAME_PERIOD)
@@ -552,40 +589,48 @@ def _moments(seconds: Sequence[float], frames: int) -> list[tuple[float, int]]:
             recorded.append((time_left, frame))
     if not recorded:
         raise ChoiceError(
-            f"seconds: expected some from 0 to {(frames - 1) * FRAME_PERIOD:.1f}, "
-            f"as recorded before the impact, found {list(seconds)}"
+            f"seconds: expected values from 0 to {(frames - 1) * FRAME_PERIOD:.1f}, as recorded "
+            f"before the impact, found {list(seconds)}"
         )
     return recorded
 
 
 def _panel_width(fig: Figure, agents: int, moments: int) -> tuple[float, bool]:
-    """Return the width of a panel of the first row or column, about, in inches.
+    """Estimate a camera panel's width in inches; also return whether agents are the columns.
 
-    The second value is whether rows are columns because it is then wider.
+    Agents are columns instead of rows if that makes their panels wider.
     """
     width = fig.bbox.width / fig.dpi
-    height = fig.bbox.height / fig.dpi - _TITLE_HEIGHT_IN
-    row_height = height / moments - _ROW_WORDS_HEIGHT_IN * text_size()
+    title_height = _TITLE_HEIGHT_IN
+    if current_style().layout == "column":
+        title_height = _COLUMN_TITLE_HEIGHT_IN
+    height = fig.bbox.height / fig.dpi - title_height
     width_as_rows = min(width / moments, height / (agents * 9 / 16 + 1))
+    row_height = height / moments - _ROW_WORDS_HEIGHT_IN * text_size()
+    panel_height = min(row_height, width / (agents * 16 / 9 + 1))
     panel_ratio = 16 / 9 if agents else 1
-    width_as_columns = panel_ratio * min(row_height, width / (agents * 16 / 9 + 1))
-    return max(width_as_rows, width_as_columns), width_as_columns > width_as_rows
+    width_as_columns = panel_ratio * panel_height
+    if width_as_columns > width_as_rows:
+        return width_as_columns, True
+    return width_as_rows, False
 
 
 def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
-    """Return axes (agents + 1, moments), and whether rows are columns."""
+    """Make axes, shape (agents + 1, moments); also return whether agents are the columns."""
     _, is_wide = _panel_width(fig, agents, moments)
     if is_wide:
-        ratios = (*[16 / 9] * agents, 1)
-        return fig.subplots(moments, agents + 1, squeeze=False, width_ratios=ratios).T, True
-    ratios = (*[9 / 16] * agents, 1)
-    return fig.subplots(agents + 1, moments, squeeze=False, height_ratios=ratios), False
+        width_ratios = (*[16 / 9] * agents, 1)
+        axes = fig.subplots(moments, agents + 1, squeeze=False, width_ratios=width_ratios)
+        return axes.T, True
+    height_ratios = (*[9 / 16] * agents, 1)
+    axes = fig.subplots(agents + 1, moments, squeeze=False, height_ratios=height_ratios)
+    return axes, False
 
 
 def _fitting_agents(fig: Figure, agents: int, moments: int) -> int:
-    """Return how many agents can have panels large enough to recognise what happens.
+    """Return how many agents fit with panels large enough to show what happens.
 
-    If no number can, it is the one with the largest panels.
+    If no number of agents fits, return the number whose panels cover most of the figure.
     """
     panels = {number: _panel_width(fig, number, moments) for number in range(1, agents + 1)}
     widest = max(width for width, _ in panels.values())
@@ -596,7 +641,7 @@ def _fitting_agents(fig: Figure, agents: int, moments: int) -> int:
             above_ratio = 81 / 256 if is_wide else 1
             areas[number] = moments * width**2 * (number * 9 / 16 + above_ratio)
     min_area = 0.0
-    if current_style().few:
+    if current_style().shows_few_panels:
         min_area = _MIN_COVERED_SHARE * fig.bbox.width * fig.bbox.height / fig.dpi**2
     sufficient = [number for number, area in areas.items() if area > min_area]
     return max(sufficient, default=max(areas, key=areas.__getitem__))
@@ -605,32 +650,44 @@ def _fitting_agents(fig: Figure, agents: int, moments: int) -> int:
 def _best_agents(
     pair: CollidingPair, agents: Sequence[str], frames: Sequence[int], number: int
 ) -> list[str]:
-    """Return the ego and the agents that see most of the pair in their images.
+    """Return the ego and the agents whose images show most of the pair, `number` in all.
 
-    Of equal agents the one with the largest part of the pair in its images comes first.
+    Among equal agents, the ones with the largest view of the pair come first.
     """
     priorities = {}
     for agent in agents:
-        views = [pair.view(agent, frame)[1] for frame in frames]
-        shares = [(view.total_share, view.area) for view in views if view is not None]
-        total = np.sum([(0, 0), *shares], axis=0).tolist()
-        priorities[agent] = (agent == AGENTS[0], total)
+        shares_and_areas = [(0.0, 0.0)]
+        for frame in frames:
+            _, view, _ = pair.view(agent, frame)
+            if view is not None:
+                shares_and_areas.append((view.total_share, view.area))
+        totals = np.sum(shares_and_areas, axis=0).tolist()
+        priorities[agent] = (agent == AGENTS[0], totals)
     ranked = sorted(agents, key=priorities.__getitem__, reverse=True)
     return in_drawing_order(ranked[:number])
 
 
 def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
-    """Write the head of a column above its first panel, or the head of a row beside it."""
+    """Write the heading of a column above its first panel, or of a row to the left of it."""
     if above:
         lines = [line for line in (words, ax.get_title()) if line]
         ax.set_title("\n".join(lines), color=color, fontsize="medium")
         return
-    style: dict[str, Any] = {"rotation": 90, "ha": "right", "va": "center", "fontweight": "bold"}
-    ax.text(-0.02, 0.5, words, color=color, transform=ax.transAxes, **style)
+    ax.text(
+        -0.02,
+        0.5,
+        words,
+        color=color,
+        transform=ax.transAxes,
+        rotation=90,
+        ha="right",
+        va="center",
+        fontweight="bold",
+    )
 
 
 def _write_name(words: str, ax: Axes) -> None:
-    """Write a camera's name into the lower left corner of its panel, over any content."""
+    """Write a camera's name in the lower left corner of its panel, on top of the image."""
     ax.annotate(
         words,
         (0, 0),
@@ -647,7 +704,7 @@ def _write_name(words: str, ax: Axes) -> None:
 def _draw_speeds(pair: CollidingPair, index: int, ax: Axes) -> None:
     """Render the pair's speeds over the seconds before the impact.
 
-    Lines are strong up to the present and pale after it.
+    Lines are strong up to the current frame and pale after it.
     """
     tracks = pair.tracks
     impact = int(tracks.index.max())
@@ -655,14 +712,16 @@ def _draw_speeds(pair: CollidingPair, index: int, ax: Axes) -> None:
         rows = np.flatnonzero(tracks.actor_id == actor)
         seconds = (tracks.index[rows] - impact) * FRAME_PERIOD
         speed = np.linalg.norm(tracks.boxes.velocity[rows], axis=1)
-        past = tracks.index[rows] <= index
+        is_past = tracks.index[rows] <= index
         style: dict[str, Any] = {"color": COLLIDER_COLOR, "linestyle": line_style}
         ax.plot(seconds, speed, linewidth=1.2, alpha=0.25, **style)
-        ax.plot(seconds[past], speed[past], linewidth=2.0, label=pair.tags[actor], **style)
-    ax.axvline((index - impact) * FRAME_PERIOD, color="black", linewidth=1.2)
+        past_seconds = seconds[is_past]
+        ax.plot(past_seconds, speed[is_past], linewidth=2.0, label=pair.tags[actor], **style)
+    present = (index - impact) * FRAME_PERIOD
+    ax.axvline(present, color="black", linewidth=1.2)
     ax.axvline(0, color=COLLIDER_COLOR, linewidth=1.2, linestyle=":")
     ax.set(
-        xlabel="time to the impact (s)",
+        xlabel="time relative to the impact (s)",
         ylabel="speed (m/s)",
         xlim=(-(impact - 1) * FRAME_PERIOD, 0.1),
         ylim=(0, None),

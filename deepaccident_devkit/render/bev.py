@@ -1,4 +1,4 @@
-"""A moment from above: boxes, points, and the ground by the BEV camera."""
+"""A moment from above: boxes, points, and the ground as the BEV camera saw it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, get_args
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.geometry import Boxes, LidarPointCloud
+from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
 from deepaccident_devkit.geometry.boxes import concatenate
 from deepaccident_devkit.render.boxes import (
     collider_ids,
@@ -24,9 +24,10 @@ from deepaccident_devkit.render.boxes import (
 from deepaccident_devkit.render.captions import (
     absence_text,
     draw_legend_outside,
-    handles_from_above,
+    handles_of_scene,
     has_cloud,
     has_sensor_file,
+    is_callers,
     missing_clouds_text,
     set_scene_title,
     write_missing,
@@ -34,11 +35,12 @@ from deepaccident_devkit.render.captions import (
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import (
     Layer,
+    Layers,
     axes_or_new,
     check_view_range,
     label_axes,
     layers_of,
-    widening,
+    width_to_height,
 )
 from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
@@ -70,7 +72,7 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import SampleRecord
 
-BEV_LAYERS: Final[tuple[Layer, ...]] = (
+BEV_LAYERS: Final[Layers] = (
     "map",
     "bev",
     "points",
@@ -80,34 +82,34 @@ BEV_LAYERS: Final[tuple[Layer, ...]] = (
     "trajectories",
     "grid",
 )
-BEV_DEFAULT: Final[tuple[Layer, ...]] = ("bev", "points", "boxes", "grid")
-# Content of a view from above: the colours of its boxes and, if there are several agents, the
-# agents with points in it.
+BEV_DEFAULT: Final[Layers] = ("bev", "points", "boxes", "grid")
+# What the legend of a view from above explains: the colours of its boxes and, if there are several
+# agents, the agents whose points it shows.
 _ViewContent = tuple[frozenset[str], tuple[AgentName, ...]]
-_BOX_LAYERS: Final = frozenset(("boxes", "ids", "velocities", "trajectories"))
-# Metres outside the picture up to which a box may still reach into it.
-_BOX_MARGIN_M: Final = 5.0
-# An arrow head, metres of an agent's ego frame.
-_ARROW_HEAD_M: Final = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
+_BOX_LAYERS = frozenset(("boxes", "ids", "velocities", "trajectories"))
+# A box whose centre is at most this many metres outside the picture may still reach into it.
+_BOX_MARGIN_M = 5.0
+# Corners of an arrow head, metres in an agent's ego frame.
+_ARROW_HEAD_M = np.array([[1.8, 0.0], [-1.2, 1.1], [-0.6, 0.0], [-1.2, -1.1]])
 # Opacity of agents' points.
-_POINT_OPACITY: Final = 0.55
+_POINT_OPACITY = 0.55
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BevView:
-    """The rendered part of a moment from above, and the source of its data.
+    """Which part of a moment to render from above, and from which data.
 
     Attributes:
         view_range: Metres shown to each side of the agent.
         frame: Coordinate frame of the axes: `ego`, `lidar` or `world`.
-        agents: Agents with points and boxes in the view.
-        link: Effects on the partners' data.
-        sweeps: Number of frames of points, the present included.
-        seconds: Seconds of trajectories, back and ahead.
-        center: Centre of the picture, metres of `frame`; None for the agent's position.
-        wide: Ratio of the distances shown to the sides and up or down.
-        beside: Whether a picture beside it shows the surroundings, so that the BEV camera's picture
-            is not missed.
+        agents: Agents whose points and boxes the view shows.
+        link: Effects on the partners' data; None for none.
+        sweeps: Number of frames whose points are shown, including the current one.
+        seconds: Length of past and of future trajectories, seconds.
+        center: Centre of the picture, metres in `frame`; None for the agent's position.
+        wide: Width over height of the shown part.
+        surroundings_shown: Whether another panel shows the surroundings, so that a missing picture
+            of the BEV camera need not be reported.
     """
 
     view_range: float = 50.0
@@ -118,15 +120,16 @@ class BevView:
     seconds: tuple[float, float] = (1.0, 3.0)
     center: tuple[float, float] | None = None
     wide: float = 1.0
-    beside: bool = False
+    surroundings_shown: bool = False
 
     @property
     def half(self) -> FloatArray:
         """Metres from the centre to the right and the upper edge, shape (2,)."""
-        return np.array([self.wide * self.view_range, self.view_range])
+        half_width = self.wide * self.view_range
+        return np.array([half_width, self.view_range])
 
     def __post_init__(self) -> None:
-        """Check the frame and the range; raises ChoiceError."""
+        """Raise ChoiceError unless the frame is known and the range is above 0."""
         check_view_range(self.view_range)
         settle_choices(self, {"frame": get_args(Frame)})
 
@@ -148,38 +151,38 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
     """Render a moment from above: boxes, LiDAR points and more, in one coordinate frame, metres.
 
     The colliding pair is red, other recording vehicles have their agents' hues, and the remaining
-    actors a shade for their category. Agents have a mark in their hue, the sample's own with a dark
-    edge; several agents have names, and their points have their hues. The title names the effects
-    of a link, and the number of sweeps.
+    actors have a shade for their category. Each agent is marked in its hue; the mark of the
+    sample's agent has a dark edge. If there are several agents, they are named, and their points
+    have their hues. The title names the effects of a link, and the number of sweeps.
 
     Args:
         dataset: The release.
-        sample: Token or record: its agent is in the middle, its frame is the present.
+        sample: Token or record; its agent is in the middle, its frame is the current one (t = 0).
         view_range: Metres shown to each side of the agent.
-        agents: Agents with points and boxes: names, a configuration or its name, or None for all
-            present agents; by default only the sample's own agent. If there are several agents,
-            each actor has one box.
+        agents: Agents whose points and boxes are shown: names, a configuration or its name, or None
+            for all present agents; by default only the sample's agent. If there are several agents,
+            each actor still has one box.
         frame: Coordinate frame of the axes: `ego` or `lidar` (forward to the right, left up), or
             `world`.
-        layers: Some of `map` (the ground of the town in all its recordings, `town_map`; made if
-            none is stored, which takes a while), `bev` (the agent's BEV camera, in pale colours,
-            over the map), `points`, `boxes`, `ids`, `velocities` (arrows for one second),
-            `trajectories` (past thin, future thick, fading) and `grid`; by default bev, points,
-            boxes, grid. Points and the BEV camera are left out if their files are missing; the
-            title reports it (for the BEV camera only if there are no points). A stored town map
-            replaces a missing picture of a BEV camera.
+        layers: Any of `map` (the town's ground, combined from all recordings there, see
+            `town_map`; if none is stored it is made, which takes a while), `bev` (the agent's BEV
+            camera, in pale colours, over the map), `points`, `boxes`, `ids`, `velocities` (arrows
+            to the positions in one second), `trajectories` (past thin, future thick, fading) and
+            `grid`; by default bev, points, boxes, grid. Points and the BEV picture are left out if
+            their files are missing; the title reports missing points, or the missing BEV picture
+            if there are no points either. A stored town map replaces a missing BEV picture.
         link: Effects on the partners' data; None for none.
-        sweeps: Number of frames of points, the present included.
-        seconds: Seconds of trajectories, back and ahead.
-        ax: Axes to render on; new ones if None.
+        sweeps: Number of frames whose points are shown, including the current one.
+        seconds: Length of past and of future trajectories, seconds.
+        ax: Axes to render on, new ones if None. In a figure of your own, the title is yours.
 
     Returns:
         The axes, in metres of `frame`.
 
     Raises:
         TokenError: No such sample.
-        ChoiceError: No such layer, frame, agent or configuration, `sweeps` is no whole number from
-            1, or `view_range` is not above 0.
+        ChoiceError: No such layer, frame, agent or configuration, `sweeps` is not a positive whole
+            number, or `view_range` is not above 0.
         NotAvailableError: An agent is not in this (partial) release.
         ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
     """
@@ -191,10 +194,10 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         link=link,
         sweeps=sweeps,
         seconds=seconds,
-        wide=widening(ax),
+        wide=width_to_height(ax),
     )
     names = cooperating_agents(dataset, sample, agents)
-    ax = axes_or_new(ax, (6, 6.6))
+    ax = axes_or_new(ax, (6, 6.6), is_map=True)
     colors, cloud_agents = draw_bev(dataset, sample, view, shown_layers, ax)
     remarks = []
     if link is not None and link != Link(seed=link.seed) and len(names) > 1:
@@ -203,16 +206,17 @@ def render_bev(  # noqa: PLR0913 - each is a choice that stands on its own in a 
         remarks.append(f"{sweeps} sweeps")
     token = dataset.get("sample", sample)["token"]
     set_scene_title(ax, dataset, token, below=", ".join(remarks))
-    draw_legend_outside(ax, handles_from_above(colors, cloud_agents), columns=5)
+    handles = handles_of_scene(colors, cloud_agents, is_short=is_callers(ax))
+    draw_legend_outside(ax, handles, columns=5)
     return ax
 
 
 def draw_bev(
     dataset: Dataset, sample: RowArgument, view: BevView, layers: frozenset[Layer], ax: Axes
 ) -> _ViewContent:
-    """Render a panel of `render_bev`, with its arguments and errors, and return its content.
+    """Render a panel of `render_bev`, and return what its legend has to explain.
 
-    A legend explains the content.
+    Raises the errors of `render_bev`.
     """
     record = dataset.sample[dataset.getind("sample", sample)]
     names = cooperating_agents(dataset, record, view.agents)
@@ -221,9 +225,10 @@ def draw_bev(
     center = target_from_ego.translation[:2]
     if view.center is not None:
         center = np.array(view.center)
-    (left, low), (right, high) = center - view.half, center + view.half
+    left, low = center - view.half
+    right, high = center + view.half
     ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", anchor="N")
-    has_ground = _draw_ground(dataset, record, view, center, layers, ax)
+    has_ground = _draw_ground(dataset, record, view, target_from_world, center, layers, ax)
     clouds: dict[AgentName, LidarPointCloud | None] = {}
     if "points" in layers:
         clouds = _draw_clouds(dataset, record, view, names, center, ax)
@@ -236,8 +241,10 @@ def draw_bev(
     )
     absent_words = [missing_clouds_text(missing_agents)]
     if not has_ground:
-        has_surroundings = view.beside or bool(cloud_agents)
-        absent_words.append(_missing_ground_text(dataset, record, layers, beside=has_surroundings))
+        has_surroundings = view.surroundings_shown or bool(cloud_agents)
+        absent_words.append(
+            _missing_ground_text(dataset, record, layers, has_surroundings=has_surroundings)
+        )
     _draw_marks(dataset, record, view.frame, names, ax)
     label_axes(ax, view.frame)
     ax.set_axisbelow(True)
@@ -253,13 +260,12 @@ def _draw_ground(
     dataset: Dataset,
     record: SampleRecord,
     view: BevView,
+    target_from_world: SE3,
     center: FloatArray,
     layers: frozenset[Layer],
     ax: Axes,
 ) -> bool:
-    """Draw the ground by a town map and the BEV camera, and return whether there is any."""
-    target_from_world = dataset.world_from(record, view.frame).inverse()
-    target_from_ego = target_from_world @ dataset.world_from(record, "ego")
+    """Draw the ground from a town map and the BEV camera; return whether any was drawn."""
     has_picture = "bev" in layers and has_sensor_file(dataset, f"{record['token']}/{BEV_CAMERA}")
     town = None
     if "map" in layers or ("bev" in layers and not has_picture):
@@ -267,6 +273,7 @@ def _draw_ground(
     if town is not None:
         draw_town_map(town, ax, target_from_world=target_from_world)
     if has_picture:
+        target_from_ego = target_from_world @ dataset.world_from(record, "ego")
         distance = float(np.abs(center - target_from_ego.translation[:2]).max())
         draw_underlay(
             dataset.load_bev(record),
@@ -278,15 +285,15 @@ def _draw_ground(
 
 
 def _missing_ground_text(
-    dataset: Dataset, record: SampleRecord, layers: frozenset[Layer], *, beside: bool
+    dataset: Dataset, record: SampleRecord, layers: frozenset[Layer], *, has_surroundings: bool
 ) -> str:
-    """Return the words for missing ground.
+    """Return words that explain why no ground is drawn.
 
-    If other data show the surroundings (`beside`), the BEV camera's picture is not missed.
+    They are empty if no ground was requested, or if other data show the surroundings.
     """
     if "map" in layers:
         return f"no {BEV_CAMERA} for a map of the town"
-    if "bev" not in layers or beside:
+    if "bev" not in layers or has_surroundings:
         return ""
     sensor_file = f"{record['token']}/{BEV_CAMERA}"
     return f"{BEV_CAMERA}: {absence_text(dataset, sensor_file)}"
@@ -301,10 +308,11 @@ def _draw_boxes(
     layers: frozenset[Layer],
     ax: Axes,
 ) -> frozenset[str]:
-    """Draw the boxes in the picture, and return their colours."""
-    boxes = _boxes(dataset, record, view, names)
+    """Draw the boxes within the picture, and return the colours of the visible ones."""
+    boxes = _load_boxes(dataset, record, view, names)
     offsets = np.abs(boxes.center[:, :2] - center)
-    boxes = boxes.select((offsets < view.half + _BOX_MARGIN_M).all(axis=1))
+    is_shown = (offsets < view.half + _BOX_MARGIN_M).all(axis=1)
+    boxes = boxes.select(is_shown)
     colors = role_colors(dataset, record, boxes)
     if "trajectories" in layers:
         draw_trails(
@@ -320,15 +328,18 @@ def _draw_boxes(
     if "boxes" in layers:
         named_agents = names if len(names) > 1 else ()
         _name_pair(dataset, record, boxes, ax, named_agents=named_agents)
-    return frozenset(colors)
+    corners = boxes.bottom_corners()[..., :2] - center
+    is_visible = (corners.max(axis=1) > -view.half) & (corners.min(axis=1) < view.half)
+    visible_rows = np.flatnonzero(is_visible.all(axis=1))
+    return frozenset(colors[row] for row in visible_rows.tolist())
 
 
-def _boxes(
+def _load_boxes(
     dataset: Dataset, record: SampleRecord, view: BevView, names: Sequence[AgentName]
 ) -> Boxes:
-    """Return the sample's own boxes with their label ids, or several agents' with CARLA ids.
+    """Load the sample's own boxes with label ids or, for several agents, boxes with CARLA ids.
 
-    The receiver knows its own position: no message moves its box.
+    The receiver knows its own position, so no message moves its box.
     """
     if list(names) == [record["agent"]]:
         return dataset.boxes(record, view.frame)
@@ -336,9 +347,10 @@ def _boxes(
     own_actor = dataset.get("agent", record["agent_token"])["actor_id"]
     if view.link is None or own_actor is None:
         return boxes
-    true = cooperative_boxes(dataset, record, agents=names, frame=view.frame)
-    own_box = true.select(true.actor_id == own_actor)
-    return concatenate([own_box, boxes.select(boxes.actor_id != own_actor)], view.frame)
+    other_boxes = boxes.select(boxes.actor_id != own_actor)
+    true_boxes = cooperative_boxes(dataset, record, agents=names, frame=view.frame)
+    own_box = true_boxes.select(true_boxes.actor_id == own_actor)
+    return concatenate([own_box, other_boxes], view.frame)
 
 
 def _draw_clouds(
@@ -349,23 +361,25 @@ def _draw_clouds(
     center: FloatArray,
     ax: Axes,
 ) -> dict[AgentName, LidarPointCloud | None]:
-    """Draw the points of each agent and return them, None for a missing file.
+    """Draw the points of each agent, and return them by agent (None if their files are missing).
 
-    If there are several agents, points have their colours.
+    If there are several agents, each agent's points have its colour.
     """
-    clouds = {agent: _cloud(dataset, record, view, agent) for agent in names}
+    clouds = {agent: _load_cloud(dataset, record, view, agent) for agent in names}
     for agent, cloud in clouds.items():
         if cloud is None:
             continue
-        color = AGENT_COLORS[agent] if len(names) > 1 else POINT_COLOR
+        color = POINT_COLOR
+        if len(names) > 1:
+            color = AGENT_COLORS[agent]
         draw_points_from_above(cloud.xyz, ax, center=center, half=view.half, color=color)
     return clouds
 
 
-def _cloud(
+def _load_cloud(
     dataset: Dataset, record: SampleRecord, view: BevView, agent: AgentName
 ) -> LidarPointCloud | None:
-    """Return the received points of an agent; None if all files for them are missing."""
+    """Load the points received from an agent; None if all their files are missing."""
     sent = messages(dataset, record, [agent], view.link, sweeps=view.sweeps)
     samples = [message.sample for message in sent]
     if samples and not any(has_cloud(dataset, sample) for sample in samples):
@@ -387,17 +401,18 @@ def _draw_marks(
     """Draw an arrow head at the true pose of each agent, with names if there are several agents."""
     from matplotlib.collections import PolyCollection
 
-    heads, colors, edges = [], [], []
+    heads = []
+    edges = []
     arrow_head = np.column_stack([_ARROW_HEAD_M, np.zeros(len(_ARROW_HEAD_M))])
     for agent in names:
         sample = simultaneous_sample(record, agent)
         target_from_ego = transform(dataset, record, sample, frame, "ego")
         heads.append(target_from_ego.apply(arrow_head)[:, :2])
-        colors.append(AGENT_COLORS[agent])
         edges.append(OWN_COLOR if agent == record["agent"] else CASING_COLOR)
         if len(names) > 1:
             x, y = target_from_ego.translation[:2].tolist()
             write_beside(ax, short_name(agent), (x, y), AGENT_COLORS[agent])
+    colors = [AGENT_COLORS[agent] for agent in names]
     marks = PolyCollection(heads, facecolors=colors, edgecolors=edges, linewidths=0.8, zorder=5)
     ax.add_collection(marks)
     keep_free(ax, heads)
@@ -411,34 +426,38 @@ def _name_pair(
     *,
     named_agents: Collection[AgentName],
 ) -> None:
-    """Write the names of the colliding pair, without agents that already have their names.
+    """Write the names of the colliding pair, except agents that are already named.
 
-    Other actors are named by their category.
+    An actor that is not an agent is named by its category.
     """
-    agents, colliders = recorder_ids(dataset, record), collider_ids(dataset, record)
+    agents = recorder_ids(dataset, record)
+    colliders = collider_ids(dataset, record)
     for row, actor in enumerate(label_ids(dataset, record, boxes)):
         agent = agents.get(actor)
-        if actor in colliders and agent not in named_agents:
-            name = boxes.category_names[row] if agent is None else short_name(agent)
-            x, y = boxes.center[row, :2].tolist()
-            write_beside(ax, name, (x, y), COLLIDER_COLOR)
+        if actor not in colliders or agent in named_agents:
+            continue
+        name = boxes.category_names[row]
+        if agent is not None:
+            name = short_name(agent)
+        x, y = boxes.center[row, :2].tolist()
+        write_beside(ax, name, (x, y), COLLIDER_COLOR)
 
 
 def link_words(link: Link) -> str:
-    """Return the words for a link.
+    """Describe the effects of a link in words.
 
-    For example `latency 0.2 s, poses off by 0.3 m (σ 0.02 m), 10 % of messages lost`.
+    For example `latency 0.2 s, pose noise 0.3 m ± 0.02 m, 10 % of messages lost`.
     """
     words = [f"latency {link.latency:g} s"]
     noise = link.pose_noise
     if isinstance(noise, PoseNoise):
-        words.append(f"poses off by {noise.mean:g} m (σ {noise.std:g} m)")
+        words.append(f"pose noise {noise.mean:g} m ± {noise.std:g} m")
         if noise.heading_std:
-            words.append(f"headings by σ {np.degrees(noise.heading_std):.1f}°")
+            words.append(f"heading noise ± {np.degrees(noise.heading_std):.1f}°")
     if link.packet_loss:
         words.append(f"{100 * link.packet_loss:g} % of messages lost")
     if link.budget is not None:
-        words.append(f"at most {link.budget:,} bytes a frame")
+        words.append(f"at most {link.budget:,} bytes per frame")
     return ", ".join(words)
 
 
@@ -447,12 +466,13 @@ def draw_points_from_above(
 ) -> None:
     """Render the points (P, 3) within ±`half` (2,) metres of `center` (2,), in one colour.
 
-    Hues are paler than the hues of boxes, which lie over them.
+    Points are paler than the boxes drawn over them in the same hue.
     """
-    within = (np.abs(xyz[:, :2] - center) < half).all(axis=1)
+    is_shown = (np.abs(xyz[:, :2] - center) < half).all(axis=1)
+    x, y, _ = xyz[is_shown].T
     ax.scatter(
-        xyz[within, 0],
-        xyz[within, 1],
+        x,
+        y,
         s=0.6,
         c=color,
         alpha=None if color == POINT_COLOR else _POINT_OPACITY,

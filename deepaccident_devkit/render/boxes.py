@@ -59,10 +59,10 @@ EDGES = (
     (2, 6),
     (3, 7),
 )
-# Metres: radius of the mark of a small actor from above, so that it is about as wide as a car.
-_MARK_RADIUS_M: Final = 1.0
-# Points: least radius of a mark, so that it is visible in a view of a whole town.
-_MIN_MARK_RADIUS_PT: Final = 2.0
+# Radius of the mark for a small actor, seen from above, metres; it is about as wide as a car.
+_MARK_RADIUS_M = 1.0
+# Minimum radius of a mark, points, so that it is visible in a view of a whole town.
+_MIN_MARK_RADIUS_PT = 2.0
 # Arrows in data coordinates.
 ARROW_STYLE: Final[Mapping[str, Any]] = {
     "angles": "xy",
@@ -71,18 +71,19 @@ ARROW_STYLE: Final[Mapping[str, Any]] = {
     "width": 0.004,
     "zorder": 4,
 }
-# Corners of the marks, by matplotlib's names.
-_MARK_CORNERS: Final[Mapping[str, int]] = {"o": 16, "D": 4, "^": 3}
-# Metres a second: length of the arrow in a corner that shows the scale of the arrows.
+# Number of corners of each mark, by matplotlib marker name.
+_MARK_CORNERS: Mapping[str, int] = {"o": 16, "D": 4, "^": 3}
+# Length of the arrow in a corner that shows the scale of the arrows, in metres per second.
 _KEY_SPEED_MPS = 10
-# Points: the width of an edge in an image, and by how much its casing is wider.
-_EDGE_WIDTH_PT, _CASING_WIDTH_PT = 1.2, 1.2
+# Width of an edge in an image, and how much wider its casing is, in points.
+_EDGE_WIDTH_PT = 1.2
+_CASING_WIDTH_PT = 1.2
 # Metres in front of the camera at which edges are cut off.
 NEAR_PLANE_M = 0.1
 # Opacity of the end of a trail.
-_MIN_TRAIL_OPACITY: Final = 0.1
-# Metres: an actor that moves less has no trail.
-_MIN_TRAIL_LENGTH_M: Final = 0.5
+_MIN_TRAIL_OPACITY = 0.1
+# Minimum number of metres that an actor must move to have a trail.
+_MIN_TRAIL_LENGTH_M = 0.5
 
 
 @in_own_settings
@@ -90,16 +91,17 @@ def draw_box(box: Box, ax: Axes, color: str | None = None) -> Axes:
     """Render one box from above, in its own frame's x and y, metres, with a line to its front.
 
     Raises:
-        GeometryError: `box` is no `Box`, such as the axes.
+        GeometryError: `box` is not a `Box`; for example, the axes were passed first.
     """
     if not isinstance(box, Box):
         raise GeometryError(
-            f"box: expected a Box, found {type(box).__name__}; "
-            "the box is first, then the axes: draw_box(box, ax)"
+            f"box: expected a Box, found {type(box).__name__}; pass the box first, then the "
+            "axes: draw_box(box, ax)"
         )
     colors = [color or category_colors()[box.category]]
+    center = box.center[None, :2]
     corners = box.bottom_corners().T[None, :, :2]
-    _draw_footprints(box.center[None, :2], corners, ax, colors, 0.25, {})
+    _draw_footprints(center, corners, ax, colors, 0.25, {})
     return ax
 
 
@@ -108,31 +110,34 @@ def draw_boxes_from_above(
 ) -> None:
     """Render boxes in x and y of their (level) frame, metres, each with a line to its front.
 
-    `fill` is the opacity of their areas. Pedestrians, cyclists and motorcycles also have their
-    class's mark, as large as a car is wide. `style` has matplotlib's options for the outlines, such
-    as `linestyle`.
+    `colors` has one colour for each box, and `fill` is the opacity of the filled areas.
+    Pedestrians, cyclists and motorcycles also have their class's mark, which is about as wide as a
+    car. `style` holds matplotlib options for the outlines, such as `linestyle`.
     """
+    centers = boxes.center[:, :2]
     corners = boxes.bottom_corners()[..., :2]
-    _draw_footprints(boxes.center[:, :2], corners, ax, colors, fill, style)
+    _draw_footprints(centers, corners, ax, colors, fill, style)
     _draw_small_actors(boxes, ax, colors, filled=fill > 0)
 
 
 def draw_ids_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
-    """Write the label ids of tracked boxes beside them; the recording agent is `own`."""
-    _write_ids(boxes.center[:, :2], boxes.actor_id, ax, colors)
+    """Write the label ids of tracked boxes next to them; the recording agent's is `own`."""
+    centers = boxes.center[:, :2]
+    _write_ids(centers, boxes.actor_id, ax, colors)
 
 
 def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) -> None:
-    """Render an arrow to the position of each moving box in one second, and a key for their scale.
+    """Render an arrow from each moving box to where it will be in 1 s, and a key for the scale.
 
     Boxes with unknown velocities have no arrow.
     """
     rows = np.flatnonzero(_is_moving(boxes))
     if not len(rows):
         return
-    starts, steps = boxes.center[rows, :2].T, boxes.velocity[rows, :2].T
+    x, y = boxes.center[rows, :2].T
+    velocity_x, velocity_y = boxes.velocity[rows, :2].T
     arrow_colors = [colors[row] for row in rows.tolist()]
-    arrows = ax.quiver(*starts, *steps, color=arrow_colors, **ARROW_STYLE)
+    arrows = ax.quiver(x, y, velocity_x, velocity_y, color=arrow_colors, **ARROW_STYLE)
     key = ax.quiverkey(
         arrows,
         0.85,
@@ -148,7 +153,7 @@ def draw_velocities_from_above(boxes: Boxes, ax: Axes, colors: Sequence[str]) ->
 def draw_actors_from_above(
     boxes: Boxes, ax: Axes, colors: Sequence[str], layers: Collection[Layer]
 ) -> None:
-    """Render the requested ones of the layers `boxes`, `velocities` and `ids`."""
+    """Render the layers among `boxes`, `velocities` and `ids` that are requested."""
     if "boxes" in layers:
         draw_boxes_from_above(boxes, ax, colors)
     if "velocities" in layers:
@@ -160,11 +165,11 @@ def draw_actors_from_above(
 def draw_boxes_in_image(
     boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str], **style: Any
 ) -> BoolArray:
-    """Render the edges of boxes (N) of the camera's optical frame, and fill their fronts.
+    """Render the edges of N boxes (in the camera's optical frame), and fill large ones' fronts.
 
-    Edges have a white casing. Parts that are not in front of the camera are cut off. `style` has
-    matplotlib's options for the edges, such as `linestyle`. Returns which boxes (N,) have a part in
-    the image.
+    Edges have a white casing. Parts that are not in front of the camera are cut off. `style` holds
+    matplotlib options for the edges, such as `linestyle`. Returns whether any part of each box is
+    in the image, shape (N,).
     """
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgba_array
@@ -176,13 +181,15 @@ def draw_boxes_in_image(
         line_style = {"colors": rgba[row], "linewidths": _EDGE_WIDTH_PT, **style}
         lines = LineCollection(list(pixels), **line_style)
         ax.add_collection(lines, autolim=False)  # the image has set the limits
-        rgba[:, 3] *= 0.25
-        # the ends of the cut edges, going round, are the corners of the cut face
+        # a filled front would hide a small actor
+        rgba[:, 3] = [0 if name in CATEGORY_MARKERS else 0.25 for name in boxes.category_names]
         is_front = edge < 4
-        rows, starts = np.unique(row[is_front], return_index=True)
+        rows, first_edges = np.unique(row[is_front], return_index=True)
         faces: list[FloatArray] = []
         if len(rows):
-            faces = np.split(pixels[is_front].reshape(-1, 2), 2 * starts[1:])
+            # the ends of the cut edges, in order around the face, are the corners of the cut face
+            corners = pixels[is_front].reshape(-1, 2)
+            faces = np.split(corners, 2 * first_edges[1:])
         fronts = PolyCollection(faces, facecolors=rgba[rows], edgecolors="none")
         ax.add_collection(fronts, autolim=False)
     bounds = _bounds(pixels, row, len(boxes), camera)
@@ -190,15 +197,16 @@ def draw_boxes_in_image(
 
 
 def _casing(pixels: FloatArray) -> PathPatch:
-    """Return white lines below edges (V, 2, 2), which are dark on asphalt.
+    """Return a white casing for edges (V, 2, 2), pixels, which are hard to see on dark asphalt.
 
-    They are one shape, because that takes the least time.
+    All lines are one shape, because that is fastest to render.
     """
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
     codes = np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(pixels))
-    path = Path(pixels.reshape(-1, 2), codes)
+    vertices = pixels.reshape(-1, 2)
+    path = Path(vertices, codes)
     width = _EDGE_WIDTH_PT + _CASING_WIDTH_PT
     return PathPatch(path, fill=False, edgecolor=CASING_COLOR, alpha=0.5, linewidth=width)
 
@@ -213,34 +221,43 @@ def bounds_in_image(boxes: Boxes, camera: PinholeCamera) -> FloatArray:
 
 
 def _bounds(pixels: FloatArray, row: IntArray, count: int, camera: PinholeCamera) -> FloatArray:
-    """Return `bounds_in_image` of `count` boxes, from their edges."""
+    """Return the bounds (count, 4) of boxes from edges (V, 2, 2), pixels, of the boxes `row` (V,).
+
+    Boxes without an edge in the image have no area.
+    """
     bounds = np.zeros((count, 4))
     if len(row):
-        rows, starts = np.unique(row, return_index=True)
-        bounds[rows, :2] = np.minimum.reduceat(pixels.min(axis=1), starts)
-        bounds[rows, 2:] = np.maximum.reduceat(pixels.max(axis=1), starts)
-    return bounds.clip(0, (camera.width, camera.height) * 2)
+        rows, first_edges = np.unique(row, return_index=True)
+        left_top = pixels.min(axis=1)
+        right_bottom = pixels.max(axis=1)
+        bounds[rows, :2] = np.minimum.reduceat(left_top, first_edges)
+        bounds[rows, 2:] = np.maximum.reduceat(right_bottom, first_edges)
+    size = (camera.width, camera.height)
+    return bounds.clip(0, size * 2)
 
 
 def _edges_in_image(boxes: Boxes, camera: PinholeCamera) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return edges (V, 2, 2) in front of the camera, pixels, with their boxes and numbers.
+    """Return the V edges of boxes that are in front of the camera, shape (V, 2, 2), pixels.
 
-    Boxes are rows (V,), numbers are positions in `EDGES`.
+    Also return the row of the box that each edge belongs to, shape (V,), and the edge's index in
+    `EDGES`, shape (V,).
     """
     edges = boxes.corners()[:, EDGES].reshape(-1, 2, 3)
-    pixels, drawn = segments_in_image(edges, camera)
-    row, edge = np.divmod(np.flatnonzero(drawn), len(EDGES))
+    pixels, is_drawn = segments_in_image(edges, camera)
+    edge_numbers = np.flatnonzero(is_drawn)
+    row, edge = np.divmod(edge_numbers, len(EDGES))
     return pixels, row, edge
 
 
 def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]) -> None:
-    """Write the ids of tracked boxes of the camera's optical frame above them.
+    """Write the ids of tracked boxes (in the camera's optical frame) above them.
 
-    Boxes with their top outside the image have none.
+    A box whose top is outside the image has no id.
     """
-    top_centers = boxes.corners()[:, (0, 1, 4, 5)].mean(axis=1)
-    pixels, depth = camera.project(top_centers)
-    rows = np.flatnonzero(camera.in_image(pixels, depth, min_depth=NEAR_PLANE_M))
+    top_corners = boxes.corners()[:, (0, 1, 4, 5)]
+    pixels, depth = camera.project(top_corners.mean(axis=1))
+    in_image = camera.in_image(pixels, depth, min_depth=NEAR_PLANE_M)
+    rows = np.flatnonzero(in_image)
     row_colors = [colors[row] for row in rows.tolist()]
     _write_ids(pixels[rows], boxes.actor_id[rows], ax, row_colors)
 
@@ -248,38 +265,41 @@ def draw_ids_in_image(boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Seq
 def draw_velocities_in_image(
     boxes: Boxes, camera: PinholeCamera, ax: Axes, colors: Sequence[str]
 ) -> None:
-    """Render a line to the position of each moving box's centre in one second.
+    """Draw a line from each moving box's centre to where it will be in 1 s.
 
-    Boxes are in the camera's optical frame.
+    Boxes are in the camera's optical frame. `colors` has one colour per box, including boxes that
+    stand still.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba_array
 
     moving = _is_moving(boxes)
-    center = boxes.center[moving]
-    segments = np.stack([center, center + boxes.velocity[moving]], axis=1)
-    pixels, drawn = segments_in_image(segments, camera)
-    rgba = to_rgba_array(list(colors))[moving][drawn]
+    starts = boxes.center[moving]
+    ends = starts + boxes.velocity[moving]
+    pixels, is_drawn = segments_in_image(np.stack([starts, ends], axis=1), camera)
+    rgba = to_rgba_array(list(colors))[moving][is_drawn]
     lines = LineCollection(list(pixels), colors=rgba, linewidths=2, linestyles=(0, (2, 1)))
     ax.add_collection(lines)
 
 
 def segments_in_image(segments: FloatArray, camera: PinholeCamera) -> tuple[FloatArray, BoolArray]:
-    """Return segments (S, 2, 3) of the optical frame as pixels (V, 2, 2), cut off in front.
+    """Project segments (S, 2, 3) in the optical frame to pixels (V, 2, 2).
 
-    They end at `NEAR_PLANE_M`. The second array, shape (S,), is whether a segment remains.
+    Parts nearer than `NEAR_PLANE_M`, or behind the camera, are cut off. The second array, shape
+    (S,), marks for each segment whether any part of it remains.
     """
-    depth = segments[..., 2]
-    drawn = np.asarray((depth >= NEAR_PLANE_M).any(axis=1))
-    ends, depth = segments[drawn].copy(), depth[drawn]
+    is_drawn = np.asarray((segments[..., 2] >= NEAR_PLANE_M).any(axis=1))
+    ends = segments[is_drawn]
+    depth = ends[..., 2].copy()
     for end, opposite in ((0, 1), (1, 0)):
-        behind = depth[:, end] < NEAR_PLANE_M
-        opposite_depth = depth[behind, opposite]
-        share = (NEAR_PLANE_M - opposite_depth) / (depth[behind, end] - opposite_depth)
-        start = ends[behind, opposite]
-        ends[behind, end] = start + share[:, None] * (ends[behind, end] - start)
+        is_cut = depth[:, end] < NEAR_PLANE_M
+        opposite_depth = depth[is_cut, opposite]
+        share = (NEAR_PLANE_M - opposite_depth) / (depth[is_cut, end] - opposite_depth)
+        opposite_end = ends[is_cut, opposite]
+        offset = ends[is_cut, end] - opposite_end
+        ends[is_cut, end] = opposite_end + share[:, None] * offset
     pixels, _ = camera.project(ends.reshape(-1, 3))
-    return pixels.reshape(-1, 2, 2), drawn
+    return pixels.reshape(-1, 2, 2), is_drawn
 
 
 def _draw_footprints(
@@ -290,7 +310,16 @@ def _draw_footprints(
     fill: float,
     style: Mapping[str, Any],
 ) -> None:
-    """Draw outlines (N, 4, 2), front corners first, and lines from centres (N, 2) to fronts."""
+    """Draw outlines of boxes, and lines from their centres to their fronts.
+
+    Args:
+        centers: Centres, shape (N, 2), metres.
+        corners: Corners, shape (N, 4, 2), metres, front corners first.
+        ax: Axes to draw on.
+        colors: One colour for each box.
+        fill: Opacity of the filled areas.
+        style: Options for the outlines, as for a matplotlib collection.
+    """
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgba_array
 
@@ -307,24 +336,23 @@ def _draw_footprints(
 
 
 def _draw_small_actors(boxes: Boxes, ax: Axes, colors: Sequence[str], *, filled: bool) -> None:
-    """Draw the marks of classes that are too small to be found; a mark is as wide as a car."""
+    """Draw marks, about as wide as a car, for actors whose boxes are too small to notice."""
     from matplotlib.collections import PolyCollection
 
-    corners_of_rows = {}
-    for row, name in enumerate(boxes.category_names):
-        corners = _MARK_CORNERS.get(CATEGORY_MARKERS.get(name, ""))
-        if corners is not None:
-            corners_of_rows[row] = corners
-    if not corners_of_rows:
-        return
-    point = float(np.ptp(ax.get_xlim())) / ax.bbox.width * ax.figure.dpi / 72
-    radius = max(_MARK_RADIUS_M, _MIN_MARK_RADIUS_PT * point)
+    metres_per_point = float(np.ptp(ax.get_xlim())) / ax.bbox.width * ax.figure.dpi / 72
+    radius = max(_MARK_RADIUS_M, _MIN_MARK_RADIUS_PT * metres_per_point)
     marks = []
-    for row, corners in corners_of_rows.items():
-        angle = np.pi / 2 + 2 * np.pi * np.arange(corners) / corners
+    mark_colors = []
+    for row, name in enumerate(boxes.category_names):
+        if name not in CATEGORY_MARKERS:
+            continue
+        corner_count = _MARK_CORNERS[CATEGORY_MARKERS[name]]
+        angle = np.pi / 2 + 2 * np.pi * np.arange(corner_count) / corner_count
         circle = np.column_stack([np.cos(angle), np.sin(angle)])
         marks.append(boxes.center[row, :2] + radius * circle)
-    mark_colors = [colors[row] for row in corners_of_rows]
+        mark_colors.append(colors[row])
+    if not marks:
+        return
     style: dict[str, Any] = {"facecolors": "none", "edgecolors": mark_colors}
     if filled:
         style = {"facecolors": mark_colors, "edgecolors": CASING_COLOR}
@@ -339,14 +367,18 @@ def _is_moving(boxes: Boxes) -> BoolArray:
 def _write_ids(positions: FloatArray, actor_ids: IntArray, ax: Axes, colors: Sequence[str]) -> None:
     """Write the ids of tracked actors at positions (N, 2).
 
-    The ids of the accident's actors, with hues instead of shades, come first.
+    If space is short, the ids of the accident's actors, which have hues, take precedence.
     """
     shades = set(category_colors().values())
-    tracked = np.flatnonzero(actor_ids != UNTRACKED_ID).tolist()
-    rows = sorted(tracked, key=lambda row: colors[row] in shades)
-    words = ["own" if actor_ids[row] == OWN_ACTOR_ID else str(actor_ids[row]) for row in rows]
-    chips = zip(words, positions[rows], strict=True)
-    place_chips(ax, chips, colors=[colors[row] for row in rows])
+    tracked_rows = np.flatnonzero(actor_ids != UNTRACKED_ID).tolist()
+    rows = sorted(tracked_rows, key=lambda row: colors[row] in shades)
+    chips = []
+    for row in rows:
+        is_own = actor_ids[row] == OWN_ACTOR_ID
+        words = "own" if is_own else str(actor_ids[row])
+        chips.append((words, positions[row]))
+    chip_colors = [colors[row] for row in rows]
+    place_chips(ax, chips, colors=chip_colors)
 
 
 def write_beside(ax: Axes, words: str, position: tuple[float, float], color: str) -> None:
@@ -354,11 +386,12 @@ def write_beside(ax: Axes, words: str, position: tuple[float, float], color: str
 
     Words outside the axes are left out.
     """
-    place_chips(ax, [(words, position)], colors=[color])
+    chip = (words, position)
+    place_chips(ax, [chip], colors=[color])
 
 
 def draw_trail(path: FloatArray, ax: Axes, color: str, **style: Any) -> LineCollection:
-    """Render a path (T, 2), metres, from the present on or back, fading towards its end."""
+    """Render a path (T, 2), metres, that starts in the current frame and fades towards its end."""
     return _draw_trails([path], ax, [color], style)
 
 
@@ -372,32 +405,39 @@ def draw_trails(
     seconds: tuple[float, float],
     ax: Axes,
 ) -> None:
-    """Render past (thin) and future (thick) paths of actors, by all agents' labels.
+    """Render past (thin) and future (thick) paths of actors, from the labels of all agents.
 
-    `sample` is the record of the present, `seconds` are the lengths of both. Boxes without an id
-    have no trail.
+    Args:
+        dataset: The release.
+        sample: Record of the current sample.
+        boxes: Actors; the ones without an id have no trail.
+        colors: One colour for each actor.
+        target_from_world: Pose of the world in the frame of the axes.
+        seconds: Length of the past and of the future paths, seconds.
+        ax: Axes to render on.
     """
     tracks = scenario_tracks(dataset, sample["scenario_token"])
     own_actor = dataset.get("agent", sample["agent_token"])["actor_id"]
     present = int(sample["token"].rsplit("/", 1)[1])
-    back, ahead = (round(span / FRAME_PERIOD) for span in seconds)
+    past_count, future_count = (round(duration / FRAME_PERIOD) for duration in seconds)
     centers = target_from_world.apply(tracks.boxes.center)[:, :2]
-    pasts, futures = [], []
-    for actor_id in boxes.actor_id.tolist():
-        actor = actor_id
-        if actor_id == OWN_ACTOR_ID:
-            actor = own_actor
-        past_rows = _track_rows(tracks, actor, present - back, present)
-        pasts.append(centers[past_rows][::-1])
-        futures.append(centers[_track_rows(tracks, actor, present, present + ahead)])
-    _draw_trails(pasts, ax, colors, {"linewidths": 0.8})
-    _draw_trails(futures, ax, colors, {"linewidths": 2.0})
+    past_paths = []
+    future_paths = []
+    for label_id in boxes.actor_id.tolist():
+        actor = own_actor if label_id == OWN_ACTOR_ID else label_id
+        past_rows = _track_rows(tracks, actor, present - past_count, present)
+        future_rows = _track_rows(tracks, actor, present, present + future_count)
+        past_paths.append(centers[past_rows][::-1])
+        future_paths.append(centers[future_rows])
+    _draw_trails(past_paths, ax, colors, {"linewidths": 0.8})
+    _draw_trails(future_paths, ax, colors, {"linewidths": 2.0})
 
 
 def _track_rows(tracks: ScenarioTracks, actor: int | None, start: int, end: int) -> IntArray:
-    """Return the rows of an actor from frame `start` to `end`, both included, by time."""
+    """Return an actor's row numbers from frame `start` to `end` inclusive, in order of time."""
+    is_actor = tracks.actor_id == actor
     is_within = (tracks.index >= start) & (tracks.index <= end)
-    return np.flatnonzero((tracks.actor_id == actor) & is_within)
+    return np.flatnonzero(is_actor & is_within)
 
 
 def _draw_trails(
@@ -407,7 +447,8 @@ def _draw_trails(
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgb
 
-    lines, rgba = [np.zeros((0, 2, 2))], [np.zeros((0, 4))]
+    lines = [np.zeros((0, 2, 2))]
+    rgba = [np.zeros((0, 4))]
     for path, color in zip(paths, colors, strict=True):
         if len(path) > 1 and np.ptp(path, axis=0).max() > _MIN_TRAIL_LENGTH_M:
             opacity = np.linspace(1, _MIN_TRAIL_OPACITY, len(path) - 1)
@@ -422,20 +463,26 @@ def _draw_trails(
 
 
 def collider_ids(dataset: Dataset, sample: RowArgument) -> set[int]:
-    """Return the label ids, in this sample, of the pair that collides by meta.
+    """Return the label ids, in this sample, of the colliding pair that meta names.
 
-    The id is −100 if the sample's agent is one of them.
+    The label id of the sample's agent itself is −100.
     """
     record = dataset.get("sample", sample)
     collision = dataset.get("scenario", record["scenario_token"])["collision"]
     if collision is None:
         return set()
     agent_id = dataset.get("agent", record["agent_token"])["actor_id"]
-    return {OWN_ACTOR_ID if actor_id == agent_id else actor_id for actor_id in collision["ids"]}
+    label_ids = set()
+    for actor_id in collision["ids"]:
+        if actor_id == agent_id:
+            label_ids.add(OWN_ACTOR_ID)
+        else:
+            label_ids.add(actor_id)
+    return label_ids
 
 
 def recorder_ids(dataset: Dataset, sample: RowArgument) -> dict[int, AgentName]:
-    """Return label id → agent, for the recording vehicles; −100 is the sample's own agent."""
+    """Map the label ids of recording vehicles to agents; the sample's agent has −100."""
     record = dataset.get("sample", sample)
     agents = {}
     for actor, agent in recorders_of(dataset, record["scenario_token"]).items():
@@ -445,7 +492,7 @@ def recorder_ids(dataset: Dataset, sample: RowArgument) -> dict[int, AgentName]:
 
 
 def recorders_of(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
-    """Return actor id → agent, for the recording vehicles of a scenario (a token).
+    """Map the actor ids of a scenario's recording vehicles to agents; `scenario` is a token.
 
     Vehicles that meta does not name are left out.
     """
@@ -458,15 +505,16 @@ def recorders_of(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
 
 
 def agent_letters(agent: str) -> str:
-    """Return one or two letters for an agent: E, EB, O, OB or I."""
-    return "".join(word[0] for word in short_name(agent).split()).upper()
+    """Abbreviate an agent's name to one or two letters: E, EB, O, OB or I."""
+    words = short_name(agent).upper().split()
+    return "".join(word[0] for word in words)
 
 
 def actor_color(category: str, agent: str | None = None, *, collides: bool = False) -> str:
     """Return the colour of an actor's box.
 
-    It is red for colliders, otherwise the agent's colour, otherwise the category's. Some styles use
-    the category's colour for agents too.
+    Actors that collide are red. Other agents have their agent's colour, or in some styles their
+    category's; all other actors have their category's colour.
     """
     if collides:
         return COLLIDER_COLOR
@@ -476,12 +524,14 @@ def actor_color(category: str, agent: str | None = None, *, collides: bool = Fal
 
 
 def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str]:
-    """Return the colours of boxes of a sample, or of several agents.
+    """Return the colour of each box by the role of its actor.
 
-    In a sample's own boxes its agent has the id −100, in others its CARLA id.
+    The boxes come from the sample's label, where its agent has the id −100, or from several
+    agents, where it has its CARLA id.
     """
     record = dataset.get("sample", sample)
-    colliders, recorders = collider_ids(dataset, record), recorder_ids(dataset, record)
+    colliders = collider_ids(dataset, record)
+    recorders = recorder_ids(dataset, record)
     actors = zip(label_ids(dataset, record, boxes), boxes.category_names, strict=True)
     return [
         actor_color(category, recorders.get(actor), collides=actor in colliders)
@@ -490,7 +540,7 @@ def role_colors(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[str
 
 
 def label_ids(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[int]:
-    """Return the label ids, in this sample, of boxes that may have CARLA ids.
+    """Convert the ids of boxes, which may be CARLA ids, to label ids in this sample.
 
     The sample's agent itself is −100.
     """
@@ -501,33 +551,34 @@ def label_ids(dataset: Dataset, sample: RowArgument, boxes: Boxes) -> list[int]:
 
 
 def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
-    """Return short names of the colliding pair: the letters of agents, otherwise the category.
+    """Map the actor ids of the colliding pair to short names.
 
-    Letters are for example `E` and `OB`.
+    An agent is named by its letters, such as `E` or `OB`, and any other actor by its category.
     """
     agents = recorders_of(dataset, contact.frame.rsplit("/", 1)[0])
     tags = {}
-    for actor, instance in zip(contact.actor_ids, contact.instances, strict=True):
+    for actor, instance_token in zip(contact.actor_ids, contact.instances, strict=True):
         if actor in agents:
             tags[actor] = agent_letters(agents[actor])
         else:
-            tags[actor] = dataset.instance.get(instance)["category"]
+            tags[actor] = dataset.instance.get(instance_token)["category"]
     return tags
 
 
 def camera_name(channel: str) -> str:
-    """Return a camera's short name for readers: `front`, `back left`; another sensor's channel."""
+    """Return a camera's short name, such as `back left`; other channels are returned unchanged."""
     if not channel.startswith("Camera_"):
         return channel
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", channel.removeprefix("Camera_")).lower()
+    name = channel.removeprefix("Camera_")
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()
 
 
 def in_drawing_order(agents: Collection[str]) -> list[str]:
-    """Return agents in the order of `taxonomy.AGENTS`, as in panels and legends."""
+    """Sort agents in the order of `taxonomy.AGENTS`, which panels and legends use."""
     return sorted(agents, key=AGENTS.index)
 
 
 def simultaneous_sample(sample: Mapping[str, Any], agent: str) -> str:
-    """Return the token of an agent's sample at the moment of another agent's sample (a record)."""
+    """Return the token of an agent's sample in the same frame as another agent's sample record."""
     scenario, _, number = sample["token"].rsplit("/", 2)
     return sample_token(scenario, agent, int(number))

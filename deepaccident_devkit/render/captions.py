@@ -1,4 +1,4 @@
-"""Captions of pictures: their moment, the meaning of their colours, and missing sensor files."""
+"""Captions of pictures: the moment, the meaning of the colours, and missing sensor files."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.release.store import folder_entries
 from deepaccident_devkit.render.boxes import in_drawing_order
+from deepaccident_devkit.render.figures import label_axes, with_light_grid
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     CATEGORY_MARKERS,
@@ -31,75 +32,88 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.font_manager import FontProperties
 
-# The best positions of line breaks in a title.
-_BREAKS: Final = re.compile(r"(?<=/)|(?<=, )|(?<=: )|(?<=; )")
-# Share of a figure's width that a title may take.
-_TITLE_SHARE: Final = 0.92
-# Least factor of the size of letters before a title is broken into lines.
-_MIN_FONT_SCALE: Final = 0.85
-# Share of a panel's width for its title: text beside the axes moves the title to one side, and in
-# few pixels letters become wider.
-_PANEL_SHARE: Final = 0.78
-# Points of a token's letters. A token is for copying, not for reading.
-_TOKEN_SIZE_PT: Final = 7.5
+# Where a title is best broken into lines, but not in `m/s`.
+_BREAKS = re.compile(r"(?<=/)(?!s\b)|(?<=, )|(?<=: )|(?<=; )|(?<=· )")
+# Where a title is broken if that is not enough.
+_SPACES = re.compile(r"(?<= )")
+# Share of a figure's width that its title may take.
+_TITLE_SHARE = 0.92
+# Smallest factor by which letters shrink before a title is broken into lines instead.
+_MIN_FONT_SCALE = 0.85
+# Share of a panel's width that its title may take: text next to the axes shifts the title, and
+# letters become wider at low resolution.
+_PANEL_SHARE = 0.78
+# Size of a token's letters in points. A token is for copying, not for reading.
+_TOKEN_SIZE_PT = 7.5
 # Marks the token at the foot of a title.
-_FOOT_GID: Final = "token"
-_CAPITALS: Final = re.compile(r"(?<=[a-z])(?=[A-Z])")
-# Style of a legend in axes, so that nothing is beside them.
+_FOOT_GID = "token"
+# Separates a scene, a moment, an agent and an actor in a title.
+_SEPARATOR = " · "
+_CAPITALS = re.compile(r"(?<=[a-z])(?=[A-Z])")
+# Style of a legend inside the axes, where it takes no space around them, and of one below the
+# label of their x axis.
 INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
-# Inches of a sign and the blanks around it, for letters of one point.
-_HANDLE_WIDTH_IN: Final = 0.044
-# Share of a panel's width for a legend below it.
-_LEGEND_SHARE: Final = 0.86
-_LEGEND_SPACING: Final[Mapping[str, Any]] = {"handlelength": 1.2, "columnspacing": 1.0}
-# Mark the words of a grey panel, and words for a title, so that `missing_words` finds them.
-_MISSING_GID, _LACKS_GID = "missing", "lacks"
-_NO_CLOUD_PREFIX: Final = "no LiDAR file of "
+BELOW: Final[Mapping[str, Any]] = {
+    "loc": "upper center",
+    "bbox_to_anchor": (0.5, 0),
+    "borderaxespad": 4.5,
+}
+# Width in inches of a legend symbol and the space around it, per point of letter size.
+_HANDLE_WIDTH_IN = 0.044
+# Share of a panel's width that a legend below it may take.
+_LEGEND_SHARE = 0.86
+_LEGEND_SPACING: Mapping[str, Any] = {"handlelength": 1.2, "columnspacing": 1.0}
+# Labels of the words in a grey panel, and of words for a title; `missing_words` looks for them.
+_MISSING_GID = "missing"
+_LACKS_GID = "lacks"
+_NO_CLOUD_PREFIX = "no LiDAR file of "
 
 
 def scene_words(record: Mapping[str, Any]) -> str:
-    """Return the town and weather of a scenario, as far as meta has them: `Town10HD, wet night`."""
+    """Name a scenario's town and weather, if meta states them: `Town10HD, wet night`."""
     weather = _CAPITALS.sub(" ", record["weather"] or "").lower()
     separator = " at " if weather.endswith("rain") else " "
-    conditions = separator.join(filter(None, [weather, record["time_of_day"]])).lower()
-    return _joined([record["town"], conditions])
+    conditions = _join_parts([weather, record["time_of_day"]], separator)
+    return _join_parts([record["town"], conditions.lower()])
 
 
 def scenario_words(record: Mapping[str, Any]) -> str:
-    """Return a scenario's name for readers, cars first.
+    """Describe a scenario to readers by its town, its weather and how it ends.
 
-    For example `Town02, wet night: car hits pedestrian`, or `…: no collision`.
+    For example `Town02, wet night: car hits pedestrian` (cars come first), or `…: no collision`.
     """
     collision: Any = record["collision"]
     if collision is not None:
-        order = (*CATEGORIES, *collision["classes"]).index
-        end = " hits ".join(sorted(collision["classes"], key=order))
+        order = (*CATEGORIES, *collision["classes"])
+        categories = sorted(collision["classes"], key=order.index)
+        end = " hits ".join(categories)
     elif record["weather"] is None:
         end = "end unknown"
     else:
         end = "no collision"
-    return _joined([scene_words(record), end], ": ")
+    return _join_parts([scene_words(record), end], ": ")
 
 
-def _joined(parts: Iterable[str | None], separator: str = ", ") -> str:
-    return separator.join(part for part in parts if part)
+def _join_parts(parts: Iterable[str | None], separator: str = ", ") -> str:
+    """Join the parts that are neither None nor empty."""
+    return separator.join(filter(None, parts))
 
 
 def moment_words(dataset: Dataset, token: str) -> str:
-    """Return the moment of a frame's token, and the agent of a sample's token.
+    """Describe a moment: the time of a frame (a token), for a sample also its agent.
 
-    For example `1.0 s to the impact, ego behind`.
+    For example `1.0 s before the impact · ego behind`.
     """
     kind, name, *agents, number = token.split("/")[:4]
     frame = dataset.get("frame", f"{kind}/{name}/{number}")
     time_left = dataset.samples_of(frame)[0]["time_to_impact"]
     if time_left is None:
-        moment = f"{frame['timestamp']:.1f} s"
+        moment = f"t = {frame['timestamp']:.1f} s"
     elif time_left == 0:
-        moment = "the impact"
+        moment = "at the impact"
     else:
-        moment = f"{time_left:.1f} s to the impact"
-    return ", ".join([moment, *map(short_name, agents)])
+        moment = f"{time_left:.1f} s before the impact"
+    return _SEPARATOR.join([moment, *map(short_name, agents)])
 
 
 def set_scene_title(
@@ -111,16 +125,17 @@ def set_scene_title(
     below: str = "",
     **style: Any,
 ) -> None:
-    """Title axes or a figure `Town10HD, wet night: 1.0 s to the impact, ego`, and a small token.
+    """Title axes or a figure `Town10HD, wet night · 1.0 s before the impact · ego`.
 
-    The title of a scenario or an actor begins with `scenario_words`. The token is that of a
-    scenario, frame, sample, sensor file, box or actor; it is beneath the title. `words` follow on
-    the same line, `below` on another one, and on a last one the words of `write_missing` for these
-    axes, or for a figure's axes.
+    Axes in a figure of the caller get no title: it is the caller's. The token may be of a scenario,
+    frame, sample, sensor file, box or actor; it is written beneath the title. The title of a
+    scenario or an actor begins with `scenario_words`. `words` follow on the same line, `below` on
+    the next. The last line has the words of `write_missing` for these axes, or for all axes of the
+    figure.
     """
     from matplotlib.axes import Axes
 
-    if not current_style().titled:
+    if not current_style().titled or (isinstance(target, Axes) and is_callers(target)):
         return
     kind, name, *parts = token.split("/")
     record = dataset.get("scenario", f"{kind}/{name}")
@@ -128,14 +143,18 @@ def set_scene_title(
     if is_whole_scenario:
         scene = scenario_words(record)
     else:
-        scene = _joined([scene_words(record), moment_words(dataset, token)], ": ")
+        scene = _join_parts([scene_words(record), moment_words(dataset, token)], _SEPARATOR)
     axes: Any = target.axes
     if isinstance(target, Axes):
         axes = [target]
         style.setdefault("fontsize", "medium")
     missing_texts = [text for ax in axes for text in ax.texts if text.get_gid() == _LACKS_GID]
-    lines = [_joined([scene, words]), below, "; ".join(_missing_parts(missing_texts))]
-    set_title(target, _joined(lines, "\n"), token=token, **style)
+    lines = [
+        _join_parts([scene, words], _SEPARATOR),
+        below,
+        "; ".join(_missing_parts(missing_texts)),
+    ]
+    set_title(target, _join_parts(lines, "\n"), token=token, **style)
 
 
 def set_title(
@@ -148,27 +167,28 @@ def set_title(
 ) -> None:
     """Give axes or a figure a title that fits the figure's width, and a token beneath it.
 
-    Only some styles have tokens. If a line is a little too long, the letters are smaller. If it is
-    far too long, it is broken, best after `/`, `:` or a comma. The title is centred as a block.
+    Only some styles show tokens. If a line is a little too long, the letters shrink. If it is far
+    too long, it is broken, preferably after `/`, `:` or a comma. The title is centred as a block.
     """
     from matplotlib import rcParams
     from matplotlib.axes import Axes
     from matplotlib.font_manager import FontProperties
 
-    is_panel, artist = isinstance(target, Axes), cast("Any", target)
+    is_panel = isinstance(target, Axes)
+    artist = cast("Any", target)
     default_size = rcParams["axes.titlesize" if is_panel else "figure.titlesize"]
     font = FontProperties(size=fontsize or default_size)
     width = 72 * room_of(target)
-    text, size = _fitted(words, font, width, text_size())
+    text, size = _fit_words(words, font, width, text_size())
     shown_token = token if current_style().tokens else ""
     token_font = FontProperties(size=_TOKEN_SIZE_PT)
-    token_text, token_size = _fitted(shown_token, token_font, width, _TOKEN_SIZE_PT)
+    token_text, token_size = _fit_words(shown_token, token_font, width, _TOKEN_SIZE_PT)
     if token_text:
-        # blank lines reserve the space for the token, so that the layout need not know of it
+        # blank lines reserve the space for the token, so that the layout need not know about it
         token_lines = token_text.count("\n") + 1
         text += "\n " * math.ceil(token_size * token_lines / size)
     if is_panel:
-        # matplotlib measures all ticks, again and again, to find a title's height
+        # matplotlib measures all ticks over and over to find a title's height
         style.setdefault("y", 1.0)
         title = artist.set_title(text, fontsize=size, **style)
     else:
@@ -176,75 +196,119 @@ def set_title(
     _write_token(target, token_text, token_size, title)
 
 
+def set_note(fig: Figure, words: str, **style: Any) -> None:
+    """Write a note below all panels of a figure, in lines that fit the figure's width."""
+    from matplotlib.font_manager import FontProperties
+
+    font = FontProperties(size=text_size())
+    text, size = _fit_words(words, font, 72 * room_of(fig), text_size())
+    fig.supxlabel(text, fontsize=size, **{"color": MUTED_COLOR, **style})
+
+
+def titled_from_above(ax: Axes, title: str, *, grid: bool) -> Axes:
+    """Finish a view from above, in metres, with a small title that fits; return its axes."""
+    ax.set_aspect("equal")
+    label_axes(ax, "ego")
+    if not is_callers(ax):
+        set_title(ax, title, fontsize=text_size(), y=None)
+    if grid:
+        with_light_grid(ax, "both")
+    return ax
+
+
 def _write_token(target: Any, token: str, size: float, title: Any) -> None:
-    """Write a token in the lowest lines of a title's text, instead of an older one."""
-    from matplotlib.text import Annotation
+    """Write a token over the lowest lines of a title's text, and remove the previous token."""
+    from deepaccident_devkit.render.own_figure import TitleToken
 
     figure = target.figure
     for artist in [*figure.artists]:
         if artist.get_gid() == _FOOT_GID and artist.xycoords is title:
             artist.remove()
-    if not token:
-        return
-    annotation = Annotation(
-        token,
-        (0.5, 0),
-        xycoords=title,
-        annotation_clip=False,
-        ha="center",
-        va="bottom",
-        fontsize=size,
-        color=MUTED_COLOR,
-        gid=_FOOT_GID,
-    )
-    figure.add_artist(annotation).set_in_layout(False)
+    if token:
+        artist = TitleToken(token, title, fontsize=size, color=MUTED_COLOR, gid=_FOOT_GID)
+        figure.add_artist(artist).set_in_layout(False)
+
+
+def is_callers(ax: Axes) -> bool:
+    """Return whether axes are in a figure of the caller, not in one that this package made."""
+    from deepaccident_devkit.render.own_figure import OwnFigure
+
+    return not isinstance(ax.figure.figure, OwnFigure)
 
 
 def room_of(target: Axes | Figure, panel_share: float = _PANEL_SHARE) -> float:
-    """Return the inches that words above or below a figure or a panel may take.
+    """Return how wide words above or below a figure or a panel may be, in inches.
 
-    They are a share of the figure's width, or a share of a panel's width.
+    It is a fixed share of a figure's width, or `panel_share` of a panel's width.
     """
     from matplotlib.axes import Axes
 
-    fig: Any = target.figure if isinstance(target, Axes) else target
-    share, spec = _TITLE_SHARE, None
+    fig: Any = target
+    share = _TITLE_SHARE
     if isinstance(target, Axes):
-        share, spec = panel_share, target.get_subplotspec()
-    if spec is not None:
-        grid: Any = spec.get_gridspec()
-        ratios = grid.get_width_ratios() or [1] * grid.ncols
-        share *= sum(ratios[spec.colspan.start : spec.colspan.stop]) / sum(ratios)
+        fig = target.figure
+        share = panel_share
+        spec = target.get_subplotspec()
+        if spec is not None:
+            grid: Any = spec.get_gridspec()
+            ratios = grid.get_width_ratios() or [1] * grid.ncols
+            panel_ratios = ratios[spec.colspan.start : spec.colspan.stop]
+            share *= sum(panel_ratios) / sum(ratios)
     return float(share * fig.bbox.width / fig.dpi)
 
 
-def _fitted(words: str, font: FontProperties, width: float, min_size: float) -> tuple[str, float]:
-    """Return words in lines that fit a width (points), and the size of their letters.
+def _fit_words(
+    words: str, font: FontProperties, width: float, min_size: float
+) -> tuple[str, float]:
+    """Break words into lines that fit a width in points; also return the font size.
 
-    The size is at least `min_size` if possible.
+    The size only falls below `min_size` if the lines do not fit otherwise.
     """
     size = font.get_size_in_points()
-    line_width = _max_line_width(words, font)
+    lines = words.split("\n")
+    longest = _longest_width(lines, font)
     min_scale = max(_MIN_FONT_SCALE, min(1.0, min_size / size))
-    if line_width > width / min_scale:
-        words = "\n".join(_broken(line, width, font) for line in words.split("\n"))
-        line_width = _max_line_width(words, font)
-    return words, size * min(1.0, width / max(line_width, 1.0))
+    for breaks in (_BREAKS, _SPACES):
+        if longest <= width / min_scale:
+            break
+        broken_lines: list[str] = []
+        for line in lines:
+            broken_lines += _break_line(line, width, font, breaks)
+        lines = broken_lines
+        longest = _longest_width(lines, font)
+    scale = min(1.0, width / max(longest, 1.0))
+    return "\n".join(lines), size * scale
 
 
-def _broken(line: str, width: float, font: FontProperties) -> str:
-    """Return a line, broken so that each part fits a width (points), if possible."""
-    lines = [""]
-    for part in _BREAKS.split(line):
-        if lines[-1] and text_width(lines[-1] + part.rstrip(), font) > width:
-            lines.append("")
-        lines[-1] += part
-    return "\n".join(broken_line.rstrip() for broken_line in lines)
+def _break_line(
+    line: str, width: float, font: FontProperties, breaks: re.Pattern[str]
+) -> list[str]:
+    """Break a line into as few parts as fit a width in points, of about equal widths."""
+    best_parts = parts = _fill_lines(line, width, font, breaks)
+    while len(parts) == len(best_parts) > 1:
+        best_parts = parts
+        longest = _longest_width(parts, font)
+        parts = _fill_lines(line, longest - 1.0, font, breaks)
+        if _longest_width(parts, font) >= longest:
+            break
+    return best_parts
 
 
-def _max_line_width(text: str, font: FontProperties) -> float:
+def _fill_lines(
+    line: str, width: float, font: FontProperties, breaks: re.Pattern[str]
+) -> list[str]:
+    """Break a line where the next phrase would exceed a width in points."""
+    parts = [""]
+    for phrase in breaks.split(line):
+        if parts[-1] and text_width(parts[-1] + phrase.rstrip(), font) > width:
+            parts.append("")
+        parts[-1] += phrase
+    return [part.strip().removesuffix(" ·") for part in parts]
+
+
+def _longest_width(lines: Iterable[str], font: FontProperties) -> float:
     """Return the width of the longest line in points."""
-    return max(text_width(line, font) for line in text.split("\n"))
+    return max(text_width(line, font) for line in lines)
 
 
 def text_width(text: str, font: FontProperties) -> float:
@@ -256,7 +320,7 @@ def text_width(text: str, font: FontProperties) -> float:
 
 @lru_cache(maxsize=1024)  # a video writes the same words again and again
 def _width_in(file: str, text: str, size: float) -> float:
-    """Return the width of a line in a font's file, in points."""
+    """Return the width of a line in points, in the font of a file."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 
@@ -267,23 +331,26 @@ def _width_in(file: str, text: str, size: float) -> float:
 
 
 def hue_meanings() -> dict[str, str]:
-    """Return name → hue, for the colliding pair and the agents."""
+    """Map the colliding pair and each agent, by name, to their hues."""
     meanings = {"colliding pair": COLLIDER_COLOR}
     for agent, color in AGENT_COLORS.items():
         meanings[short_name(agent)] = color
     return meanings
 
 
-def box_handles(colors: Collection[str]) -> list[Artist]:
-    """Return handles for colours of boxes: a patch, or the mark of a class of small actors."""
+def box_handles(
+    colors_from_above: Collection[str], colors_in_images: Collection[str] = ()
+) -> list[Artist]:
+    """Make legend handles for the colours of boxes: patches or, for small actors in maps, marks."""
     from matplotlib.colors import to_rgba
     from matplotlib.patches import Patch
 
+    shown_colors = {*colors_from_above, *colors_in_images}
     handles: list[Artist] = []
     for name, color in {**hue_meanings(), **category_colors()}.items():
-        if color not in colors:
+        if color not in shown_colors:
             continue
-        if name in CATEGORY_MARKERS:
+        if name in CATEGORY_MARKERS and color in colors_from_above:
             handles.append(_mark(name, CATEGORY_MARKERS[name], color))
         else:
             handles.append(Patch(label=name, facecolor=to_rgba(color, 0.25), edgecolor=color))
@@ -291,19 +358,26 @@ def box_handles(colors: Collection[str]) -> list[Artist]:
 
 
 def agent_handles(agents: Collection[str]) -> list[Artist]:
-    """Return a dot for each agent, in the order of all pictures."""
+    """Make a legend handle, a dot, for each agent, in the order that all pictures use."""
     names = in_drawing_order(agents)
     return [_mark(short_name(agent), "o", AGENT_COLORS[agent]) for agent in names]
 
 
-def handles_from_above(colors: Collection[str], clouds: Collection[str]) -> list[Artist]:
-    """Return handles for the colours of boxes and of agents' clouds, each once.
+def handles_of_scene(
+    colors_from_above: Collection[str],
+    clouds: Collection[str],
+    colors_in_images: frozenset[str] = frozenset(),
+    *,
+    is_short: bool = False,
+) -> list[Artist]:
+    """Make one legend handle for each colour of boxes and of agents' clouds.
 
-    In a small picture the names of agents are at their clouds.
+    In a short legend, such as a small picture's, clouds have no handles: agents are named next to
+    them.
     """
     cloud_colors = {AGENT_COLORS[agent] for agent in clouds}
-    handles = box_handles(set(colors) - cloud_colors)
-    if not current_style().few:
+    handles = box_handles(set(colors_from_above) - cloud_colors, colors_in_images - cloud_colors)
+    if not (is_short or current_style().shows_few_panels):
         handles += agent_handles(clouds)
     return handles
 
@@ -317,9 +391,9 @@ def _mark(label: str, marker: str, color: str) -> Artist:
 def draw_legend(
     target: Any, handles: Sequence[Artist], *, columns: int | None = None, **style: Any
 ) -> None:
-    """Render a legend, by default below all panels of a figure; none without handles.
+    """Render a legend, by default below all panels of a figure, with as many columns as fit.
 
-    It has as many columns as fit.
+    Without handles there is no legend.
     """
     from matplotlib.font_manager import FontProperties
 
@@ -343,9 +417,11 @@ def draw_legend(
 
 
 def _fitting_columns(widths: Sequence[float], max_columns: int, width: float) -> int:
-    """Return how many columns, each as wide as its widest sign, fit a width (inches)."""
+    """Return how many columns fit a width in inches; each is as wide as its widest handle."""
     for columns in range(min(max_columns, len(widths)), 1, -1):
-        if sum(max(column) for column in np.array_split(widths, columns)) < width:
+        widths_by_column = np.array_split(widths, columns)
+        column_widths = [max(column) for column in widths_by_column]
+        if sum(column_widths) < width:
             return columns
     return 1
 
@@ -353,13 +429,19 @@ def _fitting_columns(widths: Sequence[float], max_columns: int, width: float) ->
 def draw_legend_outside(
     ax: Axes, handles: Sequence[Artist], *, columns: int | None = None, **style: Any
 ) -> None:
-    """Render a legend below axes, or on a slide, which is wide, to their right."""
-    anchor: dict[str, Any] = {
-        "loc": "upper center",
-        "bbox_to_anchor": (0.5, 0),
-        "borderaxespad": 4.5,
-    }
-    if current_style().room == "slide":
+    """Render a legend below the axes or, if the style is wide, to the right of a map.
+
+    In a figure of the caller without a layout engine, which could cut it off, it is in the axes.
+    """
+    has_scale = ax.xaxis.get_visible()  # a map's, not an image's
+    figure: Any = ax.figure.figure
+    anchor = BELOW
+    if is_callers(ax) and figure.get_layout_engine() is None:
+        columns = 1
+        anchor = INSIDE
+    elif not has_scale:
+        anchor = {**BELOW, "borderaxespad": 0.5}
+    elif current_style().is_wide:
         columns = 1
         anchor = {"loc": "upper left", "bbox_to_anchor": (1, 1), "borderaxespad": 0.5}
     draw_legend(ax, handles, columns=columns, **{**anchor, **style})
@@ -376,19 +458,19 @@ def draw_legend_of_fills(ax: Axes, colors: Mapping[str, str]) -> None:
 
 
 def has_sensor_file(dataset: Dataset, sample_data: str) -> bool:
-    """Return whether a sensor's file, by its token, is present."""
+    """Return whether the file of a sensor (a token) is present."""
     return dataset.sensor_path(sample_data).exists()
 
 
 def has_cloud(dataset: Dataset, sample: str) -> bool:
-    """Return whether the LiDAR file of a sample, by its token, is present."""
+    """Return whether the LiDAR file of a sample (a token) is present."""
     return has_sensor_file(dataset, f"{sample}/{LIDAR}")
 
 
 def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
-    """Make axes a grey panel with the reason, at its top, why an image (a token) is missing.
+    """Turn axes into a grey panel that states at its top why an image (a token) is missing.
 
-    The words are beneath all data.
+    The words are drawn beneath all data.
     """
     agent, _, channel = sample_data.rsplit("/", 3)[1:]
     ax.set_facecolor(MISSING_COLOR)
@@ -410,9 +492,9 @@ def draw_missing_image(dataset: Dataset, sample_data: str, ax: Axes) -> None:
 
 
 def absence_text(dataset: Dataset, sample_data: str) -> str:
-    """Return why a sensor's file, by its token, is missing.
+    """State why the file of a sensor (a token) is missing.
 
-    Its folder has files of other frames, or none at all.
+    Either only this frame's file is missing, or none of the sensor's files was downloaded.
     """
     folder = dataset.sensor_path(sample_data).parent
     if folder.is_dir() and folder_entries(folder):
@@ -421,7 +503,7 @@ def absence_text(dataset: Dataset, sample_data: str) -> str:
 
 
 def write_missing(ax: Axes, words: str) -> None:
-    """Add words on missing data to the title of axes or of their figure, which is set later.
+    """Add words about missing data to the title of axes or of their figure, which is set later.
 
     Empty words add nothing.
     """
@@ -437,16 +519,17 @@ def missing_clouds_text(agents: Collection[str]) -> str:
 
 
 def missing_words(picture: Axes | Figure) -> list[str]:
-    """Return words for missing files of a picture, or of the picture of these axes, each once."""
+    """Collect the words about missing files in a figure, or in the figure of axes, each once."""
     figure: Any = picture.figure
     gids = (_MISSING_GID, _LACKS_GID)
     return _missing_parts(figure.findobj(lambda artist: artist.get_gid() in gids))
 
 
 def _missing_parts(texts: Iterable[Any]) -> list[str]:
-    """Return the words of texts on missing files, each once; agents without clouds in one part.
+    """Collect the words of the texts that report missing files, each once.
 
-    The words are the texts' labels, after a `_`, which hides them from legends.
+    Agents without clouds are listed together. The words are in the texts' labels, after a `_`,
+    which hides them from legends.
     """
     parts: dict[str, None] = {}
     for text in texts:

@@ -1,10 +1,11 @@
-"""Words on white chips, which cover neither each other nor the things that they name."""
+"""Words on white chips (labels), which cover neither each other nor the things that they name."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -23,17 +24,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.text import Annotation
 
-# In points, in a notebook; `text_size` is that of the style.
+# Size of the smallest letters in a notebook, points; `text_size` returns the size in the current
+# style.
 SMALLEST_TEXT: Final = 9
-# Points of white around words.
-_PADDING_PT: Final = 1.5
-# Points from an anchor to its chip, the nearest first.
-_DISTANCES_PT: Final = np.array([2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0])
-# Points from an anchor above which a line leads to its chip.
-_MIN_LEADER_DISTANCE_PT: Final = 16.0
-_ANGLES_RAD: Final = np.radians([60, 120, 0, 180, -60, -120, 90, -90, 30, 150, -30, -150])
+# Margin in points around dots and thin lines that chips do not cover, as for `keep_free`.
+DOT_MARGIN_PT: Final = (-4.0, -4.0, 4.0, 4.0)
+# White margin around words, in points.
+_PADDING_PT = 1.5
+# Number of points on a line between two points that chips do not cover.
+_STEPS_PER_LINE = 20
+# Distances from an anchor to its chip in points, the nearest first.
+_DISTANCES_PT = np.array([2.0, 5.0, 9.0, 14.0, 20.0, 28.0, 38.0, 50.0, 65.0, 85.0, 110.0])
+# Minimum distance of a chip from its anchor, in points, at which a line connects them.
+_MIN_LEADER_DISTANCE_PT = 16.0
+_ANGLES_RAD = np.radians([60, 120, 0, 180, -60, -120, 90, -90, 30, 150, -30, -150])
 # Directions from an anchor to its chip, the best first.
-_DIRECTIONS: Final = np.column_stack([np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)])
+_DIRECTIONS = np.column_stack([np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)])
 
 
 def place_chips(
@@ -45,16 +51,16 @@ def place_chips(
 ) -> None:
     """Write words near anchors (x, y) in data coordinates, dark on white chips.
 
-    Nothing of importance is covered. The chips get their positions when the figure is rendered, so
-    they fit its final size; a thin line leads to a distant chip. A chip is left out if its anchor
-    is not shown, or if there is no space for it: begin with the important ones. Several calls on
-    the same axes know of each other.
+    Chips cover neither each other nor the shapes to avoid, even across several calls on the same
+    axes. They are placed when the figure is rendered, so they fit its final size. A thin line
+    connects a distant chip with its anchor. A chip is left out if its anchor is not shown, or if
+    there is no space for it; pass the important ones first.
 
     Args:
         ax: Axes to write on.
         chips: Words and anchors.
-        colors: Colours of the edges, grey by default.
-        avoid: Shapes to avoid, as in `keep_free`.
+        colors: Colours of the chips' edges; grey by default.
+        avoid: Shapes that the chips must not cover, as for `keep_free`.
     """
     placer = _placer(ax)
     if avoid is not None:
@@ -86,10 +92,10 @@ def place_chips(
 def keep_free(
     ax: Axes, shapes: ArrayLike, *, margin: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 ) -> None:
-    """Prevent chips from covering shapes (N, corners, 2) in data coordinates and their margin.
+    """Prevent chips from covering shapes (N, corners, 2) in data coordinates, plus a margin.
 
-    The margin is points added to a shape's left, low, right and high side: to the left and down
-    they are negative.
+    The margin is in points, added to a shape's left, lower, right and upper edge; to the left and
+    down, a negative number enlarges the shape.
     """
     corners = np.asarray(shapes, dtype=np.float64)
     if not corners.size:
@@ -100,13 +106,25 @@ def keep_free(
     placer.margins.append(np.tile(margin, (len(corners), 1)))
 
 
+def keep_line_free(
+    ax: Axes, points: FloatArray, *, margin: tuple[float, float, float, float]
+) -> None:
+    """Prevent chips from covering the line through points (N, 2), plus a margin, as `keep_free`."""
+    keep_free(ax, points[:, None], margin=margin)
+    for start, end in pairwise(points):
+        steps = np.linspace(start, end, _STEPS_PER_LINE)
+        keep_free(ax, steps[:, None], margin=margin)
+
+
 @dataclass(slots=True, eq=False)
 class _Placer:
-    """The chips of axes, and the upright rectangles that they must not cover.
+    """The chips on one Axes, and the axis-aligned rectangles that they must not cover.
+
+    They do not cover the legend of the axes either.
 
     Attributes:
-        ax: Axes.
-        chips: Chips in order of importance.
+        ax: The axes.
+        chips: The chips, in order of importance.
         shapes: Corners of rectangles, shape (N, 2, 2), data coordinates.
         margins: Margins of rectangles, shape (N, 4), points.
     """
@@ -117,74 +135,79 @@ class _Placer:
     margins: list[FloatArray] = field(default_factory=list)
 
     def place_all(self, renderer: Any) -> None:
-        """Move the chips, and render the lines that lead to them.
+        """Move the chips to free places, and draw the lines that connect them with their anchors.
 
-        Rectangles are pixels (left, low, right, high).
+        Rectangles are in pixels (left, bottom, right, top).
         """
+        from matplotlib.collections import LineCollection
+        from matplotlib.transforms import IdentityTransform
+
         if not self.chips:
             return
         point_px = renderer.points_to_pixels(1.0)
-        area, occupied = np.array(self.ax.bbox.extents), self._occupied(point_px)
+        low, high = self.ax.bbox.get_points()
+        occupied = self._occupied(point_px)
+        legend = self.ax.get_legend()
+        if legend is not None:
+            occupied = np.vstack([occupied, legend.get_window_extent(renderer).extents])
         anchors = self.ax.transData.transform([chip.xy for chip in self.chips])
         leaders = []
         for chip, anchor in zip(self.chips, anchors, strict=True):
-            is_inside = (anchor >= area[:2]).all() and (anchor <= area[2:]).all()
+            is_inside = ((anchor >= low) & (anchor <= high)).all()
             chip.set_visible(bool(is_inside))
-            if not chip.get_visible():
+            if not is_inside:
                 continue
             bounds = chip.get_window_extent(renderer)
             half = np.array([bounds.width, bounds.height]) / 2 + (_PADDING_PT + 0.5) * point_px
             distances = _DISTANCES_PT[:, None, None] * point_px
             offsets = distances * _DIRECTIONS + np.sign(_DIRECTIONS.round(6)) * half
             centers = anchor + offsets.reshape(-1, 2)
-            candidates = np.column_stack([centers - half, centers + half])
-            fits_low = (candidates[:, :2] >= area[:2]).all(axis=1)
-            fits_high = (candidates[:, 2:] <= area[2:]).all(axis=1)
-            free = np.flatnonzero(fits_low & fits_high & ~_overlaps(candidates, occupied))
+            corners_low = centers - half
+            corners_high = centers + half
+            candidates = np.column_stack([corners_low, corners_high])
+            fits = ((corners_low >= low) & (corners_high <= high)).all(axis=1)
+            free = np.flatnonzero(fits & ~_overlaps(candidates, occupied))
             chip.set_visible(len(free) > 0)
             if not len(free):
                 continue
             best = int(free[0])
-            rectangle = candidates[best]
             chip.set_position(tuple((centers[best] - anchor) / point_px))
-            occupied = np.vstack([occupied, rectangle])
-            if _DISTANCES_PT[best // len(_DIRECTIONS)] >= _MIN_LEADER_DISTANCE_PT:
-                leaders.append([anchor, np.clip(anchor, rectangle[:2], rectangle[2:])])
-        self._draw_leaders(leaders, renderer)
-
-    def _occupied(self, point_px: float) -> FloatArray:
-        """Return the rectangles of the shapes, shape (N, 4), pixels.
-
-        A point has `point_px` pixels.
-        """
-        if not self.shapes:
-            return np.zeros((0, 4))
-        corners = np.concatenate(self.shapes).reshape(-1, 2)
-        pixels = self.ax.transData.transform(corners).reshape(-1, 2, 2)
-        rectangles = np.column_stack([pixels.min(axis=1), pixels.max(axis=1)])
-        return rectangles + np.concatenate(self.margins) * point_px
-
-    def _draw_leaders(self, leaders: list[list[FloatArray]], renderer: Any) -> None:
-        from matplotlib.collections import LineCollection
-        from matplotlib.transforms import IdentityTransform
-
+            occupied = np.vstack([occupied, candidates[best]])
+            distance = _DISTANCES_PT[best // len(_DIRECTIONS)]
+            if distance >= _MIN_LEADER_DISTANCE_PT:
+                nearest_point = np.clip(anchor, corners_low[best], corners_high[best])
+                leaders.append([anchor, nearest_point])
         lines = LineCollection(
             leaders, colors=MUTED_COLOR, linewidths=0.6, transform=IdentityTransform()
         )
         lines.set_figure(self.ax.figure)
         lines.draw(renderer)
 
+    def _occupied(self, point_px: float) -> FloatArray:
+        """Return the rectangles around the shapes and their margins, shape (N, 4), pixels.
+
+        `point_px` is the number of pixels in a point.
+        """
+        if not self.shapes:
+            return np.zeros((0, 4))
+        corners = np.concatenate(self.shapes).reshape(-1, 2)
+        pixels = self.ax.transData.transform(corners).reshape(-1, 2, 2)
+        rectangles = np.column_stack([pixels.min(axis=1), pixels.max(axis=1)])
+        margins = np.concatenate(self.margins)
+        return rectangles + margins * point_px
+
 
 def _overlaps(rectangles: FloatArray, obstacles: FloatArray) -> Any:
-    """Return whether rectangles (N, 4) cover any of others (M, 4), shape (N,)."""
-    apart = (rectangles[:, None, :2] >= obstacles[:, 2:]) | (
-        rectangles[:, None, 2:] <= obstacles[:, :2]
-    )
-    return (~apart.any(axis=-1)).any(axis=-1)
+    """Return whether each rectangle (N, 4) covers any of the obstacles (M, 4), shape (N,)."""
+    low = rectangles[:, None, :2]
+    high = rectangles[:, None, 2:]
+    is_beyond = (low >= obstacles[:, 2:]) | (high <= obstacles[:, :2])
+    is_apart = is_beyond.any(axis=-1)
+    return (~is_apart).any(axis=-1)
 
 
 def _placer(ax: Axes) -> _Placer:
-    """Return the placer of axes, which works right before their chips are rendered."""
+    """Return the placer of the axes; make one if they have none yet."""
     artist_class = _placer_artist_class()
     for artist in ax.artists:
         if isinstance(artist, artist_class):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,28 +16,40 @@ from deepaccident_devkit.support.arrays import ByteArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Pixels of a BEV camera along a side, about: panels of a video have fewer, and more take time.
-_MAX_SIDE_PX: Final = 400
+# Approximate number of pixels along a side of a BEV picture; more take time, and panels of a video
+# have fewer.
+_MAX_SIDE_PX = 400
 
 
-def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range: float) -> None:
-    """Render a BEV camera's tags in the frame of the axes, metres, up to a range to each side.
+def draw_underlay(
+    image: BevImage,
+    ax: Axes,
+    *,
+    target_from_ego: SE3,
+    view_range: float,
+    colors: Mapping[str, str] = BEV_COLORS,
+) -> None:
+    """Render a BEV camera's semantic tags in the frame of the axes, in metres.
 
     Args:
         image: Picture of an agent.
         ax: Axes to render on; its limits stay as they are.
-        target_from_ego: Pose of the agent's ego frame in the frame of the axes; its tilt is left
-            out.
-        view_range: Metres around the agent; for a turned picture the square is larger, so that it
-            fills the corners.
+        target_from_ego: Pose of the agent's ego frame in the frame of the axes; its tilt is
+            ignored.
+        view_range: Metres shown to each side of the agent. If the picture is rotated, a larger
+            square is drawn, so that it fills the corners.
+        colors: Colour by name of a tag.
     """
-    yaw, size = _yaw(target_from_ego), len(image.semantic)
+    yaw = target_from_ego.yaw
     turned_range = view_range * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
-    half = min(size // 2, int(np.ceil(turned_range / image.resolution)))
-    part = slice(size // 2 - half, size // 2 + half)
-    tags = image.semantic[::-1, ::-1].T[part, part]
+    middle = len(image.semantic) // 2
+    half = min(middle, int(np.ceil(turned_range / image.resolution)))
+    shown = slice(middle - half, middle + half)
+    # Rows of cells are along y, left, and columns along x, forward.
+    tags = image.semantic[::-1, ::-1].T[shown, shown]
     step = max(1, len(tags) // _MAX_SIDE_PX)
-    cells = tags[step // 2 :: step, step // 2 :: step]
+    start = step // 2
+    cells = tags[start::step, start::step]
     reach = half * image.resolution
     draw_ground(
         cells,
@@ -46,6 +58,7 @@ def draw_underlay(image: BevImage, ax: Axes, *, target_from_ego: SE3, view_range
         extent=(-reach, reach, -reach, reach),
         target_from_cells=target_from_ego,
         zorder=0,
+        colors=colors,
     )
 
 
@@ -59,29 +72,32 @@ def draw_ground(
     zorder: float,
     colors: Mapping[str, str] = BEV_COLORS,
 ) -> None:
-    """Render class numbers (H, W) in the colours of their names; the limits of the axes stay.
+    """Render ground cells in the colours of their classes, without changing the axes' limits.
 
-    Numbers without a colour are white.
+    Classes without a colour are white.
 
     Args:
         cells: Class numbers, shape (H, W), lowest row first.
-        numbers: Name of a class → its number.
+        numbers: Class number by class name.
         ax: Axes to render on.
         extent: Left, right, bottom and top of the cells, metres, in their own frame.
         target_from_cells: Pose of the cells' frame in the frame of the axes.
-        zorder: Order of the picture.
-        colors: Name of a class → its colour; pale ones by default.
+        zorder: Drawing order of the cells, as in matplotlib.
+        colors: Colour by class name; pale ones by default.
     """
     from matplotlib.colors import to_rgb
     from matplotlib.transforms import Affine2D
 
-    table = np.full((256, 3), 255, dtype=np.uint8)
+    rgb_of_numbers = np.full((256, 3), 255, dtype=np.uint8)
     for name in numbers.keys() & colors.keys():
-        table[numbers[name]] = np.rint(np.array(to_rgb(colors[name])) * 255)
-    x_limits, y_limits = ax.get_xlim(), ax.get_ylim()
-    pose = Affine2D().rotate(_yaw(target_from_cells)).translate(*target_from_cells.translation[:2])
+        rgb = np.array(to_rgb(colors[name]))
+        rgb_of_numbers[numbers[name]] = np.rint(rgb * 255)
+    x_limits = ax.get_xlim()
+    y_limits = ax.get_ylim()
+    x, y, _ = target_from_cells.translation
+    pose = Affine2D().rotate(target_from_cells.yaw).translate(x, y)
     ax.imshow(
-        table[cells],
+        rgb_of_numbers[cells],
         extent=extent,
         transform=pose + ax.transData,
         origin="lower",
@@ -89,7 +105,3 @@ def draw_ground(
         zorder=zorder,
     )
     ax.set(xlim=x_limits, ylim=y_limits)
-
-
-def _yaw(pose: SE3) -> float:
-    return float(np.arctan2(pose.rotation[1, 0], pose.rotation[0, 0]))

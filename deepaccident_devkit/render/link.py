@@ -1,10 +1,10 @@
-"""The effects of a link on shared data: received boxes, and clouds with and without the link."""
+"""The effects of a link on shared data: boxes and clouds as recorded and as received."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,16 +25,20 @@ from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
 from deepaccident_devkit.render.figures import (
     Layer,
+    Layers,
     check_view_range,
     figure_or_new,
     label_axes,
+    lay_out_figure,
     layers_of,
-    settled,
-    widening,
+    show_square,
+    square_around,
+    width_to_height,
     with_light_grid,
 )
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
+    MUTED_COLOR,
     OWN_COLOR,
     TRUE_PLACE_COLOR,
     current_style,
@@ -52,14 +56,22 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import SampleRecord
 
-_LINK_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "ids", "grid")
-_DEFAULT_LAYERS: Final[tuple[Layer, ...]] = ("points", "boxes", "grid")
-# Metres around the agents and the pair.
-_VIEW_MARGIN_M: Final = 8.0
-# Metres shown to each side: minimum and maximum.
-_VIEW_RANGE_LIMITS_M: Final = (25.0, 60.0)
-_TRUE_LINE_STYLE: Final = (0, (2, 1))
-_RECEIVER_STYLE: Final[Mapping[str, Any]] = {
+_LINK_LAYERS: Layers = ("points", "boxes", "ids", "grid")
+_DEFAULT_LAYERS: Layers = ("points", "boxes", "grid")
+# Metres shown around the agents and the pair.
+_VIEW_MARGIN_M = 8.0
+# Minimum and maximum number of metres shown to each side.
+_VIEW_RANGE_LIMITS_M = (25.0, 60.0)
+# Side of the magnified part over the height of its panel, and the minimum magnification for which
+# it is shown.
+_INSET_SHARE = 0.36
+_MIN_MAGNIFICATION = 1.5
+# Metres shown around the two positions of a magnified box.
+_MAGNIFIED_MARGIN_M = 3.5
+_TRUE_LINE_STYLE = (0, (2, 1))
+# Arrows are equally wide in the panel and in its magnified part.
+_ARROW_STYLE = {**ARROW_STYLE, "units": "inches", "width": 0.014}
+_RECEIVER_STYLE: Mapping[str, Any] = {
     "linestyle": "none",
     "marker": "*",
     "color": OWN_COLOR,
@@ -74,8 +86,8 @@ class SharedBoxes:
 
     Attributes:
         agent: Name of the partner.
-        true: Present boxes of its label, at their true positions.
-        received: Received boxes, at the receiver's positions; none if the message is lost.
+        true: Boxes of the partner's label in the current frame, at their true positions.
+        received: Boxes where the receiver places them; empty if the message is lost.
     """
 
     agent: str
@@ -84,11 +96,13 @@ class SharedBoxes:
 
     @property
     def shifts(self) -> tuple[FloatArray, FloatArray]:
-        """True and received centres of the actors in both, x and y, shape (M, 2) each."""
+        """True and received centres of the M received actors, x and y, shape (M, 2) each."""
         _, true_rows, received_rows = np.intersect1d(
             self.true.actor_id, self.received.actor_id, return_indices=True
         )
-        return self.true.center[true_rows, :2], self.received.center[received_rows, :2]
+        true_centers = self.true.center[true_rows, :2]
+        received_centers = self.received.center[received_rows, :2]
+        return true_centers, received_centers
 
 
 @in_own_settings
@@ -104,21 +118,22 @@ def render_link(
 ) -> Figure:
     """Render the effects of latency, wrong poses and losses on the data that partners share.
 
-    The first panel has all partners' boxes: dashed at their true positions, and in each partner's
-    hue as received, with arrows between these positions; the legend has the mean distances. The
-    other panels have the agents' clouds without the link and with it, in papers and on slides only
-    with it, and in a paper's column there are none.
+    The first panel shows all partners' boxes, dashed at their true positions, and in the partner's
+    hue as received. Arrows lead from the true to the received positions; the legend states the mean
+    distances, and a corner shows the box with the largest error magnified. The other panels show
+    the agents' clouds, as recorded and as received; in papers and on slides only as received, and
+    in a paper's column not at all.
 
     Args:
         dataset: The release.
-        sample: Token or record: its agent receives.
+        sample: Token or record; its agent is the receiver.
         link: Effects on the partners' data.
         agents: Cooperating agents: names, a configuration or its name from the view of the ego;
             None for all present agents.
         view_range: Metres shown to each side of the ego; None shows all agents and the colliding
             pair.
-        layers: `points`, `boxes` and `grid` are the default; also `ids`. Without `points` there are
-            no clouds.
+        layers: Any of `points`, `boxes`, `grid` (these are the default) and `ids`. Without
+            `points`, no panel shows clouds.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
@@ -139,69 +154,75 @@ def render_link(
     view_range = view_range or _view_range(dataset, record, shared)
     links = _links_of_clouds(link, shown_layers)
     fig, box_ax, cloud_axes = _panels(fig, len(links))
-    # the legend is below, so a slide's panel is wider
-    width_ratio = 1.0 if links else widening(None) ** 1.5
+    # the legend is below, so a wide style's panel is wider
+    width_ratio = 1.0 if links else width_to_height(None) ** 1.5
     half_width = width_ratio * view_range
     box_ax.set(xlim=(-half_width, half_width), ylim=(-view_range, view_range), aspect="equal")
     label_axes(box_ax, "ego")
     box_ax.set_title(_error_words(shared))
     _draw_shared(shared, shown_layers, box_ax)
-    words = f"{short_name(record['agent'])} receives"
+    if "boxes" in shown_layers:
+        _magnify_largest_error(shared, box_ax)
+    words = f"received by {short_name(record['agent'])}"
     write_beside(box_ax, words, (0.0, 0.0), AGENT_COLORS[record["agent"]])
     for ax, (words, cloud_link) in zip(cloud_axes, links.items(), strict=True):
         view = BevView(view_range=view_range, agents=agents, link=cloud_link)
         draw_bev(dataset, record, view, shown_layers - {"boxes", "ids"}, ax)
-        ax.set(title=f"clouds {words}", anchor="C")
+        ax.set(title=f"Point clouds {words}", anchor="C")
         if "boxes" in shown_layers:
             truth = cooperative_boxes(dataset, record, agents=agents, frame="ego")
             draw_boxes_from_above(truth, ax, [OWN_COLOR] * len(truth), fill=0.0, linewidths=0.7)
-    draw_legend(fig, [*map(_handle, shared), *_handles()], columns=4)
+    draw_legend(fig, _legend_handles(shared), columns=4)
     set_scene_title(fig, dataset, record["token"], below=link_words(link))
-    return settled(fig)
+    return lay_out_figure(fig)
 
 
 def _links_of_clouds(link: Link, layers: frozenset[Layer]) -> dict[str, Link | None]:
-    """Return the words for each panel of clouds → its link."""
-    if "points" not in layers or current_style().room == "column":
+    """Return the link of each panel that shows clouds, by the panel's title."""
+    if "points" not in layers or current_style().layout == "column":
         return {}
-    if current_style().few:
-        return {"with the link": link}
-    return {"without the link": None, "with the link": link}
+    if current_style().shows_few_panels:
+        return {"as received": link}
+    return {"as recorded": None, "as received": link}
 
 
 def _panels(fig: Figure | None, clouds: int) -> tuple[Figure, Axes, list[Axes]]:
-    """Return the figure, the axes of the boxes, and the axes of the clouds."""
-    size = 5.0 * (1 + clouds) + 0.4, 6.4
-    if clouds:
-        fig = figure_or_new(fig, size, panels="several", page=0.6, column=1.28)
-    else:
-        fig = figure_or_new(fig, size, panels="one", page=1.28, column=1.28)
+    """Return the figure, the axes for the boxes, and the axes for the clouds."""
+    page_height = 0.6 if clouds or current_style().is_wide else 1.3
+    fig = figure_or_new(
+        fig,
+        (5.0 * (1 + clouds) + 0.4, 6.4),
+        panels="several" if clouds else "one",
+        page=page_height,
+        column=1.3,
+    )
     box_ax, *cloud_axes = fig.subplots(1, 1 + clouds, squeeze=False)[0]
     return fig, box_ax, cloud_axes
 
 
 def _view_range(dataset: Dataset, record: SampleRecord, shared: Sequence[SharedBoxes]) -> float:
-    """Return metres to each side of the ego up to the agents and the colliding pair.
+    """Return the view range, in metres, that shows the agents and the colliding pair.
 
-    They are within limits.
+    It is within `_VIEW_RANGE_LIMITS_M`.
     """
     colliders = [*collider_ids(dataset, record)]
-    positions, pair_centers = [], []
+    points = []
     for boxes in shared:
         sample = simultaneous_sample(record, boxes.agent)
         pose = transform(dataset, record, sample, "ego", "ego")
         pair = boxes.true.select(np.isin(boxes.true.actor_id, colliders))
-        positions.append(pose.translation[:2])
-        pair_centers.append(pair.center[:, :2])
-    points = np.concatenate([np.array(positions), *pair_centers])
-    view_range = np.abs(points).max() + _VIEW_MARGIN_M
+        points += [pose.translation[None, :2], pair.center[:, :2]]
+    view_range = np.abs(np.concatenate(points)).max() + _VIEW_MARGIN_M
     return float(np.clip(view_range, *_VIEW_RANGE_LIMITS_M))
 
 
 def shared_boxes(
     dataset: Dataset, sample: RowArgument, link: Link, agents: Agents = None
 ) -> list[SharedBoxes]:
-    """Return each partner's tracked boxes as received; arguments and errors as in `render_link`."""
+    """Return each partner's tracked boxes, at their true positions and as received.
+
+    Arguments and errors are as for `render_link`.
+    """
     record = dataset.get("sample", sample)
     names = cooperating_agents(dataset, sample, agents)
     partners = [agent for agent in names if agent != record["agent"]]
@@ -209,19 +230,19 @@ def shared_boxes(
         raise ChoiceError(
             f"agents: expected a partner of {record['agent']}, found none; a link needs two agents"
         )
-    # all messages are sent together, since together they may not fit the link
+    # all messages are sent together, because together they may exceed the link's capacity
     senders = {message.agent for message in messages(dataset, sample, agents, link)}
     shared = []
     for agent in partners:
-        agent_link = link if agent in senders else replace(link, packet_loss=1.0)
+        agent_link = link
+        if agent not in senders:
+            agent_link = replace(link, packet_loss=1.0)
         true = cooperative_boxes(dataset, sample, agents=[agent], frame="ego")
+        true = true.select(true.actor_id != UNTRACKED_ID)
         received = cooperative_boxes(dataset, sample, agents=[agent], frame="ego", link=agent_link)
-        shared.append(SharedBoxes(agent=agent, true=_tracked(true), received=_tracked(received)))
+        received = received.select(received.actor_id != UNTRACKED_ID)
+        shared.append(SharedBoxes(agent=agent, true=true, received=received))
     return shared
-
-
-def _tracked(boxes: Boxes) -> Boxes:
-    return boxes.select(boxes.actor_id != UNTRACKED_ID)
 
 
 def _draw_shared(shared: Sequence[SharedBoxes], layers: frozenset[Layer], ax: Axes) -> None:
@@ -229,7 +250,8 @@ def _draw_shared(shared: Sequence[SharedBoxes], layers: frozenset[Layer], ax: Ax
     ax.plot(0, 0, **_RECEIVER_STYLE)
     keep_free(ax, [[(0.0, 0.0)]], margin=(-5, -5, 5, 5))
     true = concatenate([boxes.true for boxes in shared], "ego")
-    true = true.select(np.unique(true.actor_id, return_index=True)[1])
+    _, first_rows = np.unique(true.actor_id, return_index=True)
+    true = true.select(first_rows)
     true_colors = [TRUE_PLACE_COLOR] * len(true)
     if "boxes" in layers:
         draw_boxes_from_above(
@@ -238,31 +260,63 @@ def _draw_shared(shared: Sequence[SharedBoxes], layers: frozenset[Layer], ax: Ax
     for boxes in shared:
         colors = [AGENT_COLORS[boxes.agent]] * len(boxes.received)
         if "boxes" in layers:
-            draw_boxes_from_above(boxes.received, ax, colors, fill=0.25, linewidths=1)
+            # filled boxes of several partners would mix to brown
+            draw_boxes_from_above(boxes.received, ax, colors, fill=0, linewidths=1.4)
         starts, ends = boxes.shifts
         if len(starts):
-            ax.quiver(*starts.T, *(ends - starts).T, color=OWN_COLOR, **ARROW_STYLE)
+            shifts = ends - starts
+            ax.quiver(*starts.T, *shifts.T, color=OWN_COLOR, **_ARROW_STYLE)
     if "ids" in layers:
         draw_ids_from_above(true, ax, true_colors)
     if "grid" in layers:
         with_light_grid(ax, "both")
 
 
-def _handle(shared: SharedBoxes) -> Artist:
-    """Return the handle of a partner: its hue, and the mean shift of its boxes."""
-    from matplotlib.patches import Patch
+def _magnify_largest_error(shared: Sequence[SharedBoxes], ax: Axes) -> None:
+    """Magnify the visible box with the largest error, in the corner with the fewest boxes.
 
-    color = AGENT_COLORS[shared.agent]
-    return Patch(facecolor=(color, 0.25), edgecolor=color, label=_shift_words(shared))
+    There is no magnified part if no visible box has an error, or if it would hardly be larger.
+    """
+    shifts = np.concatenate([np.stack(boxes.shifts, axis=1) for boxes in shared])
+    low, high = np.array([ax.get_xlim(), ax.get_ylim()]).T
+    is_visible = ((low < shifts) & (shifts < high)).all(axis=(1, 2))
+    shifts = shifts[is_visible]
+    distances = np.linalg.norm(shifts[:, 1] - shifts[:, 0], axis=1)
+    if not distances.any():
+        return
+    center, half = square_around(shifts[distances.argmax()], _MAGNIFIED_MARGIN_M)
+    side = _INSET_SHARE * (high[1] - low[1])
+    magnification = side / (2 * half)
+    if magnification < _MIN_MAGNIFICATION:
+        return
+    size = side / (high - low)
+    corners = (1 - size) * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+    places = (shifts.reshape(-1, 2) - low) / (high - low)
+    is_covered = (np.abs(places - corners[:, None] - size / 2) < size / 2).all(axis=2)
+    corner = corners[is_covered.sum(axis=1).argmin()]
+    inset = ax.inset_axes((*corner, *size))
+    show_square(inset, center, half)
+    inset.set(xticks=[], yticks=[])
+    _draw_shared(shared, frozenset({"boxes"}), inset)
+    words = f"{distances.max():.2f} m, ×{magnification:.0f}"
+    inset.text(0.04, 0.96, words, ha="left", va="top", transform=inset.transAxes)
+    ax.indicate_inset_zoom(inset, edgecolor=MUTED_COLOR, alpha=1.0)
+    keep_free(ax, [low + np.stack([corner, corner + size]) * (high - low)])
 
 
-def _handles() -> list[Artist]:
-    """Return handles of the other marks of the first panel."""
+def _legend_handles(shared: Sequence[SharedBoxes]) -> list[Artist]:
+    """Make a legend handle for each partner, with its boxes' mean shift, and for other marks."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    return [
-        Patch(facecolor="none", edgecolor=TRUE_PLACE_COLOR, linestyle="--", label="true places"),
+    handles: list[Artist] = []
+    for boxes in shared:
+        color = AGENT_COLORS[boxes.agent]
+        handles.append(Patch(facecolor="none", edgecolor=color, label=_shift_words(boxes)))
+    handles.append(
+        Patch(facecolor="none", edgecolor=TRUE_PLACE_COLOR, linestyle="--", label="ground truth")
+    )
+    handles.append(
         Line2D(
             [],
             [],
@@ -270,12 +324,14 @@ def _handles() -> list[Artist]:
             marker="$\\rightarrow$",
             color=OWN_COLOR,
             markersize=12,
-            label="the error",
-        ),
-    ]
+            label="displacement",
+        )
+    )
+    return handles
 
 
 def _shift_words(shared: SharedBoxes) -> str:
+    """State the mean distance between a partner's true and received boxes in words."""
     name = short_name(shared.agent)
     if not len(shared.received) and len(shared.true):
         return f"{name}: nothing arrived"
@@ -287,6 +343,10 @@ def _shift_words(shared: SharedBoxes) -> str:
 
 
 def _error_words(shared: Sequence[SharedBoxes]) -> str:
-    """Return the title of all partners' boxes."""
-    distances = [np.linalg.norm(np.subtract(*boxes.shifts), axis=1) for boxes in shared]
-    return f"boxes, off by at most {np.concatenate(distances).max(initial=0):.2f} m"
+    """State the largest distance between any partner's true and received boxes in words."""
+    max_distance = 0.0
+    for boxes in shared:
+        starts, ends = boxes.shifts
+        distances = np.linalg.norm(starts - ends, axis=1)
+        max_distance = distances.max(initial=max_distance)
+    return f"Box positions (largest error {max_distance:.2f} m, means below)"

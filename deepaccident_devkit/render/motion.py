@@ -1,4 +1,4 @@
-"""Motion labels and predictions as pictures: maps by frame, or all frames as a fading trail."""
+"""Motion labels and predictions as pictures: maps of each frame, or all frames as a trail."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.render.boxes import collider_ids, recorder_ids
 from deepaccident_devkit.render.captions import draw_legend, set_scene_title
-from deepaccident_devkit.render.figures import Layer, axes_or_new, figure_or_new, layers_of, settled
+from deepaccident_devkit.render.figures import (
+    Layer,
+    Layers,
+    axes_or_new,
+    figure_or_new,
+    lay_out_figure,
+    layers_of,
+)
 from deepaccident_devkit.render.motion_maps import (
     DRAWN_MAPS,
     DrawnMap,
@@ -29,6 +36,7 @@ from deepaccident_devkit.render.motion_maps import (
     instance_handles,
     maps_of_labels,
     maps_of_output,
+    trail_handles,
 )
 from deepaccident_devkit.render.styles import current_style, in_own_settings
 from deepaccident_devkit.support.text import choice
@@ -37,25 +45,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# `maps`: one panel for each map and frame; `trail`: one panel, the present opaque and later frames
-# paler.
+# `maps`: one panel for each map and frame; `trail`: one panel, in which the current frame is opaque
+# and later frames are paler.
 MotionStyle = Literal["maps", "trail"]
-_MAP_LAYERS: Final[tuple[Layer, ...]] = ("labels", "velocities", "ids", "grid")
-TRAIL_LAYERS: Final[tuple[Layer, ...]] = ("labels", "trajectories", "ids", "grid")
-_DEFAULT_LAYERS: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
+_MAP_LAYERS: Layers = ("labels", "velocities", "ids", "grid")
+TRAIL_LAYERS: Final[Layers] = ("labels", "trajectories", "ids", "grid")
+_DEFAULT_LAYERS: dict[MotionStyle, Layers] = {
     "maps": ("labels", "velocities"),
     "trail": ("labels", "trajectories"),
 }
-_LAYERS_OF_STYLE: Final[dict[MotionStyle, tuple[Layer, ...]]] = {
+_LAYERS_OF_STYLE: dict[MotionStyle, Layers] = {
     "maps": _MAP_LAYERS,
     "trail": TRAIL_LAYERS,
 }
-# Maps of a small picture.
-_MAIN_MAPS: Final = ("instance", "flow")
-# Number of frames of maps in a small picture.
-_FRAME_COUNTS: Final = {"column": 1, "page": 3, "slide": 3}
-# Width of the column that explains the colours, in widths of a panel.
-_KEY_WIDTH_RATIO: Final = 0.5
+# Maps that a small picture shows.
+_MAIN_MAPS = ("instance", "flow")
+# Number of frames in a small picture, for each `room` of a style.
+_FRAME_COUNTS = {"column": 1, "page": 3, "slide": 3}
+# Width of the column that explains the colours, over the width of a panel.
+_KEY_WIDTH_RATIO = 0.5
 
 
 @in_own_settings
@@ -71,20 +79,19 @@ def render_motion_labels(
 ) -> Figure:
     """Render a sample's motion labels: instances, centerness, offset and flow of each frame.
 
-    There is one column for each frame. In a paper or on a slide, maps are the instances and the
-    flow of at most three of the frames that have a flow.
+    There is one column for each frame. A paper or slide only shows the instances and the flow, in
+    at most three of the frames that have a flow.
 
     Args:
         dataset: The release.
         sample: Token or record.
         config: Configuration of the labels; None for the released ones.
-        at_present: Whether to warp all frames to the present ego frame; if False, each is in its
-            own.
+        at_present: Whether to warp all frames to the ego frame at t = 0; if False, each is in the
+            ego frame of its own time.
         style: `maps`, or `trail` for one panel with all frames, later ones paler, and the actors'
-            paths; None is for maps, or in a paper or on a slide for a trail.
-        layers: For maps `labels` (the cells) and `velocities` (the arrows of the flow),
-            which are the default, `ids` and `grid`; for a trail `trajectories` instead of
-            `velocities`.
+            paths. None means `trail` in a paper or on a slide, otherwise `maps`.
+        layers: Any of `labels` (the cells), `velocities` (the arrows of the flow), `ids` and
+            `grid`; a trail has `trajectories` instead of `velocities`. Default: the first two.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
@@ -93,20 +100,21 @@ def render_motion_labels(
     Raises:
         TokenError: No such sample.
         NotAvailableError: The sample has no label.
-        ChoiceError: No such style or layer, or a trail of frames that are not at the present.
+        ChoiceError: No such style or layer, or a trail of frames that are not warped to t = 0.
     """
     if not style:
-        style = "trail" if current_style().few and at_present else "maps"
+        style = "trail" if current_style().shows_few_panels and at_present else "maps"
     labels = motion_labels(dataset, sample, config)
     if at_present:
         labels = labels.to_present()
-    pair, agents = collider_ids(dataset, sample), recorder_ids(dataset, sample)
+    pair = collider_ids(dataset, sample)
+    agents = recorder_ids(dataset, sample)
     fig = draw_motion_labels(
         labels, marked=pair, agents=agents, style=style, layers=layers, fig=fig
     )
     set_scene_title(fig, dataset, dataset.get("sample", sample)["token"], "motion labels")
     if style == "trail":
-        return settled(fig)
+        return lay_out_figure(fig)
     return fig
 
 
@@ -120,12 +128,12 @@ def draw_motion_labels(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render labels as `render_motion_labels` does, with red for some actors.
+    """Render labels as `render_motion_labels` does, with some actors in red.
 
     Args:
-        labels: Labels, warped to the present or not; they are rendered as they are.
-        marked: Label ids of the red actors; the ego itself is −100.
-        agents: Label id → agent, for recording vehicles; they have their agents' hues.
+        labels: Labels, warped to t = 0 or not; they are rendered as they are.
+        marked: Label ids of the actors to draw in red; the ego itself is −100.
+        agents: Agent by label id, for recording vehicles, which get their agents' hues.
         style: `maps` or `trail`.
         layers: Layers, as in `render_motion_labels`.
         fig: Empty figure to render on; a new one if None.
@@ -134,9 +142,10 @@ def draw_motion_labels(
         The figure.
 
     Raises:
-        ChoiceError: No such style or layer, or a trail of frames that are not at the present.
+        ChoiceError: No such style or layer, or a trail of frames that are not warped to t = 0.
     """
-    return _draw(maps_of_labels(labels, marked, agents), style, layers, fig)
+    maps = maps_of_labels(labels, marked, agents)
+    return _draw(maps, style, layers, fig)
 
 
 @in_own_settings
@@ -153,14 +162,15 @@ def draw_motion_output(
 ) -> Figure:
     """Render a prediction as `draw_motion_labels` renders labels.
 
-    Instance maps have only the instances.
+    Outputs stored as instance maps show only the instance layer.
 
     Args:
-        output: Output in the present ego frame, in any orientation.
-        number: Number of one of its K predictions, from 0 or from the end.
+        output: Output in the ego frame at t = 0, in any orientation.
+        number: Index of the prediction, 0..K−1; negative counts from the end.
         step: Seconds from frame to frame.
-        post_processing: Search for instances in heads: a name in `POST_PROCESSING`, or your own.
-        marked: Ids of red instances.
+        post_processing: How instances are extracted from the heads: a name in `POST_PROCESSING`, or
+            your own.
+        marked: Ids of the instances to draw in red.
         style: `maps` or `trail`.
         layers: Layers, as in `render_motion_labels`.
         fig: Empty figure to render on; a new one if None.
@@ -190,17 +200,17 @@ def draw_motion_map(
     """Render one map of one label frame, in metres of its ego frame: forward to the right, left up.
 
     Each instance has one colour in all frames; `marked` ones are red. The ego's own box has a dark
-    edge, and is dark if it is not marked. Colours of offset and flow are directions, paler for
-    shorter vectors; each map has its own scale. Each instance has an arrow along its flow, or a dot
-    if it stays. A frame beyond the recording is grey.
+    edge, and is dark if it is not marked. For offset and flow, the hue shows a vector's direction,
+    and shorter vectors are paler; each map has its own scale. Each instance has an arrow along its
+    flow, or a dot if it stands still. A frame outside the recording is grey.
 
     Args:
-        labels: Labels, warped to the present or not; or an output, with its last prediction
+        labels: Labels, warped to t = 0 or not; or an output, of which the last prediction is
             rendered.
         name: Name of the map.
-        frame: Number of the frame, 0 for the present.
-        marked: Label ids of actors, the ego's own is −100; for a prediction, ids of instances.
-        layers: `labels` and `velocities`, which are the default, `ids` and `grid`.
+        frame: Index of the frame; 0 is the current one.
+        marked: Label ids of actors (the ego itself is −100); for an output, ids of instances.
+        layers: Any of `labels`, `velocities`, `ids`, `grid`; default: the first two.
         ax: Axes to render on; new ones if None.
 
     Returns:
@@ -225,22 +235,22 @@ def draw_motion_trail(
     layers: Iterable[Layer] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Render all frames over each other, later ones paler, and the actors' paths.
+    """Render all frames on top of each other, later ones paler, and the actors' paths.
 
-    The present is opaque and on top.
+    The current frame is opaque and on top.
 
     Args:
-        labels: Labels, warped to the present; or an output, with its last prediction rendered.
+        labels: Labels, warped to t = 0; or an output (its last prediction is rendered).
         marked: Ids, as in `draw_motion_map`.
-        layers: `labels` (the cells) and `trajectories` (from centre to centre), which are the
-            default, `ids`, `grid`.
+        layers: Any of `labels` (cells), `trajectories` (centre to centre), `ids`, `grid`; default:
+            the first two.
         ax: Axes to render on; new ones if None.
 
     Returns:
-        The axes, in metres of the present ego frame.
+        The axes, in metres, in the ego frame at t = 0.
 
     Raises:
-        ChoiceError: No such layer, or the frames are not at the present.
+        ChoiceError: No such layer, or the frames are not warped to t = 0.
     """
     maps = _maps(labels, marked)
     shown_layers = layers_of(layers, _DEFAULT_LAYERS["trail"], TRAIL_LAYERS)
@@ -269,21 +279,27 @@ def _draw(
     if style == "maps":
         return _draw_maps(maps, shown_layers, fig)
     trail = _at_present(maps)
-    fig = figure_or_new(fig, (6.4, 6.8), panels="one", page=1.12, column=1.12)
+    # a narrow map is as wide as its column, above a legend of three rows
+    page_height = 0.6 if current_style().is_wide else 1.2
+    fig = figure_or_new(fig, (6.4, 6.8), panels="one", page=page_height, column=1.2)
     draw_trail_of(trail, shown_layers, fig.subplots())
-    draw_legend(fig, instance_handles(trail))
+    draw_legend(fig, [*instance_handles(trail), *trail_handles(trail, shown_layers)])
     return fig
 
 
 def _draw_maps(maps: MotionMaps, layers: frozenset[Layer], fig: Figure | None) -> Figure:
-    names, frames = maps.names, list(range(len(maps.valid)))
-    if current_style().few:
+    names = maps.names
+    frames = list(range(len(maps.valid)))
+    if current_style().shows_few_panels:
         names = tuple(name for name in names if name in _MAIN_MAPS)
         frames = _main_frames(maps)
-    columns, rows = len(frames), len(names)
+    columns = len(frames)
+    rows = len(names)
+    width = 2.8 * (columns + _KEY_WIDTH_RATIO) + 0.6
+    height = 2.8 * rows + 1.3
     fig = figure_or_new(
         fig,
-        (2.8 * (columns + _KEY_WIDTH_RATIO) + 0.6, 2.8 * rows + 1.3),
+        (width, height),
         page=0.3 * rows + 0.06,
         column=0.57 * rows + 0.1,
     )
@@ -302,16 +318,20 @@ def _draw_maps(maps: MotionMaps, layers: frozenset[Layer], fig: Figure | None) -
             ax.sharex(panels[0, 0])
             ax.sharey(panels[0, 0])
         ax.label_outer()
-    ego_frame = "the present ego frame" if maps.at_present else "each frame's own ego frame"
+    ego_frame = "each frame's own ego frame"
+    if maps.at_present:
+        ego_frame = "the present ego frame"
     fig.supxlabel(f"x forward (m), in {ego_frame}", fontsize="medium")
     return fig
 
 
 def _main_frames(maps: MotionMaps) -> list[int]:
-    """Return the frames of a small picture, spread evenly over the frames that have a flow."""
-    present = np.flatnonzero(maps.valid)
-    with_flow = present[: max(1, len(present) - 1)]  # the last frame has no flow
-    count = _FRAME_COUNTS[current_style().room]
-    rows = np.linspace(0, len(with_flow) - 1, count).round().astype(int)
-    frames: list[int] = np.unique(with_flow[rows]).tolist()
+    """Select the frames for a small picture, spread evenly over the frames that have a flow."""
+    recorded = np.flatnonzero(maps.valid)
+    flow_frames = recorded[:-1]  # the last frame has no flow
+    if len(recorded) == 1:
+        flow_frames = recorded
+    count = _FRAME_COUNTS[current_style().layout]
+    indices = np.linspace(0, len(flow_frames) - 1, count).round().astype(int)
+    frames: list[int] = np.unique(flow_frames[indices]).tolist()
     return frames

@@ -1,4 +1,4 @@
-"""`MotionMaps`: motion in one form for labels and predictions, and the rendering of its cells."""
+"""`MotionMaps`: labels and predictions of motion in one format, and the rendering of its cells."""
 
 from __future__ import annotations
 
@@ -41,32 +41,34 @@ if TYPE_CHECKING:
 
 DrawnMap = Literal["instance", "centerness", "offset", "flow"]
 DRAWN_MAPS: Final[tuple[DrawnMap, ...]] = get_args(DrawnMap)
-# Opacity of the last frame of a trail; the present is 1.
+# Opacity of the last frame of a trail; the current frame has the opacity 1.
 MIN_TRAIL_OPACITY: Final = 0.22
-# Points: width of the edge of the own box.
-_OWN_EDGE_WIDTH_PT: Final = 1.0
+# Width of the edge of the ego's own box, in points.
+_OWN_EDGE_WIDTH_PT = 1.0
 # Grey of cells that do not move.
-_STILL_GREY: Final = 0.92
+_STILL_GREY = 0.92
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionMaps(FrozenArrays):
-    """Motion of T frames in the form of pictures; arrays are read-only.
+    """Motion over T frames, ready to be drawn; arrays are read-only.
 
-    Rows of cells are along y left, columns along x forward.
+    Rows of cells run along y (left), columns along x (forward).
 
     Attributes:
         grid: Cells, in the devkit's orientation.
         step: Seconds from frame to frame.
-        at_present: Whether all frames are in the present ego frame; if not, each is in its own.
-        valid: Whether a frame exists, (T,) bool.
-        instance: Ids from 1, shape (T, H, W); 0 for other cells and for missing frames.
-        colors: Red, green, blue of each id, shape (1 + ids, 3); white for 0.
+        at_present: Whether all frames are in the ego frame at t = 0; otherwise each is in the ego
+            frame of its own time.
+        valid: Whether each frame exists, (T,) bool.
+        instance: Instance ids from 1, shape (T, H, W); 0 for other cells and in missing frames.
+        colors: RGB colour of each id, shape (1 + ids, 3); white for 0.
         own: Id of the ego's own box; −1 if unknown.
-        centerness: Centerness in [0, 1], shape (T, H, W); None if there are only instances.
-        offset: Cells to the left and forward, shape (T, 2, H, W), NaN outside instances; None if
-            there are only instances.
-        flow: Cells, shape (T, 2, H, W), as the offset; also NaN where it is unknown.
+        centerness: Centerness in [0, 1], shape (T, H, W); None if only instances are known.
+        offset: Vectors in cells (left, forward), shape (T, 2, H, W), NaN outside instances; None
+            if only instances are known.
+        flow: Vectors in cells, shape (T, 2, H, W), like `offset`; also NaN where the flow is
+            unknown.
     """
 
     grid: BevGrid
@@ -83,10 +85,14 @@ class MotionMaps(FrozenArrays):
     @property
     def names(self) -> tuple[DrawnMap, ...]:
         """Names of the maps that are not None."""
-        return tuple(name for name in DRAWN_MAPS if getattr(self, name) is not None)
+        names = []
+        for name in DRAWN_MAPS:
+            if getattr(self, name) is not None:
+                names.append(name)
+        return tuple(names)
 
     def vectors(self, name: DrawnMap) -> AnyArray:
-        """Return `offset` or `flow`, shape (T, 2, H, W); raises ChoiceError if it is missing."""
+        """Return `offset` or `flow`, shape (T, 2, H, W); raise ChoiceError if it is None."""
         maps = getattr(self, name)
         if maps is None:
             raise ChoiceError(
@@ -96,17 +102,21 @@ class MotionMaps(FrozenArrays):
         return np.asarray(maps)
 
     def longest(self, name: DrawnMap) -> float:
-        """Return the length of a map's longest vector in all frames, in cells, at least 1.
+        """Return the length of a map's longest vector over all frames, in cells, at least 1.
 
-        It is 1 for maps without vectors.
+        Maps without vectors have length 1.
         """
         if name not in ("offset", "flow"):
             return 1.0
         length = np.linalg.norm(self.vectors(name), axis=1)
-        return max(1.0, float(np.nan_to_num(length).max(initial=0)))
+        longest = float(np.nan_to_num(length).max(initial=0))
+        return max(1.0, longest)
 
     def paths(self) -> dict[int, FloatArray]:
-        """Return the paths of the first frame's instances: id → (n, 2) x forward, y left (m)."""
+        """Return the paths of the first frame's instances, by id.
+
+        Each path has shape (n, 2): x forward and y left, metres.
+        """
         if not self.valid[0]:
             return {}
         return instance_paths(self.instance[self.valid], self.grid)
@@ -115,11 +125,13 @@ class MotionMaps(FrozenArrays):
 def maps_of_labels(
     labels: MotionLabels, marked: Collection[int] = (), agents: Mapping[int, str] | None = None
 ) -> MotionMaps:
-    """Return labels in the form of pictures.
+    """Convert labels to `MotionMaps`.
 
-    `marked` actors are red, `agents` have their hues (both by label ids).
+    Actors in `marked` (label ids) are red. Vehicles in `agents` (agent by label id) have their
+    agents' hues.
     """
-    source, ignore = labels.config.grid.orientation, labels.config.ignore_index
+    source = labels.config.grid.orientation
+    ignore = labels.config.ignore_index
     valid = labels.label_valid
 
     def oriented(name: str, *, vectors: bool = False) -> AnyArray:
@@ -129,7 +141,8 @@ def maps_of_labels(
 
     instance = np.where(valid[:, None, None], oriented("instance"), 0)
     occupied = instance[:, None] > 0
-    offset, flow = oriented("offset", vectors=True), oriented("flow", vectors=True)
+    offset = oriented("offset", vectors=True)
+    flow = oriented("flow", vectors=True)
     has_offset = occupied & (offset != ignore).any(axis=1, keepdims=True)
     has_flow = occupied & (flow != ignore).any(axis=1, keepdims=True)
     return MotionMaps(
@@ -154,9 +167,10 @@ def maps_of_output(
     marked: Collection[int] = (),
     post_processing: PostProcessing | str = "motion",
 ) -> MotionMaps:
-    """Return one prediction of an output, by default the last, in the form of pictures.
+    """Convert one prediction of an output, by default the last, to `MotionMaps`.
 
-    `step` is seconds from frame to frame. Raises ChoiceError.
+    `step` is the time from frame to frame, seconds. Raises ChoiceError if the output has no such
+    prediction, or the post-processing is unknown.
     """
     if number not in range(-len(output), len(output)):
         raise ChoiceError(
@@ -166,7 +180,12 @@ def maps_of_output(
     heads = None
     if output.heads is not None:
         heads = output.heads[number]
-    instance = _predicted_instances(output, heads, number, post_processing)
+    if output.instances is not None:
+        instance = np.asarray(output.instances[number])
+    elif heads is not None:
+        instance = predict_instances(heads, post_processing).instance
+    else:  # only for the type checker: an output has heads or instances
+        raise ChoiceError("prediction: has neither heads nor instances")
     instance = np.maximum(output.grid.reorient(instance, "devkit"), 0)
     head_maps: dict[str, AnyArray] = {}
     if heads is not None:
@@ -184,21 +203,8 @@ def maps_of_output(
     )
 
 
-def _predicted_instances(
-    output: MotionOutput,
-    heads: MotionHeads | None,
-    number: int,
-    post_processing: PostProcessing | str,
-) -> AnyArray:
-    """Return the instances of one prediction, shape (T, H, W), in its own orientation."""
-    if output.instances is not None:
-        return np.asarray(output.instances[number])
-    if heads is None:  # only for the type checker: an output has one of them
-        raise ChoiceError("prediction: has neither heads nor instances")
-    return predict_instances(heads, post_processing).instance
-
-
 def _head_maps(heads: MotionHeads, instance: AnyArray) -> dict[str, AnyArray]:
+    """Return the maps of network heads by name; vectors are NaN outside `instance` (T, H, W)."""
     oriented = heads.in_orientation("devkit")
     ignored = [] if oriented.ignore_index is None else [oriented.ignore_index]
     occupied = instance[:, None] > 0
@@ -212,16 +218,19 @@ def _head_maps(heads: MotionHeads, instance: AnyArray) -> dict[str, AnyArray]:
 def _label_colors(
     labels: MotionLabels, instance: AnyArray, marked: Collection[int], agents: Mapping[int, str]
 ) -> FloatArray:
-    """Return the palette with red for marked actors and hues for agents.
+    """Make the palette, shape (1 + ids, 3): red for marked actors, hues for agents (label ids).
 
-    An own box that has neither is dark.
+    The ego's own box is dark, unless it is marked or has an agent's hue.
     """
     from matplotlib.colors import to_rgb
 
     max_id = max([int(instance.max(initial=0)), *labels.id_map.values()])
     instance_ids = {}
     for actor, instance_id in labels.id_map.items():
-        instance_ids[OWN_ACTOR_ID if actor == OWN_BOX_ID else actor] = instance_id
+        if actor == OWN_BOX_ID:
+            instance_ids[OWN_ACTOR_ID] = instance_id
+        else:
+            instance_ids[actor] = instance_id
     marked_ids = [instance_ids[actor] for actor in instance_ids if actor in marked]
     colors = _palette(max_id, marked_ids)
     hues = {OWN_ACTOR_ID: OWN_COLOR}
@@ -233,7 +242,7 @@ def _label_colors(
 
 
 def _palette(max_id: int, marked: Collection[int]) -> FloatArray:
-    """Return a colour for each id, shape (1 + ids, 3): white for 0, red for marked ids."""
+    """Make a palette, shape (1 + max_id, 3): white for 0, red for marked ids."""
     from matplotlib.colors import to_rgb
 
     shades = [to_rgb(color) for color in INSTANCE_COLORS]
@@ -248,7 +257,7 @@ def _palette(max_id: int, marked: Collection[int]) -> FloatArray:
 def draw_map_of(
     maps: MotionMaps, name: DrawnMap, frame: int, layers: frozenset[Layer], ax: Axes
 ) -> Axes:
-    """Render one map of one frame, in the way of `draw_motion_map`."""
+    """Render one map of one frame, as `draw_motion_map` does."""
     ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal")
     if not maps.valid[frame]:
         ax.set_facecolor(BEYOND_COLOR)
@@ -260,12 +269,12 @@ def draw_map_of(
         if "velocities" in layers:
             _draw_arrows(maps, frame, ax)
         if maps.instance[frame].any() and np.isnan(maps.vectors("flow")[frame]).all():
-            write_in_middle(ax, "no next frame")
+            write_in_middle(ax, "last frame:\nno flow")
     return _with_ids_and_grid(maps, frame, layers, ax)
 
 
 def draw_trail_of(maps: MotionMaps, layers: frozenset[Layer], ax: Axes) -> Axes:
-    """Render all frames, in the way of `draw_motion_trail`."""
+    """Render all frames, as `draw_motion_trail` does."""
     ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal")
     label_axes(ax, "ego")
     if "labels" in layers:
@@ -277,22 +286,23 @@ def draw_trail_of(maps: MotionMaps, layers: frozenset[Layer], ax: Axes) -> Axes:
 
 
 def trail_picture(maps: MotionMaps) -> FloatArray:
-    """Return the colours of all frames over each other, shape (H, W, 3).
+    """Blend all frames into one picture, shape (H, W, 3), RGB from 0 to 1.
 
-    Earlier frames are stronger and on top.
+    Earlier frames are more opaque and on top.
     """
     frames = np.flatnonzero(maps.valid).tolist()
     opacity = np.linspace(1.0, MIN_TRAIL_OPACITY, max(len(maps.valid), 2))
     picture = np.ones((*maps.instance.shape[1:], 3))
     for frame in reversed(frames):
-        occupied = maps.instance[frame] > 0
-        colors = maps.colors[maps.instance[frame][occupied]]
-        picture[occupied] = 1 - opacity[frame] * (1 - colors)
+        instance = maps.instance[frame]
+        is_occupied = instance > 0
+        colors = maps.colors[instance[is_occupied]]
+        picture[is_occupied] = 1 - opacity[frame] * (1 - colors)
     return picture
 
 
 def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
-    """Render the meaning of the colours of a map."""
+    """Render a key that explains the colours of a map."""
     ax.axis("off")
     if name == "instance":
         handles = instance_handles(maps)
@@ -313,24 +323,29 @@ def draw_key(maps: MotionMaps, name: DrawnMap, ax: Axes) -> None:
         colors = direction_colors(left, forward, longest=1.0)
         wheel = np.where(is_inside[..., None], colors, 1.0)
         ax.imshow(wheel, origin="lower", extent=(-1, 1, -1, 1))
-        ax.text(0, -1.2, f"rim: {maps.longest(name):.0f} cells", ha="center", va="top")
+        ax.text(0, -1.2, f"outer ring =\n{maps.longest(name):.0f} cells", ha="center", va="top")
         ax.text(0, 1.1, "left", ha="center", va="bottom")
         ax.text(1.1, 0, "forward", ha="left", va="center", rotation=270)
 
 
 def direction_colors(left: AnyArray, forward: AnyArray, *, longest: float) -> AnyArray:
-    """Return a colour for the direction of vectors (left, forward), paler for shorter ones.
+    """Return the colour of each vector's direction, shape (H, W, 3), paler for shorter vectors.
 
-    The shape is (H, W, 3).
+    Args:
+        left: Components of the vectors to the left, shape (H, W).
+        forward: Components of the vectors forward, shape (H, W).
+        longest: Length of a vector that has the full colour.
     """
     from matplotlib.colors import to_rgb
 
-    corners = np.array([to_rgb(color) for color in (*DIRECTION_COLORS, DIRECTION_COLORS[0])])
-    turn = np.arctan2(left, forward) / (2 * np.pi) % 1 * len(DIRECTION_COLORS)
-    channels = [np.interp(turn, range(len(corners)), channel) for channel in corners.T]
-    full = np.stack(channels, axis=-1)
+    color_circle = [*DIRECTION_COLORS, DIRECTION_COLORS[0]]
+    rgb = np.array([to_rgb(color) for color in color_circle])
+    turns = np.arctan2(left, forward) / (2 * np.pi) % 1
+    positions = turns * len(DIRECTION_COLORS)
+    channels = [np.interp(positions, range(len(rgb)), channel) for channel in rgb.T]
+    full_colors = np.stack(channels, axis=-1)
     strength = np.minimum(np.hypot(left, forward) / longest, 1)
-    return _STILL_GREY - strength[..., None] * (_STILL_GREY - full)
+    return _STILL_GREY - strength[..., None] * (_STILL_GREY - full_colors)
 
 
 def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> None:
@@ -342,8 +357,10 @@ def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> Non
             _draw_cells(ax, maps.centerness[frame], maps, cmap=CENTERNESS_COLORMAP, vmin=0, vmax=1)
     else:
         vectors = maps.vectors(name)[frame]
-        colors = direction_colors(*np.nan_to_num(vectors), longest=maps.longest(name))
-        _draw_cells(ax, np.where(np.isnan(vectors[0])[..., None], 1.0, colors), maps)
+        left, forward = np.nan_to_num(vectors)
+        colors = direction_colors(left, forward, longest=maps.longest(name))
+        colors[np.isnan(vectors[0])] = 1.0
+        _draw_cells(ax, colors, maps)
 
 
 def draw_edge(maps: MotionMaps, instance_id: int, ax: Axes, color: str, *, frame: int = 0) -> None:
@@ -355,18 +372,19 @@ def draw_edge(maps: MotionMaps, instance_id: int, ax: Axes, color: str, *, frame
 
 
 def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:
-    """Draw one arrow for each instance, from the mean of its cells, along the mean of its flow."""
-    flow, instance = maps.vectors("flow")[frame], maps.instance[frame]
-    known = ~np.isnan(flow[0])
-    if not known.any():
+    """Draw one arrow for each instance, from its cells' mean position, along its mean flow."""
+    flow = maps.vectors("flow")[frame]
+    is_known = ~np.isnan(flow[0])
+    if not is_known.any():
         return
-    row, column = np.nonzero(known)
+    row, column = np.nonzero(is_known)
     x, y = _cell_centers(maps)
-    _, member, count = np.unique(instance[known], return_inverse=True, return_counts=True)
-    left, forward = flow[:, known]
+    ids = maps.instance[frame][is_known]
+    _, member, count = np.unique(ids, return_inverse=True, return_counts=True)
     means = []
-    for values in (x[column], y[row], left, forward):
-        means.append(np.bincount(member.ravel(), weights=values) / count)
+    for values in (x[column], y[row], *flow[:, is_known]):
+        sums = np.bincount(member.ravel(), weights=values)
+        means.append(sums / count)
     start_x, start_y, step_y, step_x = means
     ax.quiver(
         start_x,
@@ -383,17 +401,18 @@ def _draw_arrows(maps: MotionMaps, frame: int, ax: Axes) -> None:
 
 
 def _draw_paths(maps: MotionMaps, ax: Axes) -> None:
-    """Draw one line for each instance along the centres of its cells.
+    """Draw each instance's path as a line, with a dot at each frame after the current one.
 
-    There is a dot at each frame after the present.
+    A path connects the centres of the instance's cells in each frame.
     """
     from matplotlib.collections import LineCollection
 
-    paths, colors = [], []
+    paths = []
+    colors = []
     for instance_id, path in maps.paths().items():
         if len(path) > 1:
             paths.append(path)
-            # darker than the cells that they lie on
+            # darker than the cells beneath them
             colors.append(maps.colors[instance_id] * 0.6)
     ax.add_collection(LineCollection(paths, colors=colors, linewidths=1.3, zorder=4))
     if paths:
@@ -409,9 +428,10 @@ def _with_ids_and_grid(maps: MotionMaps, frame: int, layers: frozenset[Layer], a
         x, y = _cell_centers(maps)
         for instance_id in np.unique(instance[instance > 0]).tolist():
             row, column = np.nonzero(instance == instance_id)
-            low, high = (x[column.min()], y[row.min()]), (x[column.max()], y[row.max()])
-            chip = (str(instance_id), (x[column].mean(), y[row].mean()))
-            place_chips(ax, [chip], avoid=[[low, high]])
+            centers = np.column_stack([x[column], y[row]])
+            corners = [centers.min(axis=0), centers.max(axis=0)]
+            position = (x[column].mean(), y[row].mean())
+            place_chips(ax, [(str(instance_id), position)], avoid=[corners])
     if "grid" in layers:
         return with_light_grid(ax, "both")
     return ax
@@ -428,7 +448,7 @@ def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **style: Any) -> 
 
 
 def instance_handles(maps: MotionMaps) -> list[Artist]:
-    """Return handles for the hues of instances."""
+    """Make legend handles for the hues of instances, and for the recording agent's own box."""
     from matplotlib.colors import to_hex
     from matplotlib.patches import Patch
 
@@ -440,7 +460,7 @@ def instance_handles(maps: MotionMaps) -> list[Artist]:
     if maps.own > 0:
         handles.append(
             Patch(
-                label="own box",
+                label="own vehicle",
                 facecolor="none",
                 edgecolor=OWN_COLOR,
                 linewidth=_OWN_EDGE_WIDTH_PT,
@@ -449,7 +469,27 @@ def instance_handles(maps: MotionMaps) -> list[Artist]:
     return handles
 
 
+def trail_handles(maps: MotionMaps, layers: Collection[Layer]) -> list[Artist]:
+    """Make legend handles for the paleness and the dots of a trail."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    color = INSTANCE_COLORS[0]
+    seconds = maps.step * (len(maps.valid) - 1)
+    pale_color = (color, MIN_TRAIL_OPACITY)
+    handles: list[Artist] = []
+    if "labels" in layers:
+        handles.append(Patch(label="others now", facecolor=color))
+        handles.append(Patch(label=f"in {seconds:g} s", facecolor=pale_color))
+    if "trajectories" in layers:
+        label = f"every {maps.step:g} s"
+        handles.append(Line2D([], [], color=color, marker="o", markersize=3, label=label))
+    return handles
+
+
 def _cell_centers(maps: MotionMaps) -> tuple[FloatArray, FloatArray]:
-    """Return x of the columns' centres and y of the rows' centres, metres."""
+    """Return the x coordinates of the columns' centres and the y of the rows' centres, metres."""
     centers = maps.grid.centers()
-    return centers[0, :, 0], centers[:, 0, 1]
+    x = centers[0, :, 0]
+    y = centers[:, 0, 1]
+    return x, y

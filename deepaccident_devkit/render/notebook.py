@@ -1,9 +1,9 @@
-"""Small pictures of boxes, points and motion labels, which a notebook shows beside their text."""
+"""Small pictures of boxes, points and motion labels, which a notebook shows next to their text."""
 
 from __future__ import annotations
 
 from io import BytesIO
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, LidarPointCloud
@@ -17,40 +17,35 @@ from deepaccident_devkit.taxonomy import CAMERAS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_FIGURE_SIZE_IN: Final = (3.6, 3.2)
-_DPI: Final = 80
-# More points and boxes are thinned out: a picture must not take long.
-_MAX_POINTS: Final = 20_000
-_MAX_BOXES: Final = 1_000
-_LETTER_SIZE_PT: Final = 7
-_LEVEL_FROM_OPTICAL: Final = SE3.from_rotation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+_FIGURE_SIZE_IN = (3.6, 3.2)
+_DPI = 80
+# Above these numbers, points and boxes are thinned out, so that a picture does not take long.
+_MAX_POINTS = 20_000
+_MAX_BOXES = 1_000
+_LETTER_SIZE_PT = 7
+_LEVEL_FROM_OPTICAL = SE3.from_rotation([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 @in_own_settings
 def png_of(thing: object) -> bytes:
-    """Return a small picture as PNG; raises ChoiceError for empty or other objects."""
+    """Draw boxes, points or labels as a small PNG; raise ChoiceError if empty or anything else."""
     figure = detached_figure(_FIGURE_SIZE_IN)
     ax = figure.add_subplot()
-    _draw(thing, ax)
+    if isinstance(thing, Boxes) and len(thing):
+        _draw_boxes(thing, ax)
+    elif isinstance(thing, LidarPointCloud) and len(thing):
+        _draw_points(thing, ax)
+    elif isinstance(thing, MotionLabels):
+        labels = thing if thing.at_present else thing.to_present()
+        draw_motion_trail(labels, ax=ax)
+    else:
+        raise ChoiceError(f"nothing to render in {thing!r}; expected boxes, points or MotionLabels")
     ax.tick_params(labelsize=_LETTER_SIZE_PT)
     ax.xaxis.label.set_fontsize(_LETTER_SIZE_PT)
     ax.yaxis.label.set_fontsize(_LETTER_SIZE_PT)
     content = BytesIO()
     figure.savefig(content, format="png", dpi=_DPI)
     return content.getvalue()
-
-
-def _draw(thing: object, ax: Axes) -> None:
-    if isinstance(thing, Boxes) and len(thing):
-        _draw_boxes(thing, ax)
-    elif isinstance(thing, LidarPointCloud) and len(thing):
-        _draw_points(thing, ax)
-    elif isinstance(thing, MotionLabels):
-        draw_motion_trail(thing if thing.at_present else thing.to_present(), ax=ax)
-    else:
-        raise ChoiceError(
-            f"there is nothing to render in {thing!r}; expected boxes, points or MotionLabels"
-        )
 
 
 def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
@@ -67,8 +62,8 @@ def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
 def _draw_points(cloud: LidarPointCloud, ax: Axes) -> None:
     _name_axes(cloud.frame, ax)
     step = -(-len(cloud) // _MAX_POINTS)
-    xyz = cloud.xyz[::step]
-    ax.scatter(xyz[:, 0], xyz[:, 1], s=0.5, c=xyz[:, 2], cmap=HEIGHT_COLORMAP, linewidths=0)
+    x, y, height = cloud.xyz[::step].T
+    ax.scatter(x, y, s=0.5, c=height, cmap=HEIGHT_COLORMAP, linewidths=0)
 
 
 def _name_axes(frame: str, ax: Axes) -> None:

@@ -1,4 +1,4 @@
-"""Several panels of one moment: of all sensors, of all agents, and proofs of the transforms."""
+"""Several panels of one moment: all sensors, all agents, and checks of the transforms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.geometry import Boxes, LidarPointCloud
 from deepaccident_devkit.render.bev import BEV_DEFAULT, BEV_LAYERS, BevView, draw_bev
-from deepaccident_devkit.render.boxes import in_drawing_order, simultaneous_sample
+from deepaccident_devkit.render.boxes import camera_name, in_drawing_order, simultaneous_sample
 from deepaccident_devkit.render.camera import (
     CAMERA_DEFAULT,
     CAMERA_LAYERS,
@@ -23,14 +23,23 @@ from deepaccident_devkit.render.camera import (
 from deepaccident_devkit.render.captions import (
     agent_handles,
     draw_legend,
-    handles_from_above,
+    handles_of_scene,
     has_cloud,
+    has_sensor_file,
     missing_clouds_text,
     set_scene_title,
     write_missing,
 )
-from deepaccident_devkit.render.figures import LAYERS, Layer, figure_or_new, hide_axes, layers_of
-from deepaccident_devkit.render.hidden import hiding
+from deepaccident_devkit.render.figures import (
+    LAYERS,
+    Layer,
+    Layers,
+    figure_or_new,
+    hide_axes,
+    layers_of,
+    square_around,
+)
+from deepaccident_devkit.render.hidden import hidden_points_filter
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     current_style,
@@ -55,30 +64,33 @@ CAMERA_GRID: Final = (
     ("Camera_FrontLeft", "Camera_Front", "Camera_FrontRight"),
     ("Camera_BackLeft", "Camera_Back", "Camera_BackRight"),
 )
-# The same in a figure of about 16 to 9.
-_TALL_GRID: Final = (
+# The same in a figure of about 16:9.
+TALL_CAMERA_GRID: Final = (
+    ("Camera_FrontLeft", "Camera_BackLeft"),
     ("Camera_Front", "Camera_Back"),
-    ("Camera_FrontLeft", "Camera_FrontRight"),
-    ("Camera_BackLeft", "Camera_BackRight"),
+    ("Camera_FrontRight", "Camera_BackRight"),
 )
-# Least width by height of a figure in which three cameras and a view from above fit side by side.
-_MIN_WIDE_RATIO: Final = 2.1
-# Metres of a view that agents share: its least range, and its margin around them.
-_MIN_SHARED_RANGE_M, _SHARED_MARGIN_M = 30.0, 12.0
-# Maximum share of the width for cameras beside a shared view.
-_MAX_CAMERAS_SHARE: Final = 0.66
-# Inches of words above and below panels, beside them, and of a panel's title, for letters of one
-# point.
-_WORDS_HEIGHT_IN, _WORDS_WIDTH_IN, _TITLE_HEIGHT_IN = 0.178, 0.08, 0.02
-# Maximum width by height of a view that agents share.
-_MAX_SHARED_RATIO: Final = 2.2
+# Minimum width over height of a figure in which three cameras and a view from above fit in a row.
+_MIN_WIDE_RATIO = 2.1
+# Minimum range to each side of a view that agents share, and the margin around them, in metres.
+_MIN_SHARED_RANGE_M = 30.0
+_SHARED_MARGIN_M = 12.0
+# Maximum share of a figure's width for cameras next to a shared view.
+_MAX_CAMERAS_SHARE = 0.66
+# Inches that words take above and below panels, next to them, and in a panel's title, per point of
+# letter size.
+_WORDS_HEIGHT_IN = 0.178
+_WORDS_WIDTH_IN = 0.08
+_TITLE_HEIGHT_IN = 0.02
+# Maximum width over height of a view that agents share.
+_MAX_SHARED_RATIO = 2.2
 MOMENT_LAYERS: Final = tuple(layer for layer in LAYERS if layer in {*CAMERA_LAYERS, *BEV_LAYERS})
-CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes", "ids")
-_DEFAULT_CALIBRATION_LAYERS: Final[tuple[Layer, ...]] = ("image", "points", "boxes")
-# Metres from the camera up to which boxes are rendered: more distant ones are as small as the
-# errors to be found.
-_MAX_BOX_DISTANCE_M: Final = 60.0
-_COLUMN_COUNT: Final = 3
+CALIBRATION_LAYERS: Final[Layers] = ("image", "points", "boxes", "ids")
+_DEFAULT_CALIBRATION_LAYERS: Layers = ("image", "points", "boxes")
+# Metres from the camera up to which boxes are rendered: more distant ones are no larger than the
+# errors that the picture should reveal.
+_MAX_BOX_DISTANCE_M = 60.0
+_COLUMN_COUNT = 3
 
 
 @in_own_settings
@@ -96,10 +108,11 @@ def render_sample(
     Args:
         dataset: The release.
         sample: Token or record.
-        agents: Agents with points and boxes from above (`render_bev`); by default only the sample's
-            own agent.
-        layers: Each panel renders the layers that it has: cameras as in `render_sample_data`, the
-            panel from above as in `render_bev`. By default each panel has its own default.
+        agents: Agents whose points and boxes the view from above shows, as in `render_bev`; by
+            default only the sample's agent.
+        layers: Each panel renders the layers that it supports: cameras as in
+            `render_sample_data`, the view from above as in `render_bev`. None means each panel's
+            default.
         link: Effects on the partners' data; None for none.
         fig: Empty figure to render on; a new one if None.
 
@@ -117,26 +130,28 @@ def render_sample(
     names = cooperating_agents(dataset, record, agents)
     fig = figure_or_new(fig, (16, 5.6), page=0.42, column=1.6)
     axes = _sample_panels(fig)
+    camera_colors: frozenset[str] = frozenset()
     for channel in CAMERAS:
         camera = dataset.get("sample_data", f"{record['token']}/{channel}")
-        draw_camera(dataset, camera, camera_layers, axes[channel])
+        camera_colors |= draw_camera(dataset, camera, camera_layers, axes[channel])
     view = BevView(agents=names, link=link)
     colors, cloud_agents = draw_bev(dataset, record, view, bev_layers, axes["bev"])
-    draw_legend(fig, handles_from_above(colors, cloud_agents))
+    draw_legend(fig, handles_of_scene(colors, cloud_agents, camera_colors))
     set_scene_title(fig, dataset, record["token"])
     return fig
 
 
 def _sample_panels(fig: Figure) -> dict[str, Axes]:
-    """Return the axes of the six cameras by channel, and of the view from above as `bev`."""
+    """Make axes for the six cameras, by channel, and for the view from above, as `bev`."""
     width, height = fig.bbox.size
     if height > width:
         mosaic: list[Any] = [*map(list, CAMERA_GRID), ["bev"] * 3]
         return fig.subplot_mosaic(mosaic, height_ratios=(1, 1, 16 / 3))
-    grid: Any = _TALL_GRID
-    ratios: tuple[float, ...] = (4, 4, 8)
+    grid: Any = TALL_CAMERA_GRID
+    ratios: tuple[float, ...] = (5, 5, 8)
     if width > _MIN_WIDE_RATIO * height:
-        grid, ratios = CAMERA_GRID, (4, 4, 4, 4.5)
+        grid = CAMERA_GRID
+        ratios = (4, 4, 4, 4.5)
     return fig.subplot_mosaic([[*row, "bev"] for row in grid], width_ratios=ratios)
 
 
@@ -149,20 +164,21 @@ def render_frame(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render the front views of a moment's agents beside one view from above, in world.
+    """Render the agents' front cameras next to one view from above, in the world frame.
 
     The colliding pair is red, other recording vehicles have their agents' hues, and the remaining
-    actors a shade for their category.
+    actors have a shade for their category.
 
     Args:
         dataset: The release.
         frame: Token or record.
-        agents: Agents, or None for all present ones; a configuration is from the view of the first
-            present agent. Their order is always that of `taxonomy.AGENTS`.
-        layers: Each panel renders the layers that it has: cameras as in `render_sample_data`, the
-            panel from above as in `render_bev`. By default each panel has its own default.
-        fig: Empty figure to render on; a new one if None. The view from above is as wide as the
-            agents need, and in a figure that is higher than wide below the cameras.
+        agents: Agents, or None for all present ones; the first present agent is the ego of a
+            configuration. They are always shown in the order of `taxonomy.AGENTS`.
+        layers: Each panel renders the layers that it supports: cameras as in
+            `render_sample_data`, the view from above as in `render_bev`. None means each panel's
+            default.
+        fig: Empty figure to render on; a new one if None. The view from above is wide enough to
+            show all agents; in a figure that is taller than wide, it is below the cameras.
 
     Returns:
         The figure. An image that was not downloaded is a grey panel.
@@ -172,9 +188,10 @@ def render_frame(
         ChoiceError: No such layer, agent or configuration.
         NotAvailableError: An agent is not in this (partial) release.
     """
-    names = cooperating_agents(dataset, dataset.samples_of(dataset.get("frame", frame))[0], agents)
+    first_sample = dataset.samples_of(dataset.get("frame", frame))[0]
+    names = cooperating_agents(dataset, first_sample, agents)
     panel_layers(layers)  # refused before a figure is made
-    fig = figure_or_new(fig, (14.5, 6.0), page=0.62, column=1.5)
+    fig = figure_or_new(fig, (14.5, 5.3), page=0.62, column=1.5)
     draw_shared_moment(dataset, frame, agents=names, layers=layers, fig=fig)
     return fig
 
@@ -187,9 +204,10 @@ def draw_shared_moment(
     layers: Iterable[Layer] | None,
     fig: Figure,
 ) -> None:
-    """Render the front views of agents beside one view from above that they share, in world.
+    """Render agents' front cameras next to a view from above that they share, in the world frame.
 
-    The view is as wide as they need. The figure is an empty one of about 16 to 9, or wider.
+    The view is wide enough to show all agents. The figure must be empty, with an aspect ratio of
+    about 16:9 or wider.
     """
     camera_layers, bev_layers = panel_layers(layers)
     record = dataset.get("frame", frame)
@@ -197,14 +215,15 @@ def draw_shared_moment(
     first_sample = dataset.samples_of(record)[0]
     samples = [simultaneous_sample(first_sample, agent) for agent in names]
     bev_ax, wide, camera_axes = _moment_panels(fig, len(names))
+    camera_colors: frozenset[str] = frozenset()
     for agent, sample, ax in zip(names, samples, camera_axes, strict=True):
         camera = dataset.get("sample_data", f"{sample}/Camera_Front")
-        draw_camera(dataset, camera, camera_layers, ax)
+        camera_colors |= draw_camera(dataset, camera, camera_layers, ax)
         ax.set_title(short_name(agent), fontsize="medium")
-    positions = np.array([dataset.world_from(sample, "ego").translation[:2] for sample in samples])
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    view_range = float((high - low).max()) / 2 + _SHARED_MARGIN_M
-    x, y = ((low + high) / 2).tolist()
+    poses = [dataset.world_from(sample, "ego") for sample in samples]
+    positions = np.array([pose.translation[:2] for pose in poses])
+    center, view_range = square_around(positions, _SHARED_MARGIN_M)
+    x, y = center.tolist()
     view = BevView(
         view_range=max(_MIN_SHARED_RANGE_M, view_range),
         frame="world",
@@ -214,14 +233,14 @@ def draw_shared_moment(
     )
     colors, cloud_agents = draw_bev(dataset, samples[0], view, bev_layers, bev_ax)
     bev_ax.set_anchor("C")
-    draw_legend(fig, handles_from_above(colors, cloud_agents))
+    draw_legend(fig, handles_of_scene(colors, cloud_agents, camera_colors))
     set_scene_title(fig, dataset, record["token"])
 
 
 def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], frozenset[Layer]]:
-    """Return the requested layers of the cameras, and of the panels from above.
+    """Split the requested layers into camera layers and layers of views from above.
 
-    Raises ChoiceError.
+    A layer may belong to both. Raises ChoiceError for a layer that neither of them supports.
     """
     if layers is None:
         return frozenset(CAMERA_DEFAULT), frozenset(BEV_DEFAULT)
@@ -230,41 +249,53 @@ def panel_layers(layers: Iterable[Layer] | None) -> tuple[frozenset[Layer], froz
 
 
 def _moment_panels(fig: Figure, agents: int) -> tuple[Axes, float, list[Axes]]:
-    """Return the panel from above, its width by height, and one for each agent's camera beside it.
+    """Make the panel from above and one for each agent's camera; also return width over height.
 
-    In a figure that is higher than wide, and in a paper, cameras are above it.
+    The ratio describes the panel from above. Cameras are next to this panel; in a paper, or in a
+    figure that is taller than wide, they are above it.
     """
-    width, height = fig.bbox.width / fig.dpi, fig.bbox.height / fig.dpi
+    width = fig.bbox.width / fig.dpi
+    height = fig.bbox.height / fig.dpi
+    bev_width = width
     bev_height = height - _WORDS_HEIGHT_IN * text_size()
-    if height > width or current_style().room == "page":
+    if height > width or current_style().layout == "page":
         columns = agents if width > height else min(_COLUMN_COUNT, agents)
         rows = -(-agents // columns)
         camera_height = width / columns * 9 / 16
-        bev_height -= rows * (camera_height + _TITLE_HEIGHT_IN * text_size())
+        title_height = _TITLE_HEIGHT_IN * text_size()
+        bev_height -= rows * (camera_height + title_height)
         height_ratios = (*[camera_height] * rows, bev_height)
-        grid = fig.add_gridspec(rows + 1, columns, height_ratios=height_ratios)
-        camera_axes = _filled_grid(fig, grid, agents, first_column=0)
-        bev_ax, bev_width = fig.add_subplot(grid[rows, :]), width
+        grid = fig.add_gridspec(rows + 1, 2 * columns, height_ratios=height_ratios)
+        camera_axes = _fill_grid(fig, grid, agents, first_column=0)
+        bev_ax = fig.add_subplot(grid[rows, :])
     else:
-        rows = min(2 if width > _MIN_WIDE_RATIO * height else 3, agents)
+        max_rows = 2 if width > _MIN_WIDE_RATIO * height else 3
+        rows = min(max_rows, agents)
         columns = -(-agents // rows)
         cameras_width = min(columns * bev_height / rows * 16 / 9, _MAX_CAMERAS_SHARE * width)
-        bev_width = width - cameras_width
-        width_ratios = (bev_width, *[cameras_width / columns] * columns)
-        grid = fig.add_gridspec(rows, columns + 1, width_ratios=width_ratios)
-        camera_axes = _filled_grid(fig, grid, agents, first_column=1)
+        bev_width -= cameras_width
+        half_columns = 2 * columns
+        width_ratios = (bev_width, *[cameras_width / half_columns] * half_columns)
+        grid = fig.add_gridspec(rows, half_columns + 1, width_ratios=width_ratios)
+        camera_axes = _fill_grid(fig, grid, agents, first_column=1)
         bev_ax = fig.add_subplot(grid[:, 0])
-    ratio = max(1.0, (bev_width - _WORDS_WIDTH_IN * text_size()) / bev_height)
-    return bev_ax, min(ratio, _MAX_SHARED_RATIO), camera_axes
+    ratio = (bev_width - _WORDS_WIDTH_IN * text_size()) / bev_height
+    ratio = min(max(1.0, ratio), _MAX_SHARED_RATIO)
+    return bev_ax, ratio, camera_axes
 
 
-def _filled_grid(fig: Figure, grid: Any, count: int, *, first_column: int) -> list[Axes]:
-    """Return `count` axes in a grid, from a first column on, row by row."""
-    columns = grid.ncols - first_column
+def _fill_grid(fig: Figure, grid: Any, count: int, *, first_column: int) -> list[Axes]:
+    """Add `count` axes to a grid, row by row, each two columns wide; the last row is centred.
+
+    Columns before `first_column` stay empty.
+    """
+    places = (grid.ncols - first_column) // 2
     axes = []
     for number in range(count):
-        row, column = divmod(number, columns)
-        axes.append(fig.add_subplot(grid[row, first_column + column]))
+        row, place = divmod(number, places)
+        free_places = max(0, (row + 1) * places - count)
+        column = first_column + free_places + 2 * place
+        axes.append(fig.add_subplot(grid[row, column : column + 2]))
     return axes
 
 
@@ -277,26 +308,27 @@ def render_calibration(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render all agents' LiDAR points and boxes in camera images, to prove the calibration.
+    """Render all agents' LiDAR points and boxes in camera images, to check the calibration.
 
-    Each agent's points have its colour. If the transforms are right, they lie on the kerbs, walls
-    and cars of the image. If an agent's pose or a sensor's pose is wrong, all points of its colour
-    are displaced. Points of other agents are left out where the camera's own cloud has something in
-    front of them (`render.hidden`); boxes are rendered even if other things hide them.
+    Each agent's points have its colour. If the transforms are right, the points lie on the kerbs,
+    walls and cars in the image. If an agent's pose or a sensor's pose is wrong, all points of that
+    agent's colour are displaced. Points of other agents are left out where the cloud of the
+    camera's agent has something in front of them (`render.hidden`). Boxes are rendered even if
+    they are occluded.
 
     Args:
         dataset: The release.
-        frame_or_sample: Token or record: a sample shows its six cameras, a frame the front cameras
-            of the agents.
-        agents: Agents with points and boxes (and, for a frame, cameras); None for all present
-            agents.
-        layers: Some of `image`, `points`, `boxes` (up to 60 m) and `ids`; by default all except
+        frame_or_sample: Token or record. For a sample, its six cameras are shown; for a frame, the
+            front cameras of the agents, or if only one of them has an image, this agent's six.
+        agents: Agents whose points and boxes (and, for a frame, cameras) are shown; None for all
+            present agents.
+        layers: Any of `image`, `points`, `boxes` (up to 60 m) and `ids`; by default all except
             ids.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
-        The figure, three panels in a row. An image that was not downloaded is a grey panel; the
-        title names the agents without downloaded points.
+        The figure, with three panels in each row. An image that was not downloaded is a grey panel;
+        the title names the agents whose points were not downloaded.
 
     Raises:
         TokenError: No such sample or frame.
@@ -304,24 +336,42 @@ def render_calibration(
         NotAvailableError: An agent is not in this (partial) release.
     """
     shown_layers = layers_of(layers, _DEFAULT_CALIBRATION_LAYERS, CALIBRATION_LAYERS)
-    sample, is_frame = _present_sample(dataset, frame_or_sample)
+    is_frame = False
+    try:
+        sample = dataset.get("sample", frame_or_sample)["token"]
+    except TokenError:
+        sample = dataset.samples_of(frame_or_sample)[0]["token"]
+        is_frame = True
     names = in_drawing_order(cooperating_agents(dataset, sample, agents))
     record = dataset.get("sample", sample)
     cameras = [f"{sample}/{channel}" for row in CAMERA_GRID for channel in row]
     title_token = record["token"]
     if is_frame:
-        cameras = [f"{simultaneous_sample(record, agent)}/Camera_Front" for agent in names]
+        samples = [simultaneous_sample(record, agent) for agent in names]
+        front_cameras = [f"{each}/Camera_Front" for each in samples]
+        with_image = [camera for camera in front_cameras if has_sensor_file(dataset, camera)]
         title_token = record["frame_token"]
+        cameras = front_cameras
+        if len(with_image) == 1:
+            pictured_sample = with_image[0].rsplit("/", 1)[0]
+            cameras = [f"{pictured_sample}/{channel}" for row in CAMERA_GRID for channel in row]
     clouds: dict[str, LidarPointCloud] = {}
     missing_agents: list[str] = []
     if "points" in shown_layers:
-        clouds, missing_agents = _clouds(dataset, record, names)
+        clouds, missing_agents = _load_clouds(dataset, record, names)
     boxes = cooperative_boxes(dataset, sample, agents=names)
-    fig, axes = _calibration_panels(fig, len(cameras))
+    columns = 2 if current_style().layout == "column" else _COLUMN_COUNT
+    rows = -(-len(cameras) // columns)
+    page_height = 0.2 * rows + 0.06
+    column_height = 0.33 * rows + 0.12
+    fig = figure_or_new(fig, (15, 3.1 * rows + 0.8), page=page_height, column=column_height)
+    axes = fig.subplots(rows, min(columns, len(cameras)), squeeze=False)
+    hide_axes(axes.flat[len(cameras) :])
     for camera, ax in zip(cameras, axes.flat, strict=False):
         _draw_panel(dataset, camera, clouds, boxes, shown_layers, ax)
         if is_frame:
-            ax.set_title(f"{short_name(camera.rsplit('/', 3)[1])}, front")
+            agent, _, channel = camera.rsplit("/", 3)[1:]
+            ax.set_title(f"{short_name(agent)}, {camera_name(channel)}")
     if len(cameras) < axes.size:
         draw_legend(axes.flat[-1], agent_handles(clouds), columns=1, loc="center")
     else:
@@ -332,11 +382,12 @@ def render_calibration(
     return fig
 
 
-def _clouds(
+def _load_clouds(
     dataset: Dataset, record: Mapping[str, Any], agents: Sequence[str]
 ) -> tuple[dict[str, LidarPointCloud], list[str]]:
-    """Return the clouds of agents at a sample's moment, and the agents without a file."""
-    clouds, missing_agents = {}, []
+    """Load the agents' clouds in a sample's frame; also return the agents without a file."""
+    clouds = {}
+    missing_agents = []
     for agent in agents:
         sample = simultaneous_sample(record, agent)
         if has_cloud(dataset, sample):
@@ -344,24 +395,6 @@ def _clouds(
         else:
             missing_agents.append(agent)
     return clouds, missing_agents
-
-
-def _calibration_panels(fig: Figure | None, cameras: int) -> tuple[Figure, Any]:
-    columns = 2 if current_style().room == "column" else _COLUMN_COUNT
-    rows = -(-cameras // columns)
-    size = (15, 3.1 * rows + 0.8)
-    fig = figure_or_new(fig, size, page=0.2 * rows + 0.06, column=0.33 * rows + 0.12)
-    axes = fig.subplots(rows, min(columns, cameras), squeeze=False)
-    hide_axes(axes.flat[cameras:])
-    return fig, axes
-
-
-def _present_sample(dataset: Dataset, row: RowArgument) -> tuple[str, bool]:
-    """Return the token of a sample, or of a frame's first one, and whether it is a frame."""
-    try:
-        return dataset.get("sample", row)["token"], False
-    except TokenError:
-        return dataset.samples_of(row)[0]["token"], True
 
 
 def _draw_panel(
@@ -372,15 +405,19 @@ def _draw_panel(
     layers: frozenset[Layer],
     ax: Axes,
 ) -> None:
+    """Draw clouds (in their agents' frames) and boxes (in world) in a camera's image (a token)."""
     record = dataset.get("sample_data", camera)
-    sample, channel = dataset.get("sample", record["sample_token"]), record["channel"]
+    sample = dataset.get("sample", record["sample_token"])
+    channel = record["channel"]
     draw_image(dataset, record, ax, image="image" in layers)
-    point_filter = hiding(dataset, record)
+    point_filter = hidden_points_filter(dataset, record)
     for agent, cloud in clouds.items():
         points = point_filter(project_to_image(dataset, cloud, sample, record, colors=False))
         draw_points_in_image(points.pixels[points.mask], ax, size=1.2, color=AGENT_COLORS[agent])
     own_actor = dataset.get("agent", sample["agent_token"])["actor_id"]
-    optical = boxes.transform(dataset.world_from(sample, channel).inverse(), channel)
+    optical_from_world = dataset.world_from(sample, channel).inverse()
+    optical = boxes.transform(optical_from_world, channel)
     is_near = np.linalg.norm(optical.center, axis=1) < _MAX_BOX_DISTANCE_M
-    shown_boxes = optical.select(is_near & (optical.actor_id != own_actor))
+    is_other = optical.actor_id != own_actor
+    shown_boxes = optical.select(is_near & is_other)
     draw_camera_boxes(dataset, record, shown_boxes, layers, ax)

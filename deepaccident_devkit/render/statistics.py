@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.render.captions import draw_legend
+from deepaccident_devkit.render.captions import BELOW, draw_legend, set_title
 from deepaccident_devkit.render.figures import (
-    detached_figure,
     figure_or_new,
     with_light_grid,
-    write_figure,
+    write_report_figure,
 )
 from deepaccident_devkit.render.styles import (
     CATEGORY_COLORS,
@@ -23,12 +23,12 @@ from deepaccident_devkit.render.styles import (
     COLLIDER_COLOR,
     GRID_COLOR,
     SPLIT_COLORS,
+    current_style,
     in_own_settings,
     text_size,
 )
 from deepaccident_devkit.statistics import (
     GROUPS,
-    PROBABILITIES,
     CollisionPair,
     CountTable,
     DatasetStatistics,
@@ -37,7 +37,8 @@ from deepaccident_devkit.statistics import (
     QuantileTable,
 )
 from deepaccident_devkit.support.files import writable_folder
-from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.human_names import human_name
+from deepaccident_devkit.support.text import PathType, choice
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 if TYPE_CHECKING:
@@ -46,19 +47,66 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 120
-# Percent: a smaller share has no number.
-_MIN_SHARE_PERCENT: Final = 0.1
-_Draw = Callable[[DatasetStatistics, "Figure"], None]
-# Inches of a page of A4 in landscape.
-_PAGE_WIDTH_IN: Final = 10.7
+# Shares below this percentage are not written as numbers.
+_MIN_SHARE_PERCENT = 0.1
+# Width in inches of an A4 page in landscape.
+_PAGE_WIDTH_IN = 10.7
+# Heights in lines of letters: the words around bars, a bar, other panels, and the legend.
+_FRAME_LINES = 5.5
+_BAR_LINES = 1.35
+_PANEL_LINES = 19
+_POLAR_LINES = 16
+_POSITIONS_LINES = 21
+_LEGEND_LINES = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Panel:
+    """A panel of a figure.
+
+    Attributes:
+        draw: Function that renders the statistics on axes.
+        counts: Name of the table of counts whose rows are bars; None for another panel.
+        lines: Minimum height without the bars, in lines of letters.
+        projection: Projection of the axes; None for plain axes.
+    """
+
+    draw: Callable[[DatasetStatistics, Axes], object]
+    counts: str | None = None
+    lines: float = _PANEL_LINES
+    projection: str | None = None
+
+    def count_lines(self, statistics: DatasetStatistics) -> float:
+        """Return the minimum height in lines of letters, including the bars."""
+        if self.counts is None:
+            return self.lines
+        return self.lines + _BAR_LINES * len(statistics.counts[self.counts].counts)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Group:
+    """A figure of several panels.
+
+    Attributes:
+        height: Height of the figure in inches.
+        rows: Panels by row.
+        widths: Relative widths of the columns.
+        title: Title of the figure; empty for none.
+    """
+
+    height: float
+    rows: tuple[tuple[_Panel, ...], ...]
+    widths: tuple[float, ...] = (1, 1)
+    title: str = ""
 
 
 def draw_counts(table: CountTable, ax: Axes) -> Axes:
     """Render a table of counts as horizontal bars, with sums and shares.
 
-    The bars of the splits follow each other.
+    Each bar stacks the counts of the splits.
     """
-    values, table_total = list(table.counts), table.total()
+    values = list(table.counts)
+    table_total = table.total()
     starts = [0] * len(values)
     for group in GROUPS[1:]:
         widths = [table.counts[value][group] for value in values]
@@ -72,23 +120,31 @@ def draw_counts(table: CountTable, ax: Axes) -> Axes:
                 height=0.72,
             )
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
-    style: Any = {"textcoords": "offset points", "va": "center", "fontsize": text_size()}
     for row, total in enumerate(starts):
         text = f"{total:,}"
         if table_total:
             text += f" ({100 * total / table_total:.0f} %)"
-        ax.annotate(text, (total, row), (4, 0), **style)
-    ax.set_yticks(range(len(values)), values)
+        ax.annotate(
+            text,
+            (total, row),
+            (4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=text_size(),
+        )
+    ax.set_yticks(range(len(values)), map(human_name, values))
     ax.invert_yaxis()
-    ax.set(xlabel=table.counted, title=table.title, xlim=(0, 1.3 * max([1, *starts])))
+    max_total = max([1, *starts])
+    ax.set(xlabel=table.counted, xlim=(0, 1.3 * max_total))
+    set_title(ax, table.title)
     _format_counts(ax.xaxis)
     return with_light_grid(ax, "x")
 
 
 def draw_histogram(histogram: Histogram, ax: Axes) -> Axes:
-    """Render a histogram as bars, the splits on top of each other.
+    """Render a histogram as bars in which the splits are stacked.
 
-    The title has the share of values outside.
+    The title states the share of values outside the histogram.
     """
     edges = histogram.edges
     widths = [high - low for low, high in pairwise(edges)]
@@ -96,31 +152,32 @@ def draw_histogram(histogram: Histogram, ax: Axes) -> Axes:
     label = histogram.field
     if histogram.unit != histogram.field:
         label += f" ({histogram.unit})"
-    ax.set(xlabel=label, ylabel=histogram.counted, title=_title(histogram))
+    ax.set(xlabel=label, ylabel=histogram.counted)
+    set_title(ax, _title(histogram))
     ax.set_xlim(edges[0], edges[-1])
-    ax.set_xticks(edges[:: -(-len(edges) // 12)])
+    tick_step = -(-len(edges) // 12)
+    ax.set_xticks(edges[::tick_step])
     _format_counts(ax.yaxis)
     return with_light_grid(ax, "y")
 
 
 def draw_quantiles(table: QuantileTable, field: str, ax: Axes) -> Axes:
-    """Render a field's quantiles by category.
+    """Render the quantiles of a field, one box for each category.
 
-    A box is from 25 to 75 %, a line at the median, whiskers at 5 and 95 %.
+    A box extends from the 25th to the 75th percentile, with a line at the median and whiskers at
+    the 5th and the 95th.
     """
-    rows = {}
-    for row in table.quantiles:
-        if row.field == field and row.group == GROUPS[0] and row.values:
-            rows[row.category] = row
-    draw_quantile_boxes(rows, ax)
-    title = f"{field.capitalize()} by category"
-    ax.set(ylabel=f"{field} ({table.unit})", title=title, ylim=(0, None))
-    ax.tick_params(axis="x", labelsize=text_size())
+    rows = [row for row in _known_rows(table) if row.field == field]
+    draw_quantile_boxes({row.category: row for row in rows}, ax)
+    ax.set(ylabel=f"{field} ({table.unit})", ylim=(0, None))
+    set_title(ax, f"{field.capitalize()} by category")
+    rotation = 90 if current_style().shows_few_panels else 0  # small panels are too narrow
+    ax.tick_params(axis="x", labelsize=text_size(), labelrotation=rotation)
     return ax
 
 
 def draw_angles(histogram: Histogram, ax: Axes) -> Axes:
-    """Render a histogram of degrees around a circle: 0° up, counter-clockwise.
+    """Render a histogram of angles around a circle: 0° is up, and angles grow counter-clockwise.
 
     Raises:
         ChoiceError: The axes are not polar.
@@ -139,24 +196,23 @@ def draw_angles(histogram: Histogram, ax: Axes) -> Axes:
     ax.tick_params(labelsize=text_size())
     counts = histogram.counts[GROUPS[0]]
     low_bar = min(range(len(counts)), key=lambda bar: counts[bar - 1] + counts[bar])
-    ax.set_rlabel_position(edges[low_bar])  # beside the bars
+    ax.set_rlabel_position(edges[low_bar])  # next to the bars
     max_count = max(1, *counts)
     ax.set_ylim(0, max_count)
     ax.set_yticks(sorted({-(-max_count * part // 3) for part in (1, 2, 3)}))
-    ax.set_title(_title(histogram), fontsize=10)
+    set_title(ax, _title(histogram), fontsize="medium", y=None)  # above the labels of the angles
     ax.grid(color=GRID_COLOR, linewidth=0.6)
     ax.set_axisbelow("line")
     return ax
 
 
 def draw_relative_positions(pairs: Sequence[CollisionPair], ax: Axes) -> Axes:
-    """Render the final position of the other actor of each colliding pair, metres.
+    """Render where the second actor of each colliding pair is when the recording ends, in metres.
 
-    Positions are relative to the first actor, forward up.
+    Positions are relative to the first actor, whose forward direction is up.
     """
     from matplotlib.patches import Rectangle
 
-    style: Any = {"s": 30, "alpha": 0.75, "linewidths": 0, "zorder": 3}
     for category in CATEGORIES:
         category_pairs = [pair for pair in pairs if pair.other_category == category]
         if category_pairs:
@@ -166,7 +222,10 @@ def draw_relative_positions(pairs: Sequence[CollisionPair], ax: Axes) -> Axes:
                 color=CATEGORY_COLORS[category],
                 label=category,
                 marker=CATEGORY_MARKERS.get(category, "s"),
-                **style,
+                s=30,
+                alpha=0.75,
+                linewidths=0,
+                zorder=3,
             )
     ax.add_patch(
         Rectangle((-0.97, -2.3), 1.94, 4.6, fill=False, edgecolor=COLLIDER_COLOR, linewidth=1.2)
@@ -176,32 +235,33 @@ def draw_relative_positions(pairs: Sequence[CollisionPair], ax: Axes) -> Axes:
     limit = max([6.0, *distances])
     ax.set(xlim=(limit, -limit), ylim=(-limit, limit), aspect="equal")
     ax.set(xlabel="to the left of the first (m)", ylabel="forward of the first (m)")
-    ax.set_title("Centre of the other actor\n(red: the first, as a median car)", fontsize=10)
+    title = "Centre of the other actor\n(red: the first, as a median car)"
+    set_title(ax, title, fontsize="medium")
     if pairs:
         handles, _ = ax.get_legend_handles_labels()
-        # below the axis' label
-        anchor: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.22)}
-        draw_legend(ax, handles, columns=3, **anchor)
+        draw_legend(ax, handles, columns=3, **BELOW)
     return with_light_grid(ax, "both")
 
 
 def draw_quantile_boxes(rows: Mapping[str, QuantileRow], ax: Axes) -> None:
-    """Render a box for each labelled row of quantiles, with its median in figures."""
-    boxes, medians = [], []
+    """Render a box for each row of quantiles (by label), and write its median as a number."""
+    boxes = []
+    medians = []
     for label, row in rows.items():
-        values = row.values
-        if values:
+        if row.values:
+            # in the order of PROBABILITIES
+            _, low, low_quartile, median, high_quartile, high, _ = row.values
             boxes.append(
                 {
                     "label": label,
-                    "whislo": values[1],
-                    "q1": values[2],
-                    "med": values[3],
-                    "q3": values[4],
-                    "whishi": values[5],
+                    "whislo": low,
+                    "q1": low_quartile,
+                    "med": median,
+                    "q3": high_quartile,
+                    "whishi": high,
                 }
             )
-            medians.append(values[PROBABILITIES.index(0.5)])
+            medians.append(median)
     if boxes:
         parts = ax.bxp(
             boxes, showfliers=False, patch_artist=True, widths=0.45, medianprops={"color": "black"}
@@ -224,9 +284,9 @@ def _draw_stacked(
     width: float | Sequence[float],
     **style: Any,
 ) -> None:
-    """Draw bars at some positions, the splits on top of each other.
+    """Draw a histogram's bars at positions, with the splits stacked.
 
-    Splits with only zeros have no bars.
+    Splits whose counts are all zero have no bars.
     """
     heights = [0] * len(positions)
     options = {"edgecolor": "white", "linewidth": 0.5, **style}
@@ -238,6 +298,11 @@ def _draw_stacked(
             heights = [height + count for height, count in zip(heights, counts, strict=True)]
 
 
+def _known_rows(table: QuantileTable) -> list[QuantileRow]:
+    """Return the rows of all splits together that have values."""
+    return [row for row in table.quantiles if row.group == GROUPS[0] and row.values]
+
+
 def _title(histogram: Histogram) -> str:
     outside_count = histogram.outside[GROUPS[0]]
     if not outside_count:
@@ -246,97 +311,132 @@ def _title(histogram: Histogram) -> str:
     share_words = f"less than {_MIN_SHARE_PERCENT}"
     if share >= _MIN_SHARE_PERCENT:
         share_words = f"{share:.1f}"
-    low, high = histogram.edges[0], histogram.edges[-1]
-    return f"{histogram.title}\n({share_words} % outside of {low:g}–{high:g})"
+    low, *_, high = histogram.edges
+    unit = "" if histogram.unit == histogram.field else f" {histogram.unit}"
+    return f"{histogram.title}\n({share_words} % outside {low:g}–{high:g}{unit})"
 
 
 def _format_counts(axis: Axis) -> None:
-    """Give an axis whole numbers with a comma at thousands, in at most six steps."""
+    """Label an axis with whole numbers, with commas at thousands, in at most six steps."""
     from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
     axis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     axis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
 
 
-def _scenarios(statistics: DatasetStatistics, fig: Figure) -> None:
-    rows: list[Any] = [
-        ["weathers", "weather_frames"],
-        ["times_of_day", "time_of_day_frames"],
-        ["scenario_types", "towns"],
-        ["road_types", "collisions"],
-    ]
-    heights = [2 + max(len(statistics.counts[name].counts) for name in row) for row in rows]
-    axes = fig.subplot_mosaic(rows, height_ratios=heights)
-    for name, ax in axes.items():
-        draw_counts(statistics.counts[name], ax=ax)
+def _counts(name: str, xlabel: str = "") -> _Panel:
+    """Describe the panel of a table of counts."""
+
+    def draw(statistics: DatasetStatistics, ax: Axes) -> None:
+        draw_counts(statistics.counts[name], ax)
+        if xlabel:
+            ax.set_xlabel(xlabel)
+
+    return _Panel(draw=draw, counts=name, lines=_FRAME_LINES)
 
 
-def _ends(statistics: DatasetStatistics, fig: Figure) -> None:
-    axes = fig.subplots(1, 2, width_ratios=(3, 2))
-    draw_counts(statistics.counts["ends"], ax=axes[0])
-    axes[0].set_xlabel("scenarios (designs 1–6: at traffic lights, 7–12: without)")
-    draw_histogram(statistics.histograms["lengths"], ax=axes[1])
+def _histogram(name: str) -> _Panel:
+    """Describe the panel of a histogram."""
+    return _Panel(draw=lambda statistics, ax: draw_histogram(statistics.histograms[name], ax))
 
 
-def _ego(statistics: DatasetStatistics, fig: Figure) -> None:
-    axes = fig.subplots(1, 2, width_ratios=(3, 2))
-    draw_histogram(statistics.histograms["ego_speeds"], ax=axes[0])
-    sizes = statistics.quantiles["ego_sizes"]
-    rows = {}
-    for row in sizes.quantiles:
-        if row.group == GROUPS[0] and row.values:
-            rows[row.field] = row
-    draw_quantile_boxes(rows, axes[1])
-    axes[1].set(ylabel=f"size ({sizes.unit})", title=sizes.title, ylim=(0, None))
-
-
-def _actors(statistics: DatasetStatistics, fig: Figure) -> None:
-    axes = fig.subplots(2, 2)
-    for name, ax in zip(("instances", "parked_instances", "annotations"), axes.flat, strict=False):
-        draw_counts(statistics.counts[name], ax=ax)
-    draw_histogram(statistics.histograms["actors"], ax=axes[1, 1])
-
-
-def _boxes(statistics: DatasetStatistics, fig: Figure) -> None:
-    for field, ax in fig.subplot_mosaic([["length", "width"], ["height", "."]]).items():
-        draw_quantiles(statistics.quantiles["box_sizes"], field, ax=ax)
-
-
-def _motion(statistics: DatasetStatistics, fig: Figure) -> None:
-    axes = fig.subplots(2, 2, width_ratios=(4, 5))
-    for row, (name, field) in enumerate((("distances", "distance"), ("speeds", "speed"))):
-        draw_histogram(statistics.histograms[name], ax=axes[row, 0])
-        draw_quantiles(statistics.quantiles[f"{field}_quantiles"], field, ax=axes[row, 1])
-
-
-def _collisions(statistics: DatasetStatistics, fig: Figure) -> None:
-    fig.suptitle("The colliding pair at the last frame: the other actor, seen from the first")
-    angles = fig.add_subplot(1, 3, 1, projection="polar")
-    bearings = fig.add_subplot(1, 3, 2, projection="polar")
-    draw_angles(statistics.histograms["collision_angles"], ax=angles)
-    draw_angles(statistics.histograms["collision_bearings"], ax=bearings)
-    headings_label = (
-        "collisions by the other's heading: 0° the same,\n"
-        "90° to the left, 180° head-on, 270° to the right"
+def _quantiles(table: str, field: str) -> _Panel:
+    """Describe the panel of a field's quantiles by category."""
+    return _Panel(
+        draw=lambda statistics, ax: draw_quantiles(statistics.quantiles[table], field, ax)
     )
-    bearings_label = "collisions by where the other is:\n0° ahead, 90° left, 270° right"
-    angles.set_xlabel(headings_label, fontsize=text_size())
-    bearings.set_xlabel(bearings_label, fontsize=text_size())
-    draw_relative_positions(statistics.collisions, ax=fig.add_subplot(1, 3, 3))
 
 
-_FIGURES: Mapping[str, tuple[tuple[float, float], _Draw]] = {
-    "scenarios": ((_PAGE_WIDTH_IN, 10.5), _scenarios),
-    "ends": ((_PAGE_WIDTH_IN, 5.5), _ends),
-    "ego": ((_PAGE_WIDTH_IN, 4.5), _ego),
-    "actors": ((_PAGE_WIDTH_IN, 7.5), _actors),
-    "boxes": ((_PAGE_WIDTH_IN, 7.5), _boxes),
-    "motion": ((_PAGE_WIDTH_IN, 8), _motion),
-    "collisions": ((_PAGE_WIDTH_IN, 5.2), _collisions),
+def _angles(name: str, label: str) -> _Panel:
+    """Describe the panel of a histogram of angles."""
+
+    def draw(statistics: DatasetStatistics, ax: Axes) -> None:
+        draw_angles(statistics.histograms[name], ax)
+        ax.set_xlabel(label, fontsize=text_size())
+
+    return _Panel(draw=draw, lines=_POLAR_LINES, projection="polar")
+
+
+def _draw_ego_sizes(statistics: DatasetStatistics, ax: Axes) -> None:
+    sizes = statistics.quantiles["ego_sizes"]
+    draw_quantile_boxes({row.field: row for row in _known_rows(sizes)}, ax)
+    ax.set(ylabel=f"size ({sizes.unit})", ylim=(0, None))
+    set_title(ax, sizes.title)
+
+
+_FIGURES: Mapping[str, _Group] = {
+    "scenarios": _Group(
+        height=10.5,
+        rows=(
+            (_counts("weathers"), _counts("weather_frames")),
+            (_counts("times_of_day"), _counts("time_of_day_frames")),
+            (_counts("scenario_types"), _counts("towns")),
+            (_counts("road_types"), _counts("collisions")),
+        ),
+    ),
+    "ends": _Group(
+        height=5.5,
+        widths=(3, 2),
+        rows=(
+            (
+                _counts("ends", "scenarios\n(designs 1–6: at traffic lights,\n7–12: without)"),
+                _histogram("lengths"),
+            ),
+        ),
+    ),
+    "ego": _Group(
+        height=4.5,
+        widths=(3, 2),
+        rows=((_histogram("ego_speeds"), _Panel(draw=_draw_ego_sizes)),),
+    ),
+    "actors": _Group(
+        height=7.5,
+        rows=(
+            (_counts("instances"), _counts("parked_instances")),
+            (_counts("annotations"), _histogram("actors")),
+        ),
+    ),
+    "boxes": _Group(
+        height=7.5,
+        rows=(
+            (_quantiles("box_sizes", "length"), _quantiles("box_sizes", "width")),
+            (_quantiles("box_sizes", "height"),),
+        ),
+    ),
+    "motion": _Group(
+        height=8,
+        widths=(4, 5),
+        rows=(
+            (_histogram("distances"), _quantiles("distance_quantiles", "distance")),
+            (_histogram("speeds"), _quantiles("speed_quantiles", "speed")),
+        ),
+    ),
+    "collisions": _Group(
+        height=5.2,
+        title="The colliding pair at the last frame: the other actor, seen from the first",
+        widths=(1, 1, 1),
+        rows=(
+            (
+                _angles(
+                    "collision_angles",
+                    "collisions by the other's heading: 0° the same,\n"
+                    "90° to the left, 180° head-on, 270° to the right",
+                ),
+                _angles(
+                    "collision_bearings",
+                    "collisions by where the other is:\n0° ahead, 90° left, 270° right",
+                ),
+                _Panel(
+                    draw=lambda statistics, ax: draw_relative_positions(statistics.collisions, ax),
+                    lines=_POSITIONS_LINES,
+                ),
+            ),
+        ),
+    ),
 }
-# Group of `render_statistics` → width and height of its figure in inches.
+# Width and height in inches of the figure of each group of `render_statistics`.
 STATISTICS_FIGURES: Final[Mapping[str, tuple[float, float]]] = {
-    group: size for group, (size, _) in _FIGURES.items()
+    name: (_PAGE_WIDTH_IN, group.height) for name, group in _FIGURES.items()
 }
 
 
@@ -346,45 +446,69 @@ def render_statistics(
 ) -> Figure:
     """Render one group of `STATISTICS_FIGURES`, coloured by split.
 
+    In a paper's column and on a slide, a group with several rows shows the first panel of each row:
+    below each other in a column, and in two columns on a slide.
+
     Raises:
         ChoiceError: No such group.
     """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    size, draw = _FIGURES[choice("group", group, _FIGURES)]
-    fig = figure_or_new(fig, size)
+    chosen = _FIGURES[choice("group", group, _FIGURES)]
+    rows, widths = _rows_in_style(chosen)
+    heights = [max(panel.count_lines(statistics) for panel in row) for row in rows]
+    size = (_PAGE_WIDTH_IN, chosen.height)
+    fig = figure_or_new(fig, size, lines=sum(heights) + _LEGEND_LINES)
     engine = fig.get_layout_engine()
     if isinstance(engine, ConstrainedLayoutEngine):
         engine.set(w_pad=0.12, h_pad=0.12)
-    draw(statistics, fig)
+    if chosen.title and current_style().titled:
+        set_title(fig, chosen.title)
+    grid = fig.add_gridspec(len(rows), len(widths), width_ratios=widths, height_ratios=heights)
+    for row_number, row in enumerate(rows):
+        for column, panel in enumerate(row):
+            ax = fig.add_subplot(grid[row_number, column], projection=panel.projection)
+            panel.draw(statistics, ax)
+    _draw_split_legend(fig)
+    return fig
+
+
+def _rows_in_style(group: _Group) -> tuple[Sequence[Sequence[_Panel]], Sequence[float]]:
+    """Return the panels by row, and the columns' relative widths, that fit the current style."""
+    layout = current_style().layout
+    panels = [row[0] for row in group.rows]
+    if len(group.rows) == 1:
+        panels = list(group.rows[0])
+    if layout == "column":
+        return [(panel,) for panel in panels], (1,)
+    if layout == "slide" and len(group.rows) > 1:
+        return [panels[start : start + 2] for start in range(0, len(panels), 2)], (1, 1)
+    return group.rows, group.widths
+
+
+def _draw_split_legend(fig: Figure) -> None:
+    """Explain the colours of the splits below all panels."""
     handle_of_label = {}
     for ax in fig.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handle_of_label[label] = handle
-    labels = [name for name in SPLIT_COLORS if name in handle_of_label]
-    if labels:
-        fig.legend(
-            [handle_of_label[label] for label in labels],
-            labels,
-            loc="outside lower center",
-            ncols=len(labels),
-            title="split",
-            fontsize=text_size(),
-        )
-    return fig
+    handles = [handle_of_label[name] for name in SPLIT_COLORS if name in handle_of_label]
+    draw_legend(fig, handles, title="split", title_fontsize=text_size())
 
 
-def save_statistics(statistics: DatasetStatistics, folder: str | os.PathLike[str]) -> list[Path]:
+def save_statistics(statistics: DatasetStatistics, folder: PathType) -> list[Path]:
     """Render each group into `<group>.png` and `<group>.pdf`, atomically, and return the paths.
 
-    Older files are replaced. The folder is made if it does not exist.
+    The PDF files have the size of the current style. Older files are replaced. The folder is made
+    if it does not exist.
 
     Raises:
         ConfigError: The folder cannot be written to, or is a file.
     """
-    folder, paths = writable_folder(folder), []
-    for group, (size, _) in _FIGURES.items():
-        figure = render_statistics(statistics, group, fig=detached_figure(size))
-        for suffix in ("png", "pdf"):
-            paths.append(write_figure(figure, folder / f"{group}.{suffix}", dpi=_DPI))
+    folder = writable_folder(folder)
+    paths = []
+    for group in _FIGURES:
+        draw = partial(render_statistics, statistics, group)
+        path = write_report_figure(draw, folder / f"{group}.png", dpi=_DPI, needs_pdf=True)
+        paths += [path, path.with_suffix(".pdf")]
     return paths

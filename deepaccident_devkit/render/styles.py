@@ -1,9 +1,9 @@
 """Colours of all pictures and pages, and the sizes of pictures in a paper or on a slide.
 
-Saturated hues are the five agents'. Red is the colliding pair, and nothing else has it; no colour
-map contains it. Classes are shades of slate, and small ones have a shape of their own. Verdicts are
-muted, and no agent's hue. Hues also differ in lightness, for colour-blind readers:
-`docs/check_colors.py` measures it, and a test asserts it.
+Saturated hues are reserved for the five agents. Red is reserved for the colliding pair; no colour
+map contains it. Classes are shades of slate, and classes of small actors also have a marker shape.
+Verdicts have muted colours that are no agent's hue. Hues also differ in lightness, for
+colour-blind readers: `docs/check_colors.py` measures this, and a test asserts it.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ CATEGORY_COLORS: Mapping[str, str] = {
     "motorcycle": "#7b8996",
     "pedestrian": "#1d272f",
 }
-# Hues of the classes, for pictures that are about them: all eyes distinguish them from each other
-# and from the pair's red.
+# Hues of the classes, for pictures that are about classes. All readers, including colour-blind
+# ones, can tell them from each other and from the pair's red.
 CLASS_COLORS: Mapping[str, str] = {
     "car": "#40409f",
     "truck": "#402040",
@@ -45,20 +45,20 @@ CLASS_COLORS: Mapping[str, str] = {
     "motorcycle": "#ff8000",
     "pedestrian": "#9f00ff",
 }
-# matplotlib's markers of the classes with boxes that are too small to be found from above.
+# matplotlib markers of the classes whose boxes are too small to notice from above.
 CATEGORY_MARKERS: Mapping[str, str] = {"cyclist": "D", "motorcycle": "^", "pedestrian": "o"}
-# Instances of motion maps, by turns.
+# Colours that the instances of motion maps take in turn.
 INSTANCE_COLORS = ("#63717e", "#b5c3cf", "#4a5864", "#94a2b0", "#323f4b", "#7b8996")
-# A mark for the recording agent itself, in addition to the colour of its part in the accident.
+# Mark for the recording agent itself, in addition to the colour of its role in the accident.
 OWN_COLOR = "#111111"
 # Edges around marks and lines that lie on pictures.
 CASING_COLOR = "#ffffff"
 # LiDAR points without a value for their colour.
 POINT_COLOR = "#9a9a9a"
-# LiDAR points in images; the nearest are yellow.
-DEPTH_COLORMAP = "viridis_r"
+# LiDAR points in images; the nearest are yellow. No colour is too dark for the night.
+DEPTH_COLORMAP = "summer_r"
 HEIGHT_COLORMAP = "cividis"
-# The same for pages, from low to high.
+# The same colours for pages, from low to high.
 HEIGHT_COLORS = ("#00224e", "#434e6c", "#7d7c78", "#bcae6c", "#fee838")
 CENTERNESS_COLORMAP = "Greys"
 # Flow forward, to the left, backward and to the right; between them the colours are mixed.
@@ -71,7 +71,7 @@ BEV_COLORS: Mapping[str, str] = {
     "vehicle": "#d3d9e0",
     "pedestrian": "#d3d9e0",
 }
-# The ground of a town's map in a picture of its own.
+# The ground of a town's map in a separate picture.
 MAP_COLORS: Mapping[str, str] = {
     "road": "#868f98",
     "road_line": "#ffffff",
@@ -85,19 +85,18 @@ MISSING_COLOR = "#dddddd"
 MUTED_COLOR = "#666666"
 # The true position of something that is also rendered at another position.
 TRUE_PLACE_COLOR = "#8a8a8a"
-# Predictions that are right, predictions that are false, and truths that are missed: green, sand
-# and pale grey.
+# Right predictions (green), false predictions (sand), and missed true objects (pale grey).
 OUTCOME_COLORS: Mapping[str, str] = {"right": "#23644d", "false": "#a98c52", "missed": "#bcc0c3"}
 # Predictions without a verdict: mauve.
 PREDICTED_COLOR = "#a8679b"
-# Lines or bars of the same kind for several values of one number, the strictest value first.
+# Lines or bars of one kind for several values of a setting, the strictest value first.
 SERIES_COLORS = ("#1a3344", "#4b667c", "#8399ac", "#b5c3cf")
 SPLIT_COLORS: Mapping[str, str] = dict(
     zip((*SPLITS, "unknown"), ("#284052", "#627a8e", "#9badbe", "#d3d8dc"), strict=True)
 )
 # A number with an interval.
 ESTIMATE_COLOR = "#3d627d"
-# Important words, dark brown: the words of a warning are not the colliding pair.
+# Important words are dark brown, because red in a warning could suggest the colliding pair.
 WARNING_COLOR = "#6b4a10"
 # Links and the focus of the keyboard on pages.
 LINK_COLOR = "#2f4a63"
@@ -117,12 +116,14 @@ COLORS: Final = f"""
 }}
 """
 Drawing = TypeVar("Drawing", bound=Callable[..., Any])
-# Inches of a picture's height that words take, about: they shrink less than the picture.
-_WORDS_HEIGHT_IN: Final = 0.5
-# Type 42: the letters of a PDF file stay letters, as publishers ask.
-_FONTS: Final = {"pdf.fonttype": 42, "ps.fonttype": 42}
+# Approximate height of the words in a picture, in inches: they shrink less than the picture.
+_WORDS_HEIGHT_IN = 0.5
+# Height of a line of words with the space to the next line, over the size of its letters.
+_LINE_HEIGHT = 1.45
+# Type 42 keeps the letters of a PDF file as text, as publishers require.
+_FONTS = {"pdf.fonttype": 42, "ps.fonttype": 42}
 _applied_style: ContextVar[_Style | None] = ContextVar("applied", default=None)
-_SETTINGS_LOCK: Final = RLock()  # matplotlib has its settings once for all threads
+_SETTINGS_LOCK = RLock()  # all threads share matplotlib's settings
 
 
 def page_style() -> str:
@@ -135,17 +136,17 @@ class _Style:
     """Sizes and words of new pictures.
 
     Attributes:
-        dpi: Pixels an inch, for files.
-        panel: Width of a picture with one panel, inches; None for the view's own.
-        figure: Width of a picture with several panels, inches; None for the view's own.
-        ratio: Width by height; None for the view's own.
+        dpi: Resolution of files, pixels per inch.
+        panel: Width of a picture with one panel, inches; None for the view's default.
+        figure: Width of a picture with several panels, inches; None for the view's default.
+        ratio: Width over height; None for the view's default.
         letters: Size of the smallest letters, points.
-        room: Extent of a picture with several panels: all of them, a page's width, a column or a
-            slide.
-        tokens: Whether titles have tokens.
+        layout: How a picture with several panels is laid out: in full, as wide as a page, in a
+            column, or on a slide.
+        tokens: Whether titles show tokens.
         titled: Whether pictures have a title.
-        by_class: Whether boxes have the hues of their classes, except the pair's boxes.
-        rc: Settings of matplotlib.
+        by_class: Whether boxes have the hues of their classes (the pair's boxes never do).
+        rc: matplotlib settings.
     """
 
     dpi: float
@@ -153,20 +154,26 @@ class _Style:
     figure: float | None = None
     ratio: float | None = None
     letters: float = 9
-    room: Literal["all", "page", "column", "slide"] = "all"
+    layout: Literal["all", "page", "column", "slide"] = "all"
     tokens: bool = True
     titled: bool = True
     by_class: bool = False
     rc: Mapping[str, Any]
 
     @property
-    def few(self) -> bool:
+    def is_wide(self) -> bool:
+        """Whether a map is wider than high, because it would be too high otherwise."""
+        is_over_columns = self.layout == "page" and (self.panel or 0) > _MAX_COLUMN_WIDTH_IN
+        return self.layout == "slide" or is_over_columns
+
+    @property
+    def shows_few_panels(self) -> bool:
         """Whether views with many panels show few of them."""
-        return self.room != "all"
+        return self.layout != "all"
 
 
 def _small(letters: float, **options: Any) -> _Style:
-    """Return a style of small pictures; `letters` is the size of letters in points."""
+    """Make a style for small pictures; `letters` is the font size in points."""
     rc = {
         **_FONTS,
         "font.size": letters,
@@ -183,37 +190,39 @@ def _small(letters: float, **options: Any) -> _Style:
 
 
 def _printed(panel: float, figure: float) -> _Style:
-    """Return a style of a paper, with widths of a panel and of a figure in inches.
+    """Make a style for papers; `panel` and `figure` are widths in inches.
 
-    Letters of 7 points in DejaVu Sans are as tall as 9 points of Times.
+    DejaVu Sans at 7 points is as tall as Times at 9 points.
     """
-    room = "column" if figure < _MAX_COLUMN_WIDTH_IN else "page"
-    return _small(7, dpi=300, panel=panel, figure=figure, room=room)
+    layout = "page"
+    if figure < _MAX_COLUMN_WIDTH_IN:
+        layout = "column"
+    return _small(7, dpi=300, panel=panel, figure=figure, layout=layout)
 
 
-# Inches: a narrower picture is a column of a paper.
-_MAX_COLUMN_WIDTH_IN: Final = 4.0
-_STYLES: Final[Mapping[str, _Style]] = {
+# Width in inches below which a picture of a paper is one column wide.
+_MAX_COLUMN_WIDTH_IN = 4.0
+_STYLES: Mapping[str, _Style] = {
     "paper": _printed(3.5, 7.16),
     "cvpr-column": _printed(3.25, 3.25),
     "cvpr-page": _printed(6.875, 6.875),
     "ieee-column": _printed(3.5, 3.5),
     "ieee-page": _printed(7.16, 7.16),
     # letters of 8 points are large on a slide that is 8 inches wide
-    "slide": _small(8, dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, room="slide"),
+    "slide": _small(8, dpi=240, panel=8.0, figure=8.0, ratio=16 / 9, layout="slide"),
 }
 
 
-_NOTEBOOK_STYLE: Final = _Style(dpi=100, rc=_FONTS)
+_NOTEBOOK_STYLE = _Style(dpi=100, rc=_FONTS)
 _selected_style: ContextVar[_Style] = ContextVar("style", default=_NOTEBOOK_STYLE)
 
 
 @contextmanager
 def own_settings(style: _Style | None = None) -> Iterator[None]:
-    """Replace the user's settings by matplotlib's own and a style's, for `with`.
+    """Replace the user's matplotlib settings by the defaults and a style's, in a `with` statement.
 
-    The style is the current one for None. All rendering uses this, so that a picture depends only
-    on its style: a user's font, grid or `image.origin` would change its message.
+    None means the current style. All rendering uses this, so that a picture depends only on its
+    style: a user's font, grid or `image.origin` could change the picture's meaning.
     """
     from matplotlib import style as styles
 
@@ -231,7 +240,7 @@ def own_settings(style: _Style | None = None) -> Iterator[None]:
 
 
 def in_own_settings(function: Drawing) -> Drawing:
-    """Make a function render in `own_settings`, as a decorator."""
+    """Decorate a function so that it renders within `own_settings`."""
     return own_settings()(function)
 
 
@@ -246,19 +255,19 @@ def style(
 
     Args:
         name: `cvpr-column` (3.25 inches wide), `cvpr-page` (6.875), `ieee-column` (3.5) and
-            `ieee-page` (7.16), for papers: letters of 7 points or more, 300 pixels an inch.
-            `paper`: an IEEE column, or with several panels a page. `slide`: 16 to 9, with large
-            letters, 1920 × 1080 pixels. None: as in a notebook. In papers and on slides views of
-            many panels show fewer, and nothing has tokens.
-        title: Whether pictures have a title; a paper's caption may replace it.
-        color_by: Meaning of the colours of boxes: the `role` in the accident, or the `class`, with
-            a hue for each; the pair is red in both.
+            `ieee-page` (7.16), for papers: letters of 7 points or more, 300 pixels per inch.
+            `paper`: an IEEE column, or an IEEE page for several panels. `slide`: 16:9, with large
+            letters, 1920 × 1080 pixels, or more for a figure with many rows. None: as in a
+            notebook. In papers and on slides, views with many panels show fewer of them, and titles
+            have no tokens. A single map is wider than high on a slide, `cvpr-page` and
+            `ieee-page`.
+        title: Whether pictures have a title; in a paper, the caption may replace it.
+        color_by: What the colours of boxes mean: the `role` in the accident, or the `class`, with
+            one hue per class. The pair is red in both.
 
     Raises:
-        ChoiceError: No such style or way to colour.
+        ChoiceError: `name` or `color_by` is unknown.
     """
-    from matplotlib import rc_context
-
     if name is not None and name not in _STYLES:
         raise ChoiceError(
             f"style: expected one of {', '.join(get_args(StyleName))}, found {name!r}"
@@ -266,6 +275,15 @@ def style(
     by_class = choice("color_by", color_by, ("role", "class")) == "class"
     base = _NOTEBOOK_STYLE if name is None else _STYLES[name]
     selected = replace(base, titled=title, by_class=by_class)
+    with using_style(selected):
+        yield
+
+
+@contextmanager
+def using_style(selected: _Style) -> Iterator[None]:
+    """Make new pictures in a style that `current_style` returned, in a `with` statement."""
+    from matplotlib import rc_context
+
     token = _selected_style.set(selected)
     try:
         with rc_context(cast("Any", {**selected.rc, "savefig.dpi": selected.dpi})):
@@ -287,8 +305,13 @@ def category_colors() -> Mapping[str, str]:
 
 
 def text_size() -> float:
-    """Return the size of the smallest letters of new pictures, points; it is readable in print."""
+    """Return the size of the smallest letters in new pictures, points; it is legible in print."""
     return current_style().letters
+
+
+def lines_height(lines: float) -> float:
+    """Return the height in inches of lines of the smallest letters in new pictures."""
+    return lines * _LINE_HEIGHT * text_size() / 72
 
 
 def size_in_style(
@@ -296,19 +319,27 @@ def size_in_style(
     *,
     panels: Literal["one", "several"],
     heights: Mapping[str, float] = MappingProxyType({}),
+    lines: float = 0,
 ) -> tuple[float, float]:
-    """Return the size in inches, in the current style, of a picture of this size in a notebook.
+    """Convert a picture's size in a notebook to its size in the current style, both in inches.
 
-    `heights` are the heights in `page` and `column`, in widths, if a view has other panels there.
+    `heights` are height-to-width ratios in `page` and `column`, for views that show different
+    panels there. The picture is at least as high as `lines` lines of its smallest letters.
     """
     selected = current_style()
-    width = selected.panel if panels == "one" else selected.figure
+    width = selected.figure
+    if panels == "one":
+        width = selected.panel
     if width is None:
-        return size
+        width, height = size
+    elif selected.ratio is not None:
+        height = width / selected.ratio
+    elif selected.layout in heights:
+        height = width * heights[selected.layout]
+    else:
+        share = width / size[0]
+        height = share * size[1] + max(0.0, 1 - share) * _WORDS_HEIGHT_IN
+    needed_height = max(height, lines_height(lines))
     if selected.ratio is not None:
-        return width, width / selected.ratio
-    if selected.room in heights:
-        return width, width * heights[selected.room]
-    share = width / size[0]
-    words_height = max(0.0, 1 - share) * _WORDS_HEIGHT_IN
-    return width, share * size[1] + words_height
+        width = max(width, needed_height * selected.ratio)
+    return width, needed_height

@@ -1,9 +1,9 @@
-"""A town's map: in a picture of its own, beneath views from above, and as a replay's road."""
+"""A town's map: as a separate picture, beneath views from above, and as the road of a replay."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.maps.counting import GROUND_CLASSES
 from deepaccident_devkit.maps.making import kept_town_map, town_map
 from deepaccident_devkit.maps.town_map import TownMap
-from deepaccident_devkit.render.captions import draw_legend
+from deepaccident_devkit.render.captions import draw_legend_outside, is_callers
 from deepaccident_devkit.render.figures import axes_or_new, label_axes
 from deepaccident_devkit.render.ground import draw_ground
 from deepaccident_devkit.render.styles import BEV_COLORS, MAP_COLORS, MUTED_COLOR, in_own_settings
@@ -23,8 +23,9 @@ from deepaccident_devkit.support.text import counted
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Cells along a side, about; in a larger part every second, third, … cell is drawn.
-_MAX_SIDE_CELLS: Final = 800
+# Approximate number of cells to draw along a side. In a larger part of a map, only every second,
+# third, … cell is drawn.
+_MAX_SIDE_CELLS = 800
 
 
 @in_own_settings
@@ -36,21 +37,23 @@ def render_town_map(dataset: Dataset, town: str, *, ax: Axes | None = None) -> A
     Args:
         dataset: The release.
         town: Name, such as `Town03`.
-        ax: Axes to render on; new ones if None.
+        ax: Axes to render on, new ones if None. In a figure of your own, the title is yours.
 
     Returns:
-        The axes, in metres of the world.
+        The axes, in metres in the world frame.
 
     Raises:
         ChoiceError: The release has no recording in this town.
-        NotAvailableError: The town has no readable file of a BEV camera.
+        NotAvailableError: No file of a BEV camera in this town can be read.
     """
-    return draw_whole_map(town_map(dataset, town), axes_or_new(ax, (7, 7)))
+    map_ = town_map(dataset, town)
+    ax = axes_or_new(ax, (7, 7))
+    return draw_whole_map(map_, ax)
 
 
 @in_own_settings
 def draw_whole_map(map_: TownMap, ax: Axes) -> Axes:
-    """Render a map up to its borders, in metres of the world, with a title and a legend."""
+    """Render a map up to its borders, in metres in the world frame, with a title and a legend."""
     from matplotlib.patches import Patch
 
     left, right, bottom, top = map_.extent
@@ -61,17 +64,22 @@ def draw_whole_map(map_: TownMap, ax: Axes) -> Axes:
     for name, color in MAP_COLORS.items():
         label = name.replace("_", " ")
         handles.append(Patch(facecolor=color, edgecolor=MUTED_COLOR, linewidth=0.5, label=label))
-    draw_legend(ax, handles, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4.5)
+    draw_legend_outside(ax, handles)
     scenarios = counted(map_.scenarios, "scenario")
-    ax.set_title(f"{map_.town}: {map_.looks:,} pictures of {scenarios}")
+    if not is_callers(ax):
+        ax.set_title(f"{map_.town}: {map_.looks:,} pictures of {scenarios}")
     return ax
 
 
 def map_beneath(dataset: Dataset, scenario: str, *, make: bool) -> TownMap | None:
-    """Return the stored map of the town of a scenario (a token), without checking its files.
+    """Return the stored map of a scenario's town, without checking the files it was made from.
 
-    If none is stored, `make` requests a new one. None if there is no map: none is stored and none
-    requested, or there is no file to make it from.
+    If no map is stored, one is made if `make` is true. The result is None if there is still none.
+
+    Args:
+        dataset: The release.
+        scenario: Token of the scenario.
+        make: Whether to make a map if none is stored.
     """
     town = dataset.get("scenario", scenario)["town"]
     stored_map = kept_town_map(dataset, town)
@@ -86,24 +94,31 @@ def map_beneath(dataset: Dataset, scenario: str, *, make: bool) -> TownMap | Non
 def draw_town_map(
     map_: TownMap, ax: Axes, *, target_from_world: SE3, colors: Mapping[str, str] = BEV_COLORS
 ) -> None:
-    """Render the part of a map within the limits of axes, which stay.
+    """Render the part of a map that is within the axes' limits, without changing the limits.
 
-    Cells without a colour, or that were not seen, are white.
+    Cells are white if no BEV image covers them, or if their class has no colour.
     """
-    part = _shown_part(map_, (ax.get_xlim(), ax.get_ylim()), target_from_world)
-    if not part.agents.size:
+    x_limits = ax.get_xlim()
+    y_limits = ax.get_ylim()
+    axes_center = [np.mean(x_limits), np.mean(y_limits), target_from_world.translation[2]]
+    world_center = target_from_world.inverse().apply(np.array([axes_center]))[0, :2]
+    diagonal = np.hypot(np.diff(x_limits)[0], np.diff(y_limits)[0])
+    visible_map = map_.around(world_center, float(diagonal / 2))
+    if not visible_map.agents.size:
         return
-    step = max(1, max(part.shape) // _MAX_SIDE_CELLS)
-    rows, columns = (size // step * step for size in part.shape)
-    cells = part.classes()[step // 2 : rows : step, step // 2 : columns : step]
-    (left, bottom), cell_size = part.origin.tolist(), part.resolution
-    extent = (left, left + columns * cell_size, bottom, bottom + rows * cell_size)
-    numbers = {name: number for number, name in enumerate(GROUND_CLASSES, 1)}
+    step = max(1, max(visible_map.shape) // _MAX_SIDE_CELLS)
+    num_rows, num_columns = (side // step * step for side in visible_map.shape)
+    first = step // 2
+    cells = visible_map.classes()[first:num_rows:step, first:num_columns:step]
+    left, bottom = visible_map.origin.tolist()
+    right = left + num_columns * visible_map.resolution
+    top = bottom + num_rows * visible_map.resolution
+    class_numbers = {name: number for number, name in enumerate(GROUND_CLASSES, 1)}
     draw_ground(
         cells,
-        numbers,
+        class_numbers,
         ax,
-        extent=extent,
+        extent=(left, right, bottom, top),
         target_from_cells=target_from_world,
         zorder=-1,
         colors=colors,
@@ -111,23 +126,12 @@ def draw_town_map(
 
 
 def ground_at(map_: TownMap, points: FloatArray, names: Sequence[str]) -> ByteArray:
-    """Return the ground at points (N, 2), x and y in world, as (N,) uint8.
+    """Look up the ground class at points (N, 2: x, y) in world, metres; returns (N,) uint8.
 
-    It is 1 + the position of its class in `names`; 0 for anything else.
+    A value is 1 + the index of the class in `names`, or 0 for any other class.
     """
-    numbers = [0]
-    for name in GROUND_CLASSES:
-        numbers.append(1 + names.index(name) if name in names else 0)
-    return np.array(numbers).astype(np.uint8)[map_.classes_at(points)]
-
-
-def _shown_part(
-    map_: TownMap, limits: tuple[tuple[float, float], ...], target_from_world: SE3
-) -> TownMap:
-    """Return the part of a map around the limits of axes, however they are turned."""
-    middle = np.array([np.mean(limit) for limit in limits])
-    lengths = [np.diff(limit)[0] for limit in limits]
-    reach = float(np.hypot(*lengths) / 2)
-    point = np.array([[*middle, target_from_world.translation[2]]])
-    center = target_from_world.inverse().apply(point)[0, :2]
-    return map_.around(center, reach)
+    numbers = np.zeros(1 + len(GROUND_CLASSES), dtype=np.uint8)
+    for code, name in enumerate(GROUND_CLASSES, 1):
+        if name in names:
+            numbers[code] = 1 + names.index(name)
+    return numbers[map_.classes_at(points)]

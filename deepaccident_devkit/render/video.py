@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,16 @@ from deepaccident_devkit.errors import ChoiceError, MissingExtraError
 from deepaccident_devkit.render.accident import PAIR_LAYERS, draw_countdown
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
-from deepaccident_devkit.render.figures import LAYERS, Layer, figure_of_pixels, layers_of
+from deepaccident_devkit.render.captions import has_sensor_file
+from deepaccident_devkit.render.figures import (
+    LAYERS,
+    Layer,
+    Layers,
+    figure_of_pixels,
+    laid_out,
+    layers_of,
+)
+from deepaccident_devkit.render.moments import default_agent
 from deepaccident_devkit.render.motion import TRAIL_LAYERS, render_motion_labels
 from deepaccident_devkit.render.samples import (
     CALIBRATION_LAYERS,
@@ -27,7 +36,7 @@ from deepaccident_devkit.render.samples import (
     render_calibration,
     render_sample,
 )
-from deepaccident_devkit.render.styles import in_own_settings
+from deepaccident_devkit.render.styles import current_style, own_settings, using_style
 from deepaccident_devkit.render.visibility import (
     VISIBILITY_LAYERS,
     render_visibility,
@@ -36,9 +45,9 @@ from deepaccident_devkit.render.visibility import (
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.parallel import Engine, Places, in_order, run_unordered
-from deepaccident_devkit.support.text import choice, path_of
+from deepaccident_devkit.support.text import PathType, choice, path_of
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
-from deepaccident_devkit.taxonomy import CAMERAS
+from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
 from deepaccident_devkit.v2x import Agents, cooperating_agents
 from deepaccident_devkit.v2x.agents import checked_agents
 
@@ -50,56 +59,53 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import FrameRecord
 
-# Quality of H.264: 0 loses nothing, 51 is the worst.
-_CRF: Final = "20"
-_WEBP_QUALITY: Final = 70
-# Colours of a GIF; one more is reserved for pixels that do not change.
-_GIF_COLORS: Final = 255
-# Pixels of all pictures, about, that are used to choose the palette.
-_PALETTE_PIXELS: Final = 2_000_000
-# Renders a moment, by its record, on an empty figure; its result is not used.
+# H.264 quality, from 0 (lossless) to 51 (worst).
+_CRF = "20"
+_WEBP_QUALITY = 70
+# Number of colours of a GIF; one more is reserved for pixels that do not change.
+_GIF_COLORS = 255
+# Approximate number of pixels from which the palette for all pictures is chosen.
+_PALETTE_PIXELS = 2_000_000
+# Function that renders a frame (a record) on an empty figure; its result is not used.
 OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
-_DPI: Final = 100.0
-# Pixels of the margin beside a view.
-_MARGIN_PX: Final = 5
-# Pixels of a picture with `_DPI` pixels an inch; larger ones have more, so words keep their share.
-_REFERENCE_PIXELS: Final = 1280 * 720
+_DPI = 100.0
+# Margin between views, in pixels.
+_MARGIN_PX = 5
+# Size in pixels of a picture at `_DPI` pixels per inch. Larger pictures have a higher resolution,
+# so that words keep their relative size.
+_REFERENCE_PIXELS = 1280 * 720
 
 
 def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
-    """Check before any rendering that the file can be written.
+    """Check before any rendering that a video can be written to this path.
 
-    Raises ChoiceError and MissingExtraError.
+    Raises ChoiceError if the path, suffix, size or rate is not possible, and MissingExtraError if
+    the extra `video` is needed but not installed.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise ChoiceError(
-            f"path: expected a file that ends in {', '.join(SUFFIXES)}, found {str(path)!r}"
-        )
+        raise ChoiceError(f"{path}: expected a file that ends in {', '.join(SUFFIXES)}")
     if path.is_dir():
-        raise ChoiceError(f"path: expected a file, found the folder {path}")
+        raise ChoiceError(f"{path}: is a folder; give a file")
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     if not os.access(folder, os.W_OK):
-        raise ChoiceError(f"path: nothing can be written into {folder}; choose another folder")
+        raise ChoiceError(f"{path}: nothing can be written into {folder}; choose another folder")
     if not 0 < fps <= 100:
-        raise ChoiceError(f"fps: expected frames a second, above 0 and at most 100, found {fps!r}")
+        raise ChoiceError(
+            f"fps: expected frames per second, above 0 and at most 100, found {fps!r}"
+        )
     if min(size) < 16:
         raise ChoiceError(f"size: expected width and height of at least 16 pixels, found {size}")
     if suffix == ".mp4":
-        _check_mp4(path, size)
+        _check_pyav(path)
 
 
-def _check_mp4(path: Path, size: tuple[int, int]) -> None:
-    if any(side % 2 for side in size):
-        even = tuple(side - side % 2 for side in size)
-        raise ChoiceError(
-            f"size: expected an even width and height, which MP4 needs, found {size}; give {even}"
-        )
+def _check_pyav(path: Path) -> None:
     try:
         import av  # noqa: F401 - whether it is installed
     except ImportError:
         raise MissingExtraError(
-            f"{path}: MP4 needs PyAV: in a checkout, pip install '.[video]'; "
+            f"{path}: MP4 needs PyAV; run pip install '.[video]' in a checkout, "
             "or choose .gif or .webp"
         ) from None
 
@@ -107,16 +113,18 @@ def _check_mp4(path: Path, size: tuple[int, int]) -> None:
 def write_video(path: Path, pictures: Iterable[ByteArray], *, fps: float) -> None:
     """Write pictures, (H, W, 3) uint8 RGB of one size, in the video format of the path's suffix.
 
-    The file is written atomically. H and W are even for MP4; there is at least one picture.
+    The file is written atomically. There must be at least one picture; for MP4, H and W must be
+    even.
     """
     with replacing(path) as temporary:
-        SUFFIXES[path.suffix.lower()](temporary, pictures, fps)
+        write = SUFFIXES[path.suffix.lower()]
+        write(temporary, pictures, fps)
 
 
 def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
-    """Write H.264 in yuv420p with its index in front.
+    """Write H.264 in yuv420p, which browsers play, with the index at the start of the file.
 
-    Browsers play it, and begin before it is complete.
+    Browsers can then start to play before they have loaded the whole file.
     """
     import av
 
@@ -128,8 +136,8 @@ def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
                 stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt = "yuv420p"
-                # in a virtual machine, x264's code for AVX-512 made other bytes in 2 of 100 files
-                # of the same pictures
+                # in a virtual machine, x264's AVX-512 code produced different bytes for the same
+                # pictures in 2 of 100 files
                 stream.options = {"crf": _CRF, "x264-params": "asm=sse4.2"}
                 stream.codec_context.thread_count = 1  # the bytes depend on the number of threads
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
@@ -147,7 +155,8 @@ def _write_gif(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
     arrays = list(pictures)
     pixels = sum(array.size / 3 for array in arrays)
     step = max(1, round((pixels / _PALETTE_PIXELS) ** 0.5))
-    samples = np.concatenate([array[::step, ::step].reshape(-1, 3) for array in arrays])
+    colors = [array[::step, ::step].reshape(-1, 3) for array in arrays]
+    samples = np.concatenate(colors)
     palette = Image.fromarray(samples[None]).quantize(_GIF_COLORS, Image.Quantize.MAXCOVERAGE)
     images = []
     for array in arrays:
@@ -171,7 +180,7 @@ def _save_animation(path: Path, images: Sequence[Image], fps: float, **options: 
     )
 
 
-# Suffix → the writer of such files.
+# Function that writes each kind of file, by suffix.
 SUFFIXES: Final[Mapping[str, Callable[[Path, Iterable[ByteArray], float], None]]] = {
     ".mp4": _write_mp4,
     ".gif": _write_gif,
@@ -184,23 +193,24 @@ class _View:
     """One way to render a moment.
 
     Attributes:
-        draw: Function that renders the row of a token of a release, as the functions of this
-            package do.
-        row_kind: Kind of its row: the moment's `frame`, or the first agent's `sample`.
-        canvas: `fig` if it renders on an empty figure, `ax` if on axes.
-        options: Names of the video's options that it uses.
-        layers: Layers that it has.
-        share: Share of a picture's width, if there are several views.
-        inches: Width that its words need; if there is less, they become smaller.
-        is_own: Whether it is a caller's function, with the arguments release, frame record and
-            figure.
+        draw: Function that takes a release and a token, as the functions of this package do.
+        row_kind: What the token names: the moment's `frame`, or the first agent's `sample`.
+        canvas: `fig` if the function renders on an empty figure, `ax` if it renders on axes.
+        options: Names of the video's options that the function takes.
+        channels: Sensors that the view of one agent shows.
+        layers: Layers that the view supports.
+        share: Share of the picture's width, if there are several views.
+        inches: Width that the view's words need; in less, they become smaller.
+        is_own: Whether the function is the caller's own, which takes a release, a frame record
+            and a figure.
     """
 
     draw: Callable[..., object]
     row_kind: Literal["frame", "sample"] = "sample"
     canvas: Literal["fig", "ax"] = "fig"
     options: tuple[str, ...] = ("agents", "layers")
-    layers: tuple[Layer, ...] = LAYERS
+    layers: Layers = LAYERS
+    channels: tuple[str, ...] = ()
     share: int = 1
     inches: float = 4.2
     is_own: bool = False
@@ -211,15 +221,15 @@ class _View:
         dataset: Dataset,
         frame: str,
         agents: Sequence[str],
-        layers: tuple[Layer, ...] | None,
+        layers: Layers | None,
     ) -> None:
-        """Render a moment, by its frame's token, on an empty figure.
+        """Render a moment on an empty figure.
 
         Args:
-            fig: The figure.
+            fig: Empty figure to render on.
             dataset: The release.
-            frame: Token.
-            agents: Names; the view is that of the first agent.
+            frame: Token of the moment's frame.
+            agents: Names of agents; a view of one agent shows the first.
             layers: Layers; None for the view's default.
         """
         if self.is_own:
@@ -236,22 +246,32 @@ class _View:
 
 
 def _draw_channel(
-    channel: str, dataset: Dataset, sample: str, *, layers: tuple[Layer, ...] | None, ax: Axes
+    channel: str, dataset: Dataset, sample: str, *, layers: Layers | None, ax: Axes
 ) -> None:
     camera = dataset.get("sample_data", f"{sample}/{channel}")
-    draw_camera(dataset, camera, CAMERA_DEFAULT if layers is None else layers, ax)
+    if layers is None:
+        layers = CAMERA_DEFAULT
+    draw_camera(dataset, camera, layers, ax)
 
 
-# Name → view; the cameras are the first agent's.
+# Views by name; a view of a camera shows the camera of the first agent.
 VIEWS: Final[Mapping[str, _View]] = {
     "frame": _View(
         draw=draw_shared_moment, row_kind="frame", layers=MOMENT_LAYERS, share=2, inches=12.8
     ),
-    "sample": _View(draw=render_sample, layers=MOMENT_LAYERS, share=2, inches=12.8),
+    "sample": _View(
+        draw=render_sample, layers=MOMENT_LAYERS, channels=(*CAMERAS, LIDAR), share=2, inches=12.8
+    ),
     "accident": _View(
         draw=draw_countdown, row_kind="frame", layers=PAIR_LAYERS, share=2, inches=12.8
     ),
-    "bev": _View(draw=render_bev, canvas="ax", layers=BEV_LAYERS, inches=4.6),
+    "bev": _View(
+        draw=render_bev,
+        canvas="ax",
+        layers=BEV_LAYERS,
+        channels=(LIDAR, BEV_CAMERA),
+        inches=4.6,
+    ),
     "visibility": _View(draw=render_visibility, canvas="ax", layers=VISIBILITY_LAYERS),
     "visibility_matrix": _View(
         draw=render_visibility_matrix, canvas="ax", options=("agents",), layers=()
@@ -271,6 +291,7 @@ VIEWS: Final[Mapping[str, _View]] = {
             canvas="ax",
             options=("layers",),
             layers=CAMERA_LAYERS,
+            channels=(channel,),
         )
         for channel in CAMERAS
     },
@@ -287,66 +308,116 @@ class VideoScene:
         agents: Agents, as in `cooperating_agents`.
         width: Width of the picture, pixels.
         height: Height of the picture, pixels.
+        view_agent: Agent that views of one agent show; None for the first of `agents`.
+        style: Style of the pictures, by default the current one.
     """
 
     dataset: Dataset
-    views: tuple[tuple[_View, tuple[Layer, ...] | None], ...]
+    views: tuple[tuple[_View, Layers | None], ...]
     agents: Agents
     width: int
     height: int
+    view_agent: str | None = None
+    style: Any = field(default_factory=current_style)
 
     def picture(self, frame: str) -> ByteArray:
         """Render the moment of a frame's token; (height, width, 3) uint8, RGB."""
-        names = names_at(self.dataset, frame, self.agents)
+        names = names_at(self.dataset, frame, self.agents, self.view_agent)
+        image = self._image_only(frame, names[0])
+        if image is not None:
+            return image
         total_share = sum(view.share for view, _ in self.views)
-        start, share, parts = 0, 0, []
+        share = 0
+        start = 0
+        pictures = []
         for view, layers in self.views:
             share += view.share
             end = round(self.width * share / total_share)
-            parts.append(self._view_picture(view, end - start, frame, names, layers))
+            fig = self.figure(view, end - start, frame, names, layers)
+            pictures.append(_picture_of(fig))
             start = end
-        return np.hstack(parts)
+        return np.hstack(pictures)
 
-    @in_own_settings
-    def _view_picture(
+    def _image_only(self, frame: str, agent: str) -> ByteArray | None:
+        """Return an image that fills the picture, if it is the only layer of the only view.
+
+        It keeps its aspect ratio, so there may be white strips at two edges.
+        """
+        from PIL import Image, ImageOps
+
+        (view, layers), *other_views = self.views
+        if other_views or layers != ("image",) or len(view.channels) != 1:
+            return None
+        scenario, number = frame.rsplit("/", 1)
+        camera = f"{sample_token(scenario, agent, int(number))}/{view.channels[0]}"
+        if not has_sensor_file(self.dataset, camera):
+            return None
+        image = Image.fromarray(self.dataset.load_image(camera))
+        size = (self.width, self.height)
+        return np.asarray(ImageOps.pad(image, size, Image.Resampling.LANCZOS, color="white"))
+
+    def figure(
         self,
         view: _View,
         width: int,
         frame: str,
         agents: Sequence[str],
-        layers: tuple[Layer, ...] | None,
-    ) -> ByteArray:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
+        layers: Layers | None,
+    ) -> Figure:
+        """Render one view of a moment on a figure of a width in pixels."""
         scale = (self.width * self.height / _REFERENCE_PIXELS) ** 0.5
         dpi = min(_DPI * scale, width / view.inches)
-        fig: Any = figure_of_pixels(width, self.height, dpi=dpi)
-        fig.get_layout_engine().set(w_pad=_MARGIN_PX / dpi)
-        view.render(fig, self.dataset, frame, agents, layers)
-        canvas: Any = FigureCanvasAgg(fig)
+        with using_style(self.style), own_settings():
+            fig = figure_of_pixels(width, self.height, dpi=dpi)
+            layout: Any = fig.get_layout_engine()
+            layout.set(w_pad=_MARGIN_PX / dpi)
+            view.render(fig, self.dataset, frame, agents, layers)
+        return fig
+
+
+def _picture_of(fig: Any) -> ByteArray:
+    """Return a figure's pixels, (H, W, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas: Any = FigureCanvasAgg(fig)
+    with laid_out(fig, fig.dpi):
         canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def names_at(dataset: Dataset, frame: str, agents: Agents) -> tuple[str, ...]:
-    """Return the names of agents at a frame, beginning with the agent of the views.
+def names_at(
+    dataset: Dataset, frame: str, agents: Agents, view_agent: str | None = None
+) -> tuple[str, ...]:
+    """Return the agents at a frame, starting with the one that views of one agent show.
 
-    It is the first one in `agents`, or the first present one.
+    That agent is the first one in `agents`, otherwise `view_agent`, or the first present one.
     """
-    names = cooperating_agents(dataset, dataset.samples_of(frame)[0], agents)
+    first_sample = dataset.samples_of(frame)[0]
+    names = cooperating_agents(dataset, first_sample, agents)
     checked = checked_agents(agents)
-    view_agent = checked[0] if isinstance(checked, tuple) else names[0]
-    return tuple(sorted(names, key=view_agent.__ne__))
+    first_agent = view_agent or names[0]
+    if isinstance(checked, tuple):
+        first_agent = checked[0]
+    return tuple(sorted(names, key=first_agent.__ne__))
 
 
 def views_of(
     names: str | OwnView | Iterable[str | OwnView], layers: Iterable[Layer] | None
-) -> tuple[tuple[_View, tuple[Layer, ...] | None], ...]:
-    """Return the named views, each with its layers of the requested ones; raises ChoiceError."""
+) -> tuple[tuple[_View, Layers | None], ...]:
+    """Return the named views, each with the requested layers that it supports.
+
+    None leaves each view its default layers. Raises ChoiceError if a view is unknown, if there are
+    no views, or if none of them supports a layer.
+    """
     items: list[Any] = [names] if isinstance(names, str) or callable(names) else list(names)
     if not items:
         raise ChoiceError(f"what: expected at least one of {', '.join(VIEWS)}, found none")
-    views = [_view(item) for item in items]
+    views = []
+    for item in items:
+        if callable(item):
+            views.append(_View(draw=item, layers=(), is_own=True))
+        else:
+            views.append(VIEWS[choice("what", item, VIEWS)])
     possible = [layer for layer in LAYERS if any(layer in view.layers for view in views)]
     requested = layers_of(layers, (), possible)
     if layers is None:
@@ -358,16 +429,10 @@ def views_of(
     return tuple(views_with_layers)
 
 
-def _view(view: object) -> _View:
-    if callable(view):
-        return _View(draw=view, layers=(), is_own=True)
-    return VIEWS[choice("what", view, VIEWS)]
-
-
 def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on its own in a notebook
     dataset: Dataset,
     scenario: RowArgument,
-    path: str | os.PathLike[str],
+    path: PathType,
     *,
     views: str | OwnView | Iterable[str | OwnView] = "frame",
     agents: Agents = None,
@@ -379,11 +444,11 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
 ) -> Path:
     """Write a scenario as a video.
 
-    The views are named after the `render_…` functions: `frame` (the agents' front cameras beside
+    The views are named after the `render_…` functions: `frame` (the agents' front cameras next to
     one view from above), `sample` (six cameras), `bev`, `visibility`, `visibility_matrix`,
-    `calibration`, `labels` (motion labels as a trail), a camera by its channel, and `accident`: the
-    countdown to the impact in five cameras, from above and in speeds. `frame`, `accident`, or two
-    or three of the others side by side, fill a picture of 16 to 9.
+    `calibration`, `labels` (motion labels as a trail), a camera by its channel, and `accident` (the
+    countdown to the impact: five cameras, a view from above and the speeds). `frame`, `accident`,
+    or two or three of the others side by side, fill a 16:9 picture.
 
     Args:
         dataset: The release.
@@ -391,19 +456,19 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         path: Path of the file to write, in the format of its suffix: `.mp4` (with the extra
             `video`), `.gif` or `.webp`. An earlier file is replaced when the new one is complete.
         views: A view by name, a function (dataset, frame record, figure) that renders one, or
-            several side by side.
+            several side by side. A single camera with only the layer `image` fills the picture.
         agents: Agents in the views, or None for all present ones. Views of one agent (`sample`,
-            `bev`, cameras, …) show the first one of them, or the first present one; their boxes and
-            points from above are of all of `agents`.
-        layers: Each view renders the layers that it has; None for the default of each view.
-        frames: Numbers of frames, from 1, in the requested order; or a slice of the list of all
-            frames; None for all.
-        size: Width and height, pixels; even numbers for MP4. `load_image` counts as arrays do:
-            (height, width).
-        fps: Frames a second; the recordings have 10.
-        **engine: Options of `parallel.Engine`, with a bar unless `progress` is False. By default
-            only this process calls functions of your own; other processes can do so if the
-            functions are importable from a module.
+            `bev`, cameras, …) show the first of them or, with None, the agent with the most files
+            of their sensors; from above, they show the boxes and points of all `agents`.
+        layers: Each view renders the layers that it supports; None means each view's default.
+        frames: Frame numbers, from 1, in the order to show; or a slice of the list of all frames;
+            or None for all.
+        size: Width and height, pixels; for MP4, rounded down to even numbers. (`load_image` uses
+            the order of arrays instead: height, width.)
+        fps: Frames per second; the recordings have 10.
+        **engine: Options of `parallel.Engine`, with a progress bar unless `progress` is False. By
+            default, only this process calls view functions of your own; worker processes can also
+            call them if they are importable from a module.
 
     Returns:
         The path of the file.
@@ -412,34 +477,51 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         TokenError: No such scenario.
         ChoiceError: No such view, layer, agent, frame or kind of file, or the file cannot have this
             size or rate.
-        NotAvailableError: An agent is not in this release, the sample has no label, or nobody
-            collides and the view is `accident`.
+        NotAvailableError: An agent is not in this release, the sample has no label, or the view is
+            `accident` and the scenario has no collision.
         MissingExtraError: The file is an `.mp4`, and the extra `video` is not installed.
         WorkerError: As in `parallel.Engine`.
     """
-    target, (width, height) = path_of(path), size
-    check_target(target, size=(width, height), fps=fps)
+    target = path_of(path)
+    check_target(target, size=size, fps=fps)
+    width, height = size
+    if target.suffix.lower() == ".mp4":  # H.264 halves the resolution of colours
+        width -= width % 2
+        height -= height % 2
     scene_views = views_of(views, layers)
     record = dataset.get("scenario", scenario)
-    numbers = _numbers(frames, record["num_frames"])
+    numbers = _frame_numbers(frames, record["num_frames"])
     tokens = [frame_token(record["token"], number) for number in numbers]
     names_at(dataset, tokens[0], agents)  # raises errors before any worker starts
     functions = [view.draw for view, _ in scene_views if view.is_own]
+    channels = {channel for view, _ in scene_views for channel in view.channels}
+    view_agent = None
+    if agents is None and channels:
+        view_agent = default_agent(dataset, record["token"], numbers, channels)
     scene = VideoScene(
-        dataset=dataset, views=scene_views, agents=agents, width=width, height=height
+        dataset=dataset,
+        views=scene_views,
+        agents=agents,
+        width=width,
+        height=height,
+        view_agent=view_agent,
     )
     workers = _workers(functions, engine.get("workers"))
     options: Engine = {"progress": True, **engine, "workers": workers}
     unordered = run_unordered(
-        scene.picture, tokens, label="frames", places=Places(reads=dataset.places), **options
+        scene.picture,
+        tokens,
+        label="Rendering frames",
+        places=Places(reads=dataset.places),
+        **options,
     )
     with closing(in_order(unordered)) as pictures:
         write_video(target, pictures, fps=fps)
     return target
 
 
-def _numbers(frames: Collection[int] | slice | None, last_frame: int) -> list[int]:
-    """Return frame numbers from 1; raises ChoiceError."""
+def _frame_numbers(frames: Collection[int] | slice | None, last_frame: int) -> list[int]:
+    """Return the numbers, from 1, of the requested frames; raise ChoiceError if one is unknown."""
     recorded = range(1, last_frame + 1)
     if frames is None or isinstance(frames, slice):
         numbers = list(recorded[frames] if frames else recorded)
@@ -453,10 +535,10 @@ def _numbers(frames: Collection[int] | slice | None, last_frame: int) -> list[in
 
 
 def _workers(functions: Sequence[Callable[..., object]], workers: int | None) -> int | None:
-    """Return how many processes render a caller's functions.
+    """Return how many processes may render a video that uses the caller's functions.
 
     Raises:
-        ChoiceError: A function cannot be sent to them.
+        ChoiceError: A function cannot be sent to other processes.
     """
     if not functions or workers == 1:
         return workers

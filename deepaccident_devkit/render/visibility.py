@@ -29,12 +29,14 @@ from deepaccident_devkit.render.captions import (
 from deepaccident_devkit.render.chips import SMALLEST_TEXT, keep_free, place_chips
 from deepaccident_devkit.render.figures import (
     Layer,
+    Layers,
     axes_or_new,
     check_view_range,
     label_axes,
+    lay_out_figure,
     layers_of,
-    settled,
-    widening,
+    square_around,
+    width_to_height,
     with_light_grid,
 )
 from deepaccident_devkit.render.styles import (
@@ -62,10 +64,10 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# The slashes of a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one more, for
-# the agent.
-_FRAME_TOKEN_SLASHES: Final = 2
-VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = (
+# Number of slashes in a frame's token, `<scenario_type>/<name>/<NNN>`; a sample's token has one
+# more, for the agent.
+_FRAME_TOKEN_SLASHES = 2
+VISIBILITY_LAYERS: Final[Layers] = (
     "points",
     "boxes",
     "ids",
@@ -73,43 +75,45 @@ VISIBILITY_LAYERS: Final[tuple[Layer, ...]] = (
     "visibility",
     "grid",
 )
-_DEFAULT_LAYERS: Final[tuple[Layer, ...]] = ("boxes", "visibility", "grid")
+_DEFAULT_LAYERS: Layers = ("boxes", "visibility", "grid")
 # Metres shown around the agents and the colliding pair.
-_VIEW_MARGIN_M: Final = 10.0
-# Metres shown to each side, at least.
-_MIN_VIEW_RANGE_M: Final = 25.0
+_VIEW_MARGIN_M = 10.0
+# Minimum number of metres shown to each side.
+_MIN_VIEW_RANGE_M = 25.0
 # Points from one agent's dot to the next.
-_DOT_DISTANCE_PT: Final = 4.6
+_DOT_DISTANCE_PT = 4.6
 # Points from an actor's box up to its dots.
-_DOT_HEIGHT_PT: Final = 5.0
-# Share of the width of the view by which a line is shifted to the right, so that two agents that
-# see each other have two lines.
-_LINE_SHIFT_SHARE: Final = 0.006
-# Share of half the view between its edge and a box that has made it larger.
-_EDGE_SHARE: Final = 0.05
-# Share of the table's width, about, at the middle of the picture; the names of actors are on the
-# left.
-_TABLE_CENTER_SHARE: Final = 0.36
-_MAX_ROWS: Final = 24
-_MAX_SLIDE_ROWS: Final = 14
+_DOT_HEIGHT_PT = 5.0
+# Share of the view's width by which a line is shifted to the right, so that two agents that see
+# each other have two separate lines.
+_LINE_SHIFT_SHARE = 0.006
+# Share of half the view that stays free at its edges if it was enlarged to fit boxes.
+_EDGE_SHARE = 0.05
+# Approximate share of the table's width at which the middle of the picture is; the names of actors
+# are on the left.
+_TABLE_CENTER_SHARE = 0.36
+_MAX_ROWS = 24
+_MAX_SLIDE_ROWS = 14
 # Relative luminance (as in sRGB) of a colour above which black text on it is easier to read.
-_MIN_BRIGHT_LUMINANCE: Final = 0.3
+_MIN_BRIGHT_LUMINANCE = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Visibility(FrozenArrays):
-    """N tracked actors of a moment and the A agents that may see them; arrays are read-only.
+    """Which of A agents see which of N tracked actors at a moment; arrays are read-only.
 
     Attributes:
         sample: Token of the sample; its agent is the ego.
         agents: Observing agents, the ego first if it is one of them.
         boxes: Actors in one frame, by ascending id; an agent's own box has the agent's actor id.
-        position: Agents' x and y in that frame, shape (A, 2), metres.
-        actor: Agents' own actor ids, (A,) int64; −1 for the infrastructure, or if meta lacks it.
-        seen: Whether the agent counts as seeing the actor, (N, A) bool.
-        annotated: Whether the agent's label has the actor, (N, A) bool.
-        points: LiDAR points of the agent in the box of its label, (N, A) int64.
-        pair: Actor ids of the colliding pair; empty if nobody collides.
+        position: Agents' x and y in the frame of `boxes`, shape (A, 2), metres.
+        actor: The agents' own actor ids, (A,) int64; −1 for the infrastructure, or if meta lacks
+            the id.
+        seen: Whether each agent counts as seeing each actor, (N, A) bool.
+        annotated: Whether each agent's label contains each actor, (N, A) bool.
+        points: Number of the agent's LiDAR points in the actor's box, as in the agent's label,
+            (N, A) int64.
+        pair: Actor ids of the colliding pair; empty without a collision.
     """
 
     sample: str
@@ -129,30 +133,34 @@ class Visibility(FrozenArrays):
 
     @property
     def own(self) -> BoolArray:
-        """Whether the actor is the agent itself, shape (N, A)."""
-        return np.asarray(self.boxes.actor_id[:, None] == self.actor)
+        """Whether each actor is the agent itself, shape (N, A)."""
+        actor_ids = self.boxes.actor_id[:, None]
+        return np.asarray(actor_ids == self.actor)
 
     @property
     def collides(self) -> BoolArray:
-        """Whether the actor is one of the colliding pair, shape (N,)."""
-        return np.isin(self.boxes.actor_id, [*self.pair])
+        """Whether each actor is one of the colliding pair, shape (N,)."""
+        pair = list(self.pair)
+        return np.isin(self.boxes.actor_id, pair)
 
     @property
     def records(self) -> BoolArray:
-        """Whether the actor is one of the agents, shape (N,)."""
-        return np.isin(self.boxes.actor_id, self.actor[self.actor >= 0])
+        """Whether each actor is one of the agents, shape (N,)."""
+        is_known = self.actor >= 0
+        return np.isin(self.boxes.actor_id, self.actor[is_known])
 
     def hidden_from(self, agent: str) -> BoolArray:
-        """Return which actors of the accident an agent does not see, shape (N,).
+        """Return which of the accident's actors an agent does not see, shape (N,).
 
-        These are the pair and the agents, without the agent itself. All are False if it is not an
-        observing agent, or if nobody collides.
+        The accident's actors are the colliding pair and the agents, except this agent. All values
+        are False if `agent` is not an observing agent, or if there is no collision.
         """
         if agent not in self.agents or not self.pair:
             return np.zeros(len(self.boxes), dtype=bool)
         column = self.agents.index(agent)
+        is_known = self.seen[:, column] | self.own[:, column]
         is_involved = self.collides | self.records
-        return np.asarray(is_involved & ~self.seen[:, column] & ~self.own[:, column])
+        return np.asarray(is_involved & ~is_known)
 
 
 def visibility_of(
@@ -160,8 +168,11 @@ def visibility_of(
 ) -> Visibility:
     """Return which agents see which annotated actors, in a coordinate frame of the sample.
 
-    The moment is a sample, or a frame, which stands for its first agent's sample. Agents are as for
-    `visible_instances`; its errors are raised.
+    Args:
+        dataset: The release.
+        moment: Token or record of a sample, or of a frame, whose first sample is then used.
+        agents: Observing agents, as for `visible_instances`, whose errors are raised.
+        frame: Coordinate frame: `ego`, `lidar` or `world`.
     """
     sample = sample_at(dataset, moment)
     scenario, _, number = sample.rsplit("/", 2)
@@ -169,24 +180,31 @@ def visibility_of(
     boxes = cooperative_boxes(dataset, sample, frame=frame)
     boxes = boxes.select(boxes.actor_id != UNTRACKED_ID)
     frame_from_world = dataset.world_from(sample, frame).inverse()
-    shape = len(boxes), len(names)
-    seen, annotated = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
-    points, position = np.zeros(shape, dtype=np.int64), np.zeros((len(names), 2))
+    shape = (len(boxes), len(names))
+    seen = np.zeros(shape, dtype=bool)
+    annotated = np.zeros(shape, dtype=bool)
+    points = np.zeros(shape, dtype=np.int64)
+    position = np.zeros((len(names), 2))
     actor = np.full(len(names), UNTRACKED_ID, dtype=np.int64)
     for column, agent in enumerate(names):
         own_sample = sample_token(scenario, agent, int(number))
         visible = visible_actors(dataset, own_sample, agents=[agent])
         seen[:, column] = np.isin(boxes.actor_id, visible)
-        label, ids = dataset.boxes(own_sample, "lidar"), dataset.actor_ids(own_sample)
+        label = dataset.boxes(own_sample, "lidar")
+        ids = dataset.actor_ids(own_sample)
         ids = np.where(label.actor_id == OWN_ACTOR_ID, UNTRACKED_ID, ids)
         _, row, label_row = np.intersect1d(boxes.actor_id, ids, return_indices=True)
-        annotated[row, column], points[row, column] = True, label.num_lidar_pts[label_row]
+        annotated[row, column] = True
+        points[row, column] = label.num_lidar_pts[label_row]
         frame_from_ego = frame_from_world @ dataset.world_from(own_sample, "ego")
         position[column] = frame_from_ego.translation[:2]
         own_actor = dataset.agent.get(f"{scenario}/{agent}")["actor_id"]
         if own_actor is not None:
             actor[column] = own_actor
     collision = dataset.get("scenario", scenario)["collision"]
+    pair: frozenset[int] = frozenset()
+    if collision is not None:
+        pair = frozenset(collision["ids"])
     return Visibility(
         sample=sample,
         agents=tuple(names),
@@ -196,7 +214,7 @@ def visibility_of(
         seen=seen,
         annotated=annotated,
         points=points,
-        pair=frozenset() if collision is None else frozenset(collision["ids"]),
+        pair=pair,
     )
 
 
@@ -204,11 +222,12 @@ def sample_at(dataset: Dataset, moment: RowArgument) -> str:
     """Return the token of a sample, or of a frame's first sample.
 
     Raises:
-        TokenError: The moment is neither.
+        TokenError: The moment is neither a sample nor a frame.
     """
     token = str(moment["token"]) if isinstance(moment, Mapping) else moment
     if token.count("/") == _FRAME_TOKEN_SLASHES:
-        return str(dataset.samples_of(token)[0]["token"])
+        first_sample = dataset.samples_of(token)[0]
+        return first_sample["token"]
     return str(dataset.get("sample", token)["token"])
 
 
@@ -225,22 +244,22 @@ def render_visibility(
 ) -> Axes:
     """Render which agents see which actors, from above, by the released rule.
 
-    Each actor has a dot for each agent that sees it. A dot has its agent's colour and its own
-    position in the row, and lines go from the agents (stars) to the actors of the colliding pair
-    that they see. The sample's agent has a circle. The accident's actors that it does not see are
-    dashed, and for the colliding pair there are words.
+    Above each actor there is a row of dots, one for each agent that sees it; each agent has its own
+    colour and its own place in the row. Lines lead from the agents (stars) to the actors of the
+    colliding pair that they see. The sample's agent is circled. The accident's actors that this
+    agent does not see are dashed; for the colliding pair, words say so too.
 
     Args:
         dataset: The release.
-        moment: Token or record of a sample, or of a frame: then its first present agent is the ego.
+        moment: Token or record of a sample; or of a frame, whose first present agent is the ego.
         agents: Observing agents: names, a configuration or its name from the view of the ego; None
             for all present agents.
         frame: Coordinate frame: `ego`, `lidar` or `world`.
         view_range: Metres to each side of the ego; None shows all agents, the colliding pair, and
-            the actors among them.
-        layers: `boxes`, `visibility` (dots, lines, words) and `grid` are the default; also `points`
-            (the LiDAR of the observing agents), `ids` and `velocities`.
-        ax: Axes to render on; new ones if None.
+            the actors between them.
+        layers: Any of `boxes`, `visibility` (dots, lines, words), `grid` (these are the default),
+            `points` (the observing agents' LiDAR), `ids` and `velocities`.
+        ax: Axes to render on, new ones if None. In a figure of your own, the title is yours.
 
     Returns:
         The axes, in metres of the frame.
@@ -255,8 +274,9 @@ def render_visibility(
     if view_range is not None:
         check_view_range(view_range)
     visibility = visibility_of(dataset, moment, agents, frame)
-    low, high = _corners(visibility, view_range, widening(ax))
-    is_new, ax = ax is None, axes_or_new(ax, (6, 6.9))
+    low, high = _corners(visibility, view_range, width_to_height(ax))
+    is_new = ax is None
+    ax = axes_or_new(ax, (6, 6.9), is_map=True)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
     label_axes(ax, frame)
     ax.locator_params(nbins=6)  # each tick costs time
@@ -281,22 +301,18 @@ def render_visibility(
     if "grid" in shown_layers:
         with_light_grid(ax, "both")
     if is_new:
-        settled(cast("Any", ax.figure))
+        lay_out_figure(cast("Any", ax.figure))
     return ax
 
 
 def _draw_boxes(visibility: Visibility, hidden: BoolArray, colors: list[str], ax: Axes) -> None:
     """Draw the boxes of all actors; the boxes of hidden actors are dashed."""
-    visible_boxes = visibility.boxes.select(~hidden)
-    draw_boxes_from_above(visible_boxes, ax, _selected(colors, ~hidden))
-    draw_boxes_from_above(
-        visibility.boxes.select(hidden),
-        ax,
-        _selected(colors, hidden),
-        fill=0.0,
-        linestyle=(0, (2, 1)),
-        linewidths=2.0,
-    )
+    hidden_style: dict[str, Any] = {"fill": 0.0, "linestyle": (0, (2, 1)), "linewidths": 2.0}
+    visible_style: dict[str, Any] = {}
+    for is_drawn, style in ((~hidden, visible_style), (hidden, hidden_style)):
+        boxes = visibility.boxes.select(is_drawn)
+        box_colors = [colors[row] for row in np.flatnonzero(is_drawn).tolist()]
+        draw_boxes_from_above(boxes, ax, box_colors, **style)
 
 
 @in_own_settings
@@ -305,19 +321,19 @@ def render_visibility_matrix(
 ) -> Axes:
     """Render which agents see which actors as a table: a row per actor, a column per agent.
 
-    A filled cell means that the agent sees the actor, an empty one that it does not. The number is
-    the agent's LiDAR points in the box; if its label lacks the actor, there is a dash. A key below
-    explains this. The colliding pair comes first, then the agents, then the actors that most agents
-    see.
+    A filled cell means that the agent sees the actor, an empty one that it does not. The number in
+    a cell counts the agent's LiDAR points in the actor's box; a dash means that the agent's label
+    lacks the actor. A key below explains this. The colliding pair comes first, then the agents,
+    then the other actors, the ones that most agents see first.
 
     Args:
         dataset: The release.
         moment: Token or record of a sample, or of a frame.
         agents: Observing agents, as in `render_visibility`.
-        ax: Axes to render on; new ones if None.
+        ax: Axes to render on, new ones if None. In a figure of your own, the title is yours.
 
     Returns:
-        The axes, with rows counted from 0 downwards.
+        The axes; rows are numbered from 0 at the top.
 
     Raises:
         TokenError: No such sample or frame.
@@ -325,17 +341,19 @@ def render_visibility_matrix(
         NotAvailableError: An agent is not in this (partial) release.
     """
     visibility = visibility_of(dataset, moment, agents)
-    is_slide = current_style().room == "slide"
-    observers = visibility.seen.sum(axis=1)
-    keys = (visibility.boxes.actor_id, -observers, ~visibility.records, ~visibility.collides)
+    is_slide = current_style().layout == "slide"
+    observer_counts = visibility.seen.sum(axis=1)
+    actor_ids = visibility.boxes.actor_id
+    keys = (actor_ids, -observer_counts, ~visibility.records, ~visibility.collides)
     all_rows = np.lexsort(keys)
-    rows = all_rows[: _MAX_SLIDE_ROWS if is_slide else _MAX_ROWS]
+    max_rows = _MAX_SLIDE_ROWS if is_slide else _MAX_ROWS
+    rows = all_rows[:max_rows]
     columns = in_drawing_order(visibility.agents)
     ax = axes_or_new(ax, (1.4 + 0.75 * len(columns), 1.2 + 0.29 * max(len(rows), 4)))
     for column, agent in enumerate(columns):
         _draw_column(visibility, rows, agent, column, ax)
-    categories, ids = visibility.boxes.category_names, visibility.boxes.actor_id
-    row_names = [f"{categories[row]} {ids[row]}" for row in rows.tolist()]
+    categories = visibility.boxes.category_names
+    row_names = [f"{categories[row]} {actor_ids[row]}" for row in rows.tolist()]
     ax.set_yticks(range(len(rows)), row_names, fontsize=text_size())
     for label, row in zip(ax.get_yticklabels(), rows.tolist(), strict=True):
         label.set_color(COLLIDER_COLOR if visibility.collides[row] else OWN_COLOR)
@@ -351,9 +369,8 @@ def render_visibility_matrix(
         key_lines.append(f"{len(all_rows) - len(rows)} more actors")
     ax.set_xlabel("\n".join(key_lines), fontsize=text_size())
     token = dataset.get("sample", visibility.sample)["frame_token"]
-    # above the names of the columns
-    style: dict[str, Any] = {"x": _TABLE_CENTER_SHARE, "y": None}
-    set_scene_title(ax, dataset, token, below="who sees whom", **style)
+    # y is None, so that the title is above the names of the columns
+    set_scene_title(ax, dataset, token, below="who sees whom", x=_TABLE_CENTER_SHARE, y=None)
     return ax
 
 
@@ -362,70 +379,74 @@ def _corners(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the lower left and the upper right corner of the view, shape (2,) each.
 
-    It is a square, or wider by the ratio.
+    The view is `width_ratio` times as wide as high.
     """
     if view_range is not None:
         column = 0
         if visibility.ego in visibility.agents:
             column = visibility.agents.index(visibility.ego)
-        middle, half = visibility.position[column], view_range
+        middle = visibility.position[column]
+        half_height = view_range
     else:
-        middle, half = _square_of(visibility)
-    sides = half * np.array([width_ratio, 1.0])
-    return middle - sides, middle + sides
+        middle, half_height = _square_of(visibility)
+    half_size = half_height * np.array([width_ratio, 1.0])
+    return middle - half_size, middle + half_size
 
 
 def _square_of(visibility: Visibility) -> tuple[FloatArray, float]:
-    """Return the middle and half the side of a square that shows the agents and the pair.
+    """Return the centre (2,), and half the side, of a square that shows the agents and the pair.
 
-    All boxes in it are shown as a whole.
+    It is large enough to show whole all boxes that are partly in it.
     """
     corners = visibility.boxes.bottom_corners()[..., :2]
     is_involved = visibility.collides | visibility.records
     points = np.concatenate([visibility.position, *corners[is_involved]])
     middle, half = _square_about(points, _VIEW_MARGIN_M)
-    among = (np.abs(corners - middle) < half).all(axis=-1).any(axis=-1)
-    shown_points = np.concatenate([[middle - half, middle + half], *corners[among]])
+    is_inside = (np.abs(corners - middle) < half).all(axis=-1)
+    is_shown = is_inside.any(axis=-1)
+    shown_points = np.concatenate([[middle - half, middle + half], *corners[is_shown]])
     is_larger = np.abs(shown_points - middle).max() > half
     return _square_about(shown_points, _EDGE_SHARE * half * is_larger)
 
 
 def _square_about(points: FloatArray, margin: float) -> tuple[FloatArray, float]:
-    """Return the middle (2,) and half the side of a square around points (P, 2)."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    half = float((high - low).max()) / 2 + margin
-    return (low + high) / 2, max(_MIN_VIEW_RANGE_M, half)
+    """Return the centre (2,), and half the side, of a square around points (P, 2).
+
+    The square extends at least `_MIN_VIEW_RANGE_M` to each side.
+    """
+    middle, half = square_around(points, margin)
+    return middle, max(_MIN_VIEW_RANGE_M, half)
 
 
 def _draw_points(dataset: Dataset, visibility: Visibility, frame: str, ax: Axes) -> None:
-    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-    center = np.array([left + right, low + high]) / 2
-    half = np.array([right - left, high - low]) / 2
+    low, high = np.array([ax.get_xlim(), ax.get_ylim()]).T
+    center = (low + high) / 2
+    half = (high - low) / 2
     scenario, _, number = visibility.sample.rsplit("/", 2)
-    absent = []
+    absent_agents = []
     for agent in visibility.agents:
         if not has_cloud(dataset, f"{scenario}/{agent}/{number}"):
-            absent.append(agent)
-    write_missing(ax, missing_clouds_text(absent))
-    for agent in visibility.agents:
-        if agent in absent:
+            absent_agents.append(agent)
             continue
         cloud = aggregate_point_cloud(dataset, visibility.sample, agents=[agent], frame=frame)
         draw_points_from_above(cloud.xyz, ax, center=center, half=half, color=AGENT_COLORS[agent])
+    write_missing(ax, missing_clouds_text(absent_agents))
 
 
 def _draw_sight_lines(visibility: Visibility, ax: Axes) -> None:
     from matplotlib.collections import LineCollection
 
     row, column = np.nonzero(visibility.seen & visibility.collides[:, None])
-    starts, ends = visibility.position[column], visibility.boxes.center[row, :2]
-    lines = np.stack([starts, ends], axis=1)
-    direction = lines[:, 1] - lines[:, 0]
-    to_right = np.column_stack([direction[:, 1], -direction[:, 0]])
-    length = np.linalg.norm(direction, axis=1, keepdims=True)
-    unit = to_right / np.maximum(length, 1e-9)
-    lines += (unit * _LINE_SHIFT_SHARE * np.ptp(ax.get_xlim()))[:, None]
-    colors = [AGENT_COLORS[visibility.agents[number]] for number in column.tolist()]
+    starts = visibility.position[column]
+    ends = visibility.boxes.center[row, :2]
+    x, y = (ends - starts).T
+    to_right = np.column_stack([y, -x])
+    length = np.linalg.norm(to_right, axis=1, keepdims=True)
+    unit_to_right = to_right / np.maximum(length, 1e-9)
+    shift = unit_to_right * _LINE_SHIFT_SHARE * np.ptp(ax.get_xlim())
+    lines = np.stack([starts + shift, ends + shift], axis=1)
+    agents = [visibility.agents[number] for number in column.tolist()]
+    colors = [AGENT_COLORS[agent] for agent in agents]
     collection = LineCollection(list(lines), colors=colors, linewidths=1.2, alpha=0.8, zorder=2)
     ax.add_collection(collection)
 
@@ -433,16 +454,19 @@ def _draw_sight_lines(visibility: Visibility, ax: Axes) -> None:
 def _draw_dots(visibility: Visibility, ax: Axes) -> None:
     from matplotlib.transforms import ScaledTranslation
 
-    order, scale = in_drawing_order(visibility.agents), text_size() / SMALLEST_TEXT
+    order = in_drawing_order(visibility.agents)
+    scale = text_size() / SMALLEST_TEXT
     inches = ax.figure.dpi_scale_trans
-    distance, height = _DOT_DISTANCE_PT * scale, _DOT_HEIGHT_PT * scale
+    distance = _DOT_DISTANCE_PT * scale
+    height = _DOT_HEIGHT_PT * scale
     box_tops = visibility.boxes.bottom_corners()[..., 1].max(axis=1)
     tops = np.column_stack([visibility.boxes.center[:, 0], box_tops])
     side = len(order) / 2 * distance
     is_seen = visibility.seen.any(axis=1)
     keep_free(ax, tops[is_seen, None], margin=(-side, 0.0, side, 2 * height))
     for slot, agent in enumerate(order):
-        x, y = tops[visibility.seen[:, visibility.agents.index(agent)]].T
+        column = visibility.agents.index(agent)
+        x, y = tops[visibility.seen[:, column]].T
         shift = (slot - (len(order) - 1) / 2) * distance
         ax.scatter(
             x,
@@ -458,16 +482,17 @@ def _draw_dots(visibility: Visibility, ax: Axes) -> None:
 
 
 def _write_hidden(visibility: Visibility, hidden: BoolArray, ax: Axes) -> None:
-    words, chips = f"{short_name(visibility.ego)} cannot see", []
-    for row in np.flatnonzero(hidden & visibility.collides).tolist():
-        chips.append((words, visibility.boxes.center[row, :2].tolist()))
+    """Write next to each colliding actor that the sample's agent does not see that it is hidden."""
+    words = f"{short_name(visibility.ego)} cannot see"
+    centers = visibility.boxes.center[hidden & visibility.collides, :2]
+    chips = [(words, center) for center in centers.tolist()]
     place_chips(ax, chips, colors=[COLLIDER_COLOR] * len(chips))
 
 
 def _draw_agents(visibility: Visibility, ax: Axes) -> None:
     scale = text_size() / SMALLEST_TEXT
     positions = dict(zip(visibility.agents, visibility.position.tolist(), strict=True))
-    if current_style().few:
+    if current_style().shows_few_panels:
         chips = [(short_name(agent), position) for agent, position in positions.items()]
         place_chips(ax, chips, colors=[AGENT_COLORS[agent] for agent in positions])
     for agent, (x, y) in positions.items():
@@ -500,11 +525,11 @@ def _draw_legend(
     from matplotlib.patches import Patch
 
     ego = short_name(visibility.ego)
-    handles = agent_handles(() if current_style().few else visibility.agents)
+    handles = agent_handles(() if current_style().shows_few_panels else visibility.agents)
     if visibility.pair:
         handles.append(Patch(facecolor="none", edgecolor=COLLIDER_COLOR, label="colliding pair"))
     mark: dict[str, Any] = {"linestyle": "none", "color": MUTED_COLOR}
-    handles.append(Line2D([], [], marker="*", markersize=8, label="an agent", **mark))
+    handles.append(Line2D([], [], marker="*", markersize=8, label="recording agent", **mark))
     if visibility.ego in visibility.agents:
         handles.append(
             Line2D(
@@ -513,23 +538,21 @@ def _draw_legend(
                 marker="o",
                 markersize=9,
                 fillstyle="none",
-                label=f"whose view: {ego}",
+                label=f"reference agent: {ego}",
                 **mark,
             )
         )
     if "visibility" in layers and visibility.pair:
         handles.append(
-            Line2D([], [], color=MUTED_COLOR, linewidth=1.2, label="sees one of the pair")
+            Line2D([], [], color=MUTED_COLOR, linewidth=1.2, label="line of sight to the pair")
         )
     if hidden.any():
         handles.append(
-            Patch(facecolor="none", edgecolor=OWN_COLOR, linestyle="--", label=f"{ego} cannot see")
+            Patch(facecolor="none", edgecolor=OWN_COLOR, linestyle="--", label=f"hidden from {ego}")
         )
-    title: dict[str, Any] = {
-        "title": "dots above: who sees it",
-        "title_fontsize": text_size(),
-    }
-    draw_legend_outside(ax, handles, columns=4, **title)
+    draw_legend_outside(
+        ax, handles, columns=4, title="Dots: agents that see the actor", title_fontsize=text_size()
+    )
 
 
 def _draw_column(visibility: Visibility, rows: IntArray, agent: str, column: int, ax: Axes) -> None:
@@ -538,31 +561,31 @@ def _draw_column(visibility: Visibility, rows: IntArray, agent: str, column: int
     agent_index = visibility.agents.index(agent)
     for y, row in enumerate(rows.tolist()):
         is_own = bool(visibility.own[row, agent_index])
-        text, color = f"{visibility.points[row, agent_index]}", MUTED_COLOR
+        text = f"{visibility.points[row, agent_index]}"
+        color = MUTED_COLOR
         if is_own:
             text = "itself"
         elif not visibility.annotated[row, agent_index]:
             text = "–"
         else:
-            face, edge = "none", GRID_COLOR
+            face = "none"
+            edge = GRID_COLOR
             if visibility.seen[row, agent_index]:
-                face = edge = AGENT_COLORS[agent]
-                color = _legible_on(face)
+                face = AGENT_COLORS[agent]
+                edge = face
+                color = _text_color_on(face)
             ax.add_patch(
                 Rectangle((column - 0.3, y - 0.4), 0.6, 0.8, facecolor=face, edgecolor=edge)
             )
         ax.text(column, y, text, ha="center", va="center", fontsize=text_size(), color=color)
 
 
-def _legible_on(color: str) -> str:
-    """Return black or white, whichever is easier to read on a colour."""
+def _text_color_on(color: str) -> str:
+    """Return black or white, whichever is easier to read on the colour."""
     from matplotlib.colors import to_rgb
 
-    luminance = np.dot(np.power(to_rgb(color), 2.2), (0.2126, 0.7152, 0.0722))
+    linear_rgb = np.power(to_rgb(color), 2.2)
+    luminance = np.dot(linear_rgb, (0.2126, 0.7152, 0.0722))
     if luminance > _MIN_BRIGHT_LUMINANCE:
         return "black"
     return "white"
-
-
-def _selected(colors: list[str], selection: BoolArray) -> list[str]:
-    return [colors[row] for row in np.flatnonzero(selection).tolist()]

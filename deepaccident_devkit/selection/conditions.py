@@ -1,13 +1,11 @@
-"""One filter on one field: its text, its keyword, and the checked condition."""
-
-from __future__ import annotations
+"""A filter on a field: its text, its keyword, and the checked condition."""
 
 import math
 import operator
 import re
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,7 @@ from deepaccident_devkit.selection.fields import Field, FieldValue
 from deepaccident_devkit.support.text import meant_text, possible_text
 
 FilterValue = FieldValue | Collection[FieldValue]
-"""Value of a keyword of `find`: a value, or several values, one of which must match."""
+"""Value of a keyword of `find`: a value, or several values, and one must match."""
 
 _FILTER_TEXT = re.compile(r"\s*(\w+)\s*(!=|>=|<=|=|>|<)(.*)", re.DOTALL)
 _NUMBER = r"-?\d{1,18}(?:\.\d{1,18})?"
@@ -25,20 +23,20 @@ _RANGE = re.compile(rf"({_NUMBER})?\s*\.\.\s*({_NUMBER})?")
 _BOUND = re.compile(rf"(>=|<=|>|<)\s*({_NUMBER})")
 _UNKNOWN_WORDS = ("unknown", "none")
 _FLAGS = {"true": True, "yes": True, "false": False, "no": False}
-# Collections of Python that a filter does not take for several values; only a str can be a value.
+# Collections that do not count as several values; of these, only a str can be a single value.
 _SINGLE_TYPES = (str, bytes, bytearray, Mapping, np.ndarray)
-# Characters of a wrong value in a message.
-_MAX_QUOTED = 60
+# Maximum number of characters of an invalid value in a message.
+_MAX_QUOTE_LENGTH = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """A field and the values to find, not yet checked.
+    """A field and the values to match, which are not checked yet.
 
     Attributes:
-        name: Name of the field or its short form.
-        values: Values, one of which must match.
-        negated: Whether to find the scenarios with none of the values.
+        name: Name of the field, or its short form.
+        values: Values; one must match.
+        negated: Whether to match the scenarios with none of the values.
     """
 
     name: str
@@ -48,13 +46,13 @@ class Filter:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A filter that was checked against its field.
+    """A filter that has been checked against its field.
 
     Attributes:
         field: Field of the filter.
-        values: Single values that match, with None for unknown.
-        ranges: (lowest, highest) of the numbers that match; None for no bound.
-        negated: As in `Filter`.
+        values: Single values that match; None for unknown.
+        ranges: Lowest and highest number of each range that matches; None for no bound.
+        negated: Whether to match the scenarios with none of the values.
     """
 
     field: Field
@@ -63,39 +61,38 @@ class Condition:
     negated: bool
 
     def holds(self, value: FieldValue | tuple[FieldValue, ...]) -> bool:
-        """Return whether a scenario with this value of the field, or with these, is found."""
+        """Return whether the condition matches a scenario with this value (or these values)."""
         values = value if isinstance(value, tuple) else (value,)
         return any(map(self._matches, values)) != self.negated
 
     def _matches(self, value: FieldValue) -> bool:
-        """Return whether a value is one of the values, or lies in one of the ranges."""
+        """Return whether a value is one of the values or lies in one of the ranges."""
         if value in self.values:
             return True
         return any(_is_within(value, *bounds) for bounds in self.ranges)
 
 
 def parse_where(text: str) -> Filter:
-    """Read a filter such as `town=Town03,Town05`, `weather!=Clear` or `length=40..60`.
+    """Parse a filter such as `town=Town03,Town05`, `weather!=Clear` or `length=40..60`.
 
-    Field and values are checked when the filter is used, like keywords.
+    Field and values are checked later, when the filter is used.
 
     Raises:
-        ChoiceError: The text has no field, no sign or no value.
+        ChoiceError: If the text has no field, no operator or no value.
     """
     if not isinstance(text, str):
         raise ChoiceError(
-            f"expected a text such as town=Town03,Town05, found {_quote(text)}; other values are "
-            "given as keywords, such as town=['Town03', 'Town05']"
+            f"expected a text such as town=Town03,Town05, found {_quote(text)}; pass other values "
+            "as keywords, such as town=['Town03', 'Town05']"
         )
     match = _FILTER_TEXT.fullmatch(text)
-    values = [value.strip() for value in match[3].split(",")] if match else []
-    if match is None or not all(values):
+    name, sign, value_text = match.groups() if match else ("", "", "")
+    values = [value.strip() for value in value_text.split(",")]
+    if not all(values):
         raise ChoiceError(
-            "expected field=value[,value…] with one of the signs =, !=, >=, <=, > and <, found "
-            f"{_quote(text)}; such as town=Town03,Town05 or length=40..60"
+            "expected field=value[,value…] with one of the signs =, !=, >=, <=, > and <, such as "
+            f"town=Town03,Town05 or length=40..60, found {_quote(text)}"
         )
-    name = match[1]
-    sign = match[2]
     if sign in {"=", "!="}:
         return Filter(name, tuple(values), negated=sign == "!=")
     if len(values) > 1:
@@ -103,33 +100,35 @@ def parse_where(text: str) -> Filter:
     return Filter(name, (f"{sign}{values[0]}",))
 
 
-def keyword_filter(name: str, value: FilterValue) -> Filter:
-    """Return the filter of a keyword of `find`."""
-    has_several = isinstance(value, Collection) and not isinstance(value, _SINGLE_TYPES)
-    return Filter(name, tuple(value) if has_several else (value,))  # type: ignore[arg-type]
+def make_filter(name: str, value: FilterValue) -> Filter:
+    """Make a filter from a keyword argument of `find`."""
+    if isinstance(value, Collection) and not isinstance(value, _SINGLE_TYPES):
+        return Filter(name, tuple(value))
+    return Filter(name, (value,))
 
 
-def condition_of(query: Filter, field: Field, release_values: Iterable[FieldValue]) -> Condition:
-    """Check a filter against its field; raises ChoiceError.
+def check_condition(query: Filter, field: Field, release_values: Iterable[FieldValue]) -> Condition:
+    """Check a filter against its field; raise ChoiceError if a value is impossible.
 
-    The field's values in this release are always possible.
+    The values that the field has in this release (`release_values`) are always possible.
     """
     release_words = sorted({str(value) for value in release_values if value is not None})
     possible = list(dict.fromkeys(map(str, [*field.known, *release_words])))
+    named_field = replace(field, name=query.name)  # messages have the name that the user gave
     singles: set[FieldValue] = set()
     ranges = []
     for item in query.values:
         value = item.item() if isinstance(item, np.generic) else item
-        bounds = _parse_range(field, value) if isinstance(value, str) else None
+        bounds = _parse_range(named_field, value) if isinstance(value, str) else None
         if bounds is not None:
             ranges.append(bounds)
         else:
-            singles.add(_parse_value(field, value, possible))
+            singles.add(_parse_value(named_field, value, possible))
     return Condition(field, frozenset(singles), tuple(ranges), query.negated)
 
 
 def _parse_value(field: Field, value: object, possible: list[str]) -> FieldValue:
-    """Return one value of a field, in the field's own type."""
+    """Convert a value to the field's type; raise ChoiceError if it is impossible."""
     if value is None or (isinstance(value, str) and value.lower() in _UNKNOWN_WORDS):
         return None
     if isinstance(value, Collection) and not isinstance(value, str):
@@ -147,15 +146,15 @@ def _parse_value(field: Field, value: object, possible: list[str]) -> FieldValue
     word = _find_word(value, possible) if isinstance(value, str) else None
     if word is not None:
         return word
-    text = value if isinstance(value, str) and len(value) <= _MAX_QUOTED else ""
+    text = value if isinstance(value, str) and len(value) <= _MAX_QUOTE_LENGTH else ""
     raise ChoiceError(
-        f"{field.name}: found {_quote(value)}; possible are {possible_text(text, possible)}"
+        f"{field.name}: expected one of {possible_text(text, possible)}; found {_quote(value)}"
         f"{meant_text(text, possible)}"
     )
 
 
 def _find_word(value: str, possible: Iterable[str]) -> str | None:
-    """Return the possible word of a value, without regard to case, `_`, `-` and blanks."""
+    """Return the possible word that equals `value` but for case, `_`, `-` and blanks, or None."""
     words = {_normalize(word): word for word in possible}
     if value in words.values():
         return value
@@ -183,13 +182,14 @@ def _parse_number(field: Field, value: object) -> float:
         )
     if field.known and number not in field.known:
         raise ChoiceError(
-            f"{field.name}: found {_quote(number)}; possible are {', '.join(map(str, field.known))}"
+            f"{field.name}: expected one of {', '.join(map(str, field.known))}; found "
+            f"{_quote(number)}"
         )
     return number
 
 
 def _read_number(field: Field, digits: str) -> float:
-    """Return the number of a sign and digits."""
+    """Parse a number; raise ChoiceError if the field's numbers are whole and this one is not."""
     if field.kind == "measure":
         return float(digits)
     if "." in digits:
@@ -198,18 +198,18 @@ def _read_number(field: Field, digits: str) -> float:
 
 
 def _quote(value: object) -> str:
-    """Return a wrong value for a message, in full if it is short."""
+    """Quote an invalid value for a message, shortened if it is long."""
     try:
         text = repr(value)
-    except ValueError:  # An int of more than 4300 digits.
-        text = f"{type(value).__name__} of very many digits"
-    if len(text) <= _MAX_QUOTED:
+    except ValueError:  # an int with more than 4300 digits
+        text = f"{type(value).__name__} with very many digits"
+    if len(text) <= _MAX_QUOTE_LENGTH:
         return text
-    return f"{text[:_MAX_QUOTED]}…"
+    return f"{text[:_MAX_QUOTE_LENGTH]}…"
 
 
 def _parse_range(field: Field, text: str) -> tuple[float | None, float | None] | None:
-    """Return the lowest and highest number that a text allows; None if it is no range."""
+    """Parse a range such as `40..60` to its ends (None: no bound); None if it is not a range."""
     text = text.strip()
     bound = _BOUND.fullmatch(text)
     interval = _RANGE.fullmatch(text)
@@ -218,19 +218,21 @@ def _parse_range(field: Field, text: str) -> tuple[float | None, float | None] |
     if bound is not None:
         lowest, highest = _parse_bound(bound[1], _read_number(field, bound[2]))
     elif interval is not None:
-        lowest = _read_number(field, interval[1]) if interval[1] else None
+        lowest = None
+        if interval[1]:
+            lowest = _read_number(field, interval[1])
         highest = _read_number(field, interval[2]) if interval[2] else None
     else:
         return None
     if field.kind not in {"number", "measure"}:
-        raise ChoiceError(f"{field.name}: {_quote(text)} is a range, which only numbers have")
+        raise ChoiceError(f"{field.name}: only numbers have ranges, found {_quote(text)}")
     if lowest is not None and highest is not None and lowest > highest:
-        raise ChoiceError(f"{field.name}: '{text}': {lowest} is more than {highest}")
+        raise ChoiceError(f"{field.name}: '{text}': {lowest} is greater than {highest}; swap them")
     return lowest, highest
 
 
 def _parse_bound(sign: str, number: float) -> tuple[float | None, float | None]:
-    """Return the lowest and highest number, both allowed, of a bound such as `>50`."""
+    """Return the lowest and highest number (None: no bound) that a bound such as `>50` allows."""
     is_lowest = sign.startswith(">")
     if sign in {">", "<"}:
         if isinstance(number, int):

@@ -1,4 +1,4 @@
-"""The paper's statistics of a release, computed on the tables' columns."""
+"""The paper's statistics of a release, computed from table columns."""
 
 from deepaccident_devkit.statistics.compute import dataset_statistics
 from deepaccident_devkit.statistics.real_facts import FACTS, Fact

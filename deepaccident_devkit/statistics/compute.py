@@ -1,16 +1,16 @@
-"""All statistics of a release, or of a selection of its scenarios, computed on table columns."""
+"""All statistics of a release, or of some of its scenarios, computed from table columns."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deepaccident_devkit import taxonomy
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import quaternions
-from deepaccident_devkit.interactions.scenario import least_times
+from deepaccident_devkit.interactions.scenario import min_times_to_collision
 from deepaccident_devkit.statistics.report import DatasetStatistics
 from deepaccident_devkit.statistics.results import (
     CRITICAL,
@@ -39,17 +39,21 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import AgentRecord, ScenarioRecord
 
 ScenarioSelection = RowArgument | Iterable[RowArgument] | None
-"""Tokens or records of scenarios, or a single one; None for all."""
-# The groups that add up to the total; a row's code is an index here, −1 for rows that do not count.
-_SPLIT_GROUPS: Final = GROUPS[1:]
-_EGO: Final = AGENTS[0]
-_SIZES: Final = ("length", "width", "height")
-_ANGLE_BIN_DEG: Final = 30
-# Twelve bins, centred at 0°, 30°, …, 330°.
-_ANGLE_EDGES_DEG: Final = tuple(range(-_ANGLE_BIN_DEG // 2, 360, _ANGLE_BIN_DEG))
-_TTC_EDGES_S: Final = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
-# Table of counts → title, field, words that are always listed, what is counted.
-_SCENARIO_TABLES: Final[Mapping[str, tuple[str, str, Sequence[str], str]]] = {
+"""A token or record of a scenario, or several; None for all."""
+# The groups that add up to the total. A row's code is an index into them; −1 if it is not counted.
+_SPLIT_GROUPS = GROUPS[1:]
+# Name, title, field and unit of a histogram.
+_HistogramNames = tuple[str, str, str, str]
+_ValueTables = tuple[Histogram, QuantileTable]
+_EGO = AGENTS[0]
+_SIZES = ("length", "width", "height")
+# Bin width in degrees, and edges of twelve bins centred at 0°, 30°, …, 330°.
+_ANGLE_BIN_DEG = 30
+_ANGLE_EDGES_DEG = tuple(range(-_ANGLE_BIN_DEG // 2, 360, _ANGLE_BIN_DEG))
+# Edges of the bins of times to collision.
+_TTC_EDGES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
+# Name of a table of counts → title, field, words that are always listed, what is counted.
+_SCENARIO_TABLES: Mapping[str, tuple[str, str, Sequence[str], str]] = {
     "scenario_types": ("Scenario types", "scenario_type", (), "scenarios"),
     "towns": ("Towns", "town", taxonomy.TOWNS, "scenarios"),
     "weathers": ("Weather", "weather", taxonomy.WEATHERS, "scenarios"),
@@ -69,23 +73,23 @@ def dataset_statistics(
     interactions: bool = False,
     **engine: Unpack[Engine],
 ) -> DatasetStatistics:
-    """Compute the paper's statistics on the tables' columns, without any annotation record.
+    """Compute the paper's statistics from table columns, without building annotation records.
 
-    Everything is counted for all scenarios and for each split. Scenarios without labels count where
-    calib, meta and folders are enough; elsewhere a table's `left_out` has their number.
+    Everything is counted for all scenarios and for each split. Scenarios without labels are only
+    counted where calib, meta and folders suffice; other tables state their number in `left_out`.
 
     Args:
         dataset: Release to describe.
-        scenarios: Tokens or records of the only scenarios to count, such as `find` returns, or a
-            single one; None for all.
-        interactions: Whether to add how soon moving pairs would collide (`da.interactions`); takes
-            a tenth of a second a scenario unless these values are cached.
+        scenarios: Tokens or records of the scenarios to count, such as `find` returns, or a single
+            one; None for all.
+        interactions: Whether to add how soon moving pairs would collide (`da.interactions`); this
+            takes 0.1 s per scenario unless it is cached.
         **engine: `workers`, `executor` and `progress` of the interactions (`parallel.Engine`).
 
     Raises:
-        TokenError: A token names no scenario of the release.
-        ChoiceError: `scenarios` has another type, or `workers` is less than 1.
-        WorkerError: A worker was killed, or cannot do the work.
+        TokenError: If a token belongs to no scenario in the release.
+        ChoiceError: If `scenarios` has another type, or `workers` is less than 1.
+        WorkerError: If a worker was killed, or cannot do the work.
     """
     selection = _Selection(dataset, sorted(set(rows_of_scenarios(dataset, scenarios))))
     pairs, pair_histograms = _describe_collisions(selection)
@@ -125,15 +129,25 @@ def dataset_statistics(
 
 
 class _Selection:
-    """The selected scenarios, and a release's columns with the group that each row counts for."""
+    """The selected scenarios, and the release's columns with the group in which each row counts.
+
+    Attributes:
+        dataset: The release.
+        scenarios: Row number → record of each selected scenario.
+        agents: Token of a selected scenario → its agents.
+        scenario_group: Group code of each scenario in the release, int8.
+        labelled_group: Group code of each scenario; −1 for scenarios without labels, int8.
+        ends: Token of a selected scenario → how it ended.
+        unlabelled: Number of selected scenarios without labels.
+    """
 
     def __init__(self, dataset: Dataset, rows: Sequence[int]) -> None:
         self.dataset = dataset
         self._groups: dict[str, AnyArray] = {}
         self.scenarios: dict[int, ScenarioRecord] = {row: dataset.scenario[row] for row in rows}
-        self.agents: dict[str, list[AgentRecord]] = {
-            scenario["token"]: [] for scenario in self.scenarios.values()
-        }
+        self.agents: dict[str, list[AgentRecord]] = {}
+        for scenario in self.scenarios.values():
+            self.agents[scenario["token"]] = []
         for agent in dataset.agent[:]:
             if agent["scenario_token"] in self.agents:
                 self.agents[agent["scenario_token"]].append(agent)
@@ -143,16 +157,18 @@ class _Selection:
             token = scenario["token"]
             self.scenario_group[row] = _SPLIT_GROUPS.index(_split_of(scenario))
             self.ends[token] = scenario_end(scenario, self.agents[token])
-        labelled = np.zeros(len(self.scenario_group), dtype=bool)
-        labelled[self.column("sample", "scenario_row")[self.column("sample", "labelled")]] = True
-        self.labelled_group = np.where(labelled, self.scenario_group, np.int8(-1))
-        unlabelled_group = np.where(labelled, np.int8(-1), self.scenario_group)
+        labelled_samples = self.column("sample", "labelled")
+        labelled_rows = self.column("sample", "scenario_row")[labelled_samples]
+        is_labelled = np.zeros(len(self.scenario_group), dtype=bool)
+        is_labelled[labelled_rows] = True
+        self.labelled_group = np.where(is_labelled, self.scenario_group, np.int8(-1))
+        unlabelled_group = np.where(is_labelled, np.int8(-1), self.scenario_group)
         self.unlabelled = LeftOut(
             what="scenarios without labels", counts=_count_by_group(unlabelled_group)
         )
 
     def column(self, table: str, name: str) -> Any:
-        """Return a stored column, read-only."""
+        """Return a stored column, which is read-only."""
         return self.dataset.columns(table)[name]
 
     def group(self, table: str) -> AnyArray:
@@ -168,12 +184,12 @@ class _Selection:
 
 
 def _split_of(scenario: ScenarioRecord) -> str:
-    """Return the group, besides the total, that a scenario counts for."""
+    """Return the group in which a scenario counts, apart from the total."""
     return scenario["split"] or UNKNOWN_SPLIT
 
 
 def _with_total(counts: AnyArray) -> dict[str, int]:
-    """Return group → count, the total first, of counts by split group."""
+    """Return group → count, with the total first, from the counts by split group."""
     by_group = zip(_SPLIT_GROUPS, counts.tolist(), strict=True)
     return {TOTAL: int(counts.sum()), **dict(by_group)}
 
@@ -181,37 +197,49 @@ def _with_total(counts: AnyArray) -> dict[str, int]:
 def _count_by_group(groups: AnyArray, weights: Iterable[int] | None = None) -> dict[str, int]:
     """Return group → number of rows (N,) with its code, or the sum of their weights."""
     counts = np.zeros(len(_SPLIT_GROUPS), dtype=np.int64)
-    counted = groups >= 0
-    np.add.at(counts, groups[counted], 1 if weights is None else np.asarray(weights)[counted])
+    is_counted = groups >= 0
+    increments: Any = 1
+    if weights is not None:
+        increments = np.asarray(weights)[is_counted]
+    np.add.at(counts, groups[is_counted], increments)
     return _with_total(counts)
 
 
 def _count_by_code(
     words: Sequence[str], codes: AnyArray, groups: AnyArray
 ) -> dict[str, dict[str, int]]:
-    """Return word → group → number of rows (N,) with the word's code."""
-    counted = (codes >= 0) & (groups >= 0)
+    """Return word → group → number of rows (N,) with the code of the word."""
+    is_counted = (codes >= 0) & (groups >= 0)
     num_groups = len(_SPLIT_GROUPS)
-    keys = codes[counted] * np.int16(num_groups) + groups[counted]
+    keys = codes[is_counted] * np.int16(num_groups) + groups[is_counted]
     counts = np.bincount(keys, minlength=len(words) * num_groups)
-    table = counts.reshape(len(words), num_groups)
-    return {word: _with_total(row) for word, row in zip(words, table, strict=True)}
+    rows = counts.reshape(len(words), num_groups)
+    table = {}
+    for word, row in zip(words, rows, strict=True):
+        table[word] = _with_total(row)
+    return table
 
 
 def _make_histogram(
-    names: tuple[str, str, str, str],
+    names: _HistogramNames,
     counted: str,
     values: FloatArray,
     groups: AnyArray,
     edges: Sequence[float],
     left_out: LeftOut | None = None,
 ) -> Histogram:
-    """Return a histogram of values (N,), without NaN and rows of group −1.
+    """Count values (N,) in bins; NaN and rows of group −1 are left out.
 
-    `names` are its name, title, field and unit.
+    Args:
+        names: Name, title, field and unit of the histogram.
+        counted: What is counted.
+        values: Values, shape (N,).
+        groups: Group code of each value, shape (N,).
+        edges: Edges of the bins, ascending.
+        left_out: Items without a value.
     """
     bounds = np.asarray(edges, dtype=np.float64)
-    # Bin 0 holds values under the lowest edge, bin B + 1 values over the highest.
+    # Bin 0 contains values below the lowest edge, bin B + 1 values above the highest.
     bins = np.searchsorted(bounds, values, side="right").astype(np.int8)
     bins[values == bounds[-1]] = len(bounds) - 1
     bins[np.isnan(values)] = -1
@@ -234,36 +262,42 @@ def _make_histogram(
 def _quantile_rows(
     field: str, category: str, values: FloatArray, groups: AnyArray
 ) -> list[QuantileRow]:
-    """Return the quantiles of values (N,) without NaN in every group."""
-    parts = [values[groups == code] for code in range(len(_SPLIT_GROUPS))]
+    """Compute the quantiles of values (N,), ignoring NaN; one row per group."""
+    split_values = [values[groups == code] for code in range(len(_SPLIT_GROUPS))]
+    total_values = np.concatenate(split_values)
     rows = []
-    for group, part in zip(GROUPS, [np.concatenate(parts), *parts], strict=True):
-        quantiles = tuple(np.quantile(part, PROBABILITIES).tolist()) if len(part) else None
-        rows.append(
-            QuantileRow(
-                field=field, category=category, group=group, number=len(part), values=quantiles
-            )
+    for group, group_values in zip(GROUPS, [total_values, *split_values], strict=True):
+        quantiles = None
+        if len(group_values):
+            quantiles = tuple(np.quantile(group_values, PROBABILITIES).tolist())
+        row = QuantileRow(
+            field=field,
+            category=category,
+            group=group,
+            number=len(group_values),
+            values=quantiles,
         )
+        rows.append(row)
     return rows
 
 
 def _count_scenarios(selection: _Selection) -> list[CountTable]:
-    """Return counts of scenarios by each of their words, and of frames by weather and time."""
+    """Count scenarios by each of their attributes, and frames by weather and time."""
     groups = selection.scenario_group[list(selection.scenarios)]
     scenarios = selection.scenarios.values()
     frames = np.array([scenario["num_frames"] for scenario in scenarios], dtype=np.int64)
     tables = []
     for name, (title, field, known_words, counted) in _SCENARIO_TABLES.items():
-        names = [_scenario_word(selection, scenario, field) for scenario in scenarios]
-        words = np.array(names, dtype=np.str_)
-        new_words = sorted({*names} - {*known_words, UNKNOWN_SPLIT})
+        words = [_scenario_word(selection, scenario, field) for scenario in scenarios]
+        new_words = sorted({*words} - {*known_words, UNKNOWN_SPLIT})
         listed_words = [*known_words, *new_words]
-        if UNKNOWN_SPLIT in names:
+        if UNKNOWN_SPLIT in words:
             listed_words.append(UNKNOWN_SPLIT)
+        word_array = np.array(words, dtype=np.str_)
         weights = frames if counted == "frames" else np.ones_like(frames)
         counts = {}
         for word in listed_words:
-            rows = np.flatnonzero(words == word)
+            rows = np.flatnonzero(word_array == word)
             counts[word] = _count_by_group(groups[rows], weights[rows])
         table = CountTable(name=name, title=title, field=field, counted=counted, counts=counts)
         tables.append(table)
@@ -271,25 +305,31 @@ def _count_scenarios(selection: _Selection) -> list[CountTable]:
 
 
 def _scenario_word(selection: _Selection, scenario: ScenarioRecord, field: str) -> str:
-    """Return the word that a scenario counts under in the table of a field."""
+    """Return the word under which a scenario is counted in the table of a field."""
     if field == "end":
         return selection.ends[scenario["token"]] or UNKNOWN_SPLIT
     return word_of(scenario, field) or UNKNOWN_SPLIT
 
 
 def _count_actors(selection: _Selection) -> list[CountTable]:
-    """Return counts of instances, of parked instances and of annotations, by category."""
+    """Count instances, parked instances and annotations by category."""
     category = selection.column("instance", "category")
     group = selection.group("instance")
-    parked = selection.column("instance", "actor_id") >= STATIC_ACTOR_ID
-    annotated = selection.column("annotation", "category"), selection.group("annotation")
-    rows_by_name = {
-        "instances": ("Instances", "instances", category, group),
-        "parked_instances": ("Parked instances", "instances", category[parked], group[parked]),
-        "annotations": ("Annotations", "annotations", *annotated),
-    }
+    is_parked = selection.column("instance", "actor_id") >= STATIC_ACTOR_ID
+    box_category = selection.column("annotation", "category")
+    box_group = selection.group("annotation")
     tables = []
-    for name, (title, counted, codes, groups) in rows_by_name.items():
+    for name, title, counted, codes, groups in (
+        ("instances", "Instances", "instances", category, group),
+        (
+            "parked_instances",
+            "Parked instances",
+            "instances",
+            category[is_parked],
+            group[is_parked],
+        ),
+        ("annotations", "Annotations", "annotations", box_category, box_group),
+    ):
         table = CountTable(
             name=name,
             title=title,
@@ -303,7 +343,7 @@ def _count_actors(selection: _Selection) -> list[CountTable]:
 
 
 def _bin_lengths(selection: _Selection) -> Histogram:
-    """Return the histogram of recorded frames a scenario; meta's simulated ones are ten more."""
+    """Make the histogram of recorded frames per scenario (ten fewer than in the meta file)."""
     scenarios = selection.scenarios.values()
     lengths = np.array([scenario["num_frames"] for scenario in scenarios], dtype=np.float64)
     groups = selection.scenario_group[list(selection.scenarios)]
@@ -312,19 +352,21 @@ def _bin_lengths(selection: _Selection) -> Histogram:
 
 
 def _bin_ego_speeds(selection: _Selection) -> Histogram:
-    """Return the histogram of the ego's speeds at its samples, from the labels' first lines."""
-    ego = selection.column("sample", "agent") == AGENTS.index(_EGO)
-    speeds = np.linalg.norm(selection.column("sample", "velocity")[ego], axis=1)
-    groups = selection.group("sample")[ego]
+    """Make the histogram of the ego's speed in its samples, from the labels' first lines."""
+    is_ego = selection.column("sample", "agent") == AGENTS.index(_EGO)
+    velocities = selection.column("sample", "velocity")[is_ego]
+    speeds = np.linalg.norm(velocities, axis=1)
+    groups = selection.group("sample")[is_ego]
+    is_unknown = ~np.isfinite(speeds)
     left_out = LeftOut(
-        what="ego samples without a label", counts=_count_by_group(groups[~np.isfinite(speeds)])
+        what="ego samples without a label", counts=_count_by_group(groups[is_unknown])
     )
     names = ("ego_speeds", "Speed of the ego vehicle", "speed", "m/s")
     return _make_histogram(names, "ego samples", speeds, groups, tuple(range(21)), left_out)
 
 
 def _bin_actors(selection: _Selection) -> Histogram:
-    """Return the histogram of actors (instances) a labelled scenario."""
+    """Make the histogram of actors (instances) per labelled scenario."""
     scenario_rows = selection.column("instance", "scenario_row")
     numbers = np.bincount(scenario_rows, minlength=len(selection.scenario_group)).astype(float)
     names = ("actors", "Actors a scenario", "actors", "actors")
@@ -335,17 +377,17 @@ def _bin_actors(selection: _Selection) -> Histogram:
 
 
 def _ego_size_quantiles(selection: _Selection) -> QuantileTable:
-    """Return quantiles of the size of `ego_vehicle`, once a scenario, from its own label row."""
-    ego = selection.column("agent", "name") == AGENTS.index(_EGO)
-    sizes = selection.column("agent", "size")[ego]
-    groups = selection.group("agent")[ego]
-    known = ~np.isnan(sizes).any(axis=1)
+    """Compute quantiles of the ego's size, from its own label row, once per scenario."""
+    is_ego = selection.column("agent", "name") == AGENTS.index(_EGO)
+    sizes = selection.column("agent", "size")[is_ego]
+    groups = selection.group("agent")[is_ego]
+    is_known = ~np.isnan(sizes).any(axis=1)
     rows: list[QuantileRow] = []
     for axis, field in enumerate(_SIZES):
-        rows += _quantile_rows(field, _EGO, sizes[known, axis], groups[known])
+        rows += _quantile_rows(field, _EGO, sizes[is_known, axis], groups[is_known])
     left_out = LeftOut(
         what="scenarios whose ego has no label row of its own",
-        counts=_count_by_group(groups[~known]),
+        counts=_count_by_group(groups[~is_known]),
     )
     return QuantileTable(
         name="ego_sizes",
@@ -358,7 +400,7 @@ def _ego_size_quantiles(selection: _Selection) -> QuantileTable:
 
 
 def _box_size_quantiles(selection: _Selection) -> QuantileTable:
-    """Return quantiles of length, width and height of all annotations, by category."""
+    """Compute quantiles of length, width and height over all annotations, by category."""
     categories = selection.column("annotation", "category")
     sizes = selection.column("annotation", "size")
     groups = selection.group("annotation")
@@ -377,8 +419,8 @@ def _box_size_quantiles(selection: _Selection) -> QuantileTable:
     )
 
 
-def _describe_distances(selection: _Selection) -> tuple[Histogram, QuantileTable]:
-    """Return horizontal distances of annotations from their agent's LiDAR, without its own box."""
+def _describe_distances(selection: _Selection) -> _ValueTables:
+    """Describe annotations' horizontal distances from their agent's LiDAR, except its own box."""
     x, y = selection.column("annotation", "translation")[:, :2].T
     is_own = selection.column("annotation", "actor_id") == OWN_ACTOR_ID
     groups = np.where(is_own, np.int8(-1), selection.group("annotation"))
@@ -388,20 +430,21 @@ def _describe_distances(selection: _Selection) -> tuple[Histogram, QuantileTable
     return _describe_values(names, binning, np.hypot(x, y), categories, groups)
 
 
-def _describe_speeds(selection: _Selection) -> tuple[Histogram, QuantileTable]:
-    """Return horizontal speeds of moving traffic, once an actor and frame, as labels have them.
+def _describe_speeds(selection: _Selection) -> _ValueTables:
+    """Describe the labelled horizontal speeds of moving traffic, once per actor and frame.
 
     Parked actors are left out.
     """
-    parked_instances = selection.column("instance", "actor_id") >= STATIC_ACTOR_ID
+    is_parked_instance = selection.column("instance", "actor_id") >= STATIC_ACTOR_ID
+    is_parked = is_parked_instance[selection.column("track", "instance_row")]
+    groups = np.where(is_parked, np.int8(-1), selection.group("track"))
     x, y = selection.column("track", "velocity")[:, :2].T
     speeds = np.hypot(x, y)
-    is_parked = parked_instances[selection.column("track", "instance_row")]
-    groups = np.where(is_parked, np.int8(-1), selection.group("track"))
+    is_unknown = ~np.isfinite(speeds)
     left_out = LeftOut(
         what="moments of actors whose label has no velocity, and that no agent saw in the frame"
         " before or after",
-        counts=_count_by_group(groups[~np.isfinite(speeds)]),
+        counts=_count_by_group(groups[is_unknown]),
     )
     names = ("speeds", "Speed of actors that are not parked", "speed", "m/s")
     binning = ("moments of actors", tuple(range(21)), left_out)
@@ -410,22 +453,27 @@ def _describe_speeds(selection: _Selection) -> tuple[Histogram, QuantileTable]:
 
 
 def _describe_values(
-    names: tuple[str, str, str, str],
+    names: _HistogramNames,
     binning: tuple[str, tuple[int, ...], LeftOut],
     values: FloatArray,
     categories: AnyArray,
     groups: AnyArray,
-) -> tuple[Histogram, QuantileTable]:
-    """Return the histogram of values (N,) over all categories and their quantiles by category.
+) -> _ValueTables:
+    """Return the histogram of values (N,) over all categories, and quantiles by category.
 
-    `binning` is what is counted, the edges and what is left out.
+    Args:
+        names: Name, title, field and unit.
+        binning: What is counted, the edges of the bins, and what is left out.
+        values: Values, shape (N,).
+        categories: Category code of each value, shape (N,).
+        groups: Group code of each value, shape (N,).
     """
     _, title, field, unit = names
     counted, edges, left_out = binning
-    known: BoolArray = np.isfinite(values) & (groups >= 0)
+    is_known: BoolArray = np.isfinite(values) & (groups >= 0)
     rows: list[QuantileRow] = []
     for code, category in enumerate(CATEGORIES):
-        indices = np.flatnonzero(known & (categories == code))
+        indices = np.flatnonzero(is_known & (categories == code))
         rows += _quantile_rows(field, category, values[indices], groups[indices])
     quantiles = QuantileTable(
         name=f"{field}_quantiles",
@@ -439,20 +487,23 @@ def _describe_values(
 
 
 def _bin_interactions(selection: _Selection, **engine: Unpack[Engine]) -> list[Histogram]:
-    """Return the least time to collision of pairs, and of scenarios.
+    """Make histograms of the smallest time to collision, of each pair and of each scenario.
 
-    Both actors of a pair move at some frame.
+    Only pairs in which both actors move at some time are counted.
     """
-    pair_times = least_times(selection.dataset, list(selection.scenarios.values()), **engine)
-    scenario_codes = selection.scenario_group[list(selection.scenarios)]
-    pair_codes = np.repeat(scenario_codes, [len(times) for times in pair_times])
+    pair_times = min_times_to_collision(
+        selection.dataset, list(selection.scenarios.values()), **engine
+    )
+    num_pairs = [len(times) for times in pair_times]
     scenario_times = np.array([times.min(initial=np.inf) for times in pair_times])
+    scenario_codes = selection.scenario_group[list(selection.scenarios)]
+    pair_codes = np.repeat(scenario_codes, num_pairs)
     return [
         _bin_times(
             ("pair_min_ttcs", "Least TTC of moving pairs", "pairs"),
             np.concatenate([np.zeros(0), *pair_times]),
             pair_codes,
-            "moving pairs that come near each other on no collision course",
+            "moving pairs that come near each other, but not on a collision course",
         ),
         _bin_times(
             (CRITICAL, "Least TTC of scenarios", "scenarios"),
@@ -466,24 +517,28 @@ def _bin_interactions(selection: _Selection, **engine: Unpack[Engine]) -> list[H
 def _bin_times(
     texts: tuple[str, str, str], times: FloatArray, groups: AnyArray, without_time: str
 ) -> Histogram:
-    """Return the histogram of least times to collision (N,), inf where there is no collision.
+    """Make the histogram of smallest times to collision (N,) in seconds.
 
-    `texts` are its name, its title and what is counted.
+    Args:
+        texts: Name, title and what is counted.
+        times: Times in seconds, shape (N,); inf where there is no collision.
+        groups: Group code of each time, shape (N,).
+        without_time: Text for what has no time.
     """
     name, title, counted = texts
-    known = np.isfinite(times)
-    left_out = LeftOut(what=without_time, counts=_count_by_group(groups[~known]))
+    is_known = np.isfinite(times)
+    known_times = np.where(is_known, times, np.nan)
+    left_out = LeftOut(what=without_time, counts=_count_by_group(groups[~is_known]))
     names = (name, title, "least time to collision", "s")
-    finite_times = np.where(known, times, np.nan)
-    return _make_histogram(names, counted, finite_times, groups, _TTC_EDGES_S, left_out)
+    return _make_histogram(names, counted, known_times, groups, _TTC_EDGES_S, left_out)
 
 
 def _describe_collisions(
     selection: _Selection,
 ) -> tuple[tuple[CollisionPair, ...], list[Histogram]]:
-    """Return the pairs labelled at the last frame, and the histograms of how they meet.
+    """Return the pairs labelled in the last frame, and histograms of how their actors meet.
 
-    One actor that meta names twice is no pair.
+    If meta names the same actor twice, that is not a pair.
     """
     tracks = _find_last_tracks(selection)
     pairs = []
@@ -491,12 +546,14 @@ def _describe_collisions(
     for row, scenario in selection.scenarios.items():
         if scenario["collision"] is None:
             continue
-        names = {agent["actor_id"]: agent["name"] for agent in selection.agents[scenario["token"]]}
-        ids = _sort_agents_first(scenario["collision"]["ids"], names)
+        agents = selection.agents[scenario["token"]]
+        agents_by_id = {agent["actor_id"]: agent["name"] for agent in agents}
+        ids = _sort_agents_first(scenario["collision"]["ids"], agents_by_id)
         track_rows = tracks.get(row, {})
         if len(set(ids)) == len(ids) and set(ids) <= set(track_rows):
             pair_rows = [track_rows[actor] for actor in ids]
-            pairs.append(_make_pair(selection, scenario, pair_rows, list(map(names.get, ids))))
+            names = [agents_by_id.get(actor) for actor in ids]
+            pairs.append(_make_pair(selection, scenario, pair_rows, names))
         else:
             unpaired_groups.append(selection.scenario_group[row])
     left_out = LeftOut(
@@ -507,25 +564,26 @@ def _describe_collisions(
 
 
 def _bin_angles(pairs: Sequence[CollisionPair], left_out: LeftOut) -> list[Histogram]:
-    """Return the histograms of collision angles and of the other actor's bearings, degrees."""
+    """Make the histograms of collision angles and of the other actor's bearing, in degrees."""
     groups = np.array([_SPLIT_GROUPS.index(pair.split) for pair in pairs], dtype=np.int8)
-    angles = np.empty(len(pairs))
+    angles = np.array([pair.angle for pair in pairs])
     bearings = np.empty(len(pairs))
     for index, pair in enumerate(pairs):
-        angles[index] = pair.angle
-        bearings[index] = _wrap_angle(np.degrees(np.arctan2(pair.y, pair.x)))
-    values = {
-        ("collision_angles", "Collision angle", "angle", "°"): angles,
-        ("collision_bearings", "Bearing of the other", "bearing", "°"): bearings,
-    }
-    return [
-        _make_histogram(names, "collisions", degrees, groups, _ANGLE_EDGES_DEG, left_out)
-        for names, degrees in values.items()
-    ]
+        bearing = np.degrees(np.arctan2(pair.y, pair.x))
+        bearings[index] = _wrap_angle(bearing)
+    histograms = []
+    for names, degrees in (
+        (("collision_angles", "Collision angle", "angle", "°"), angles),
+        (("collision_bearings", "Bearing of the other", "bearing", "°"), bearings),
+    ):
+        histograms.append(
+            _make_histogram(names, "collisions", degrees, groups, _ANGLE_EDGES_DEG, left_out)
+        )
+    return histograms
 
 
 def _find_last_tracks(selection: _Selection) -> dict[int, dict[int, int]]:
-    """Return scenario row → actor id → track row of colliders at the scenario's last frame."""
+    """Return the colliders' track rows in the last frame: scenario row → actor id → track row."""
     is_last = np.zeros(len(selection.column("frame", "index")), dtype=bool)
     is_last[selection.column("scenario", "last_frame_row")] = True
     is_last_track = is_last[selection.column("track", "frame_row")]
@@ -543,14 +601,14 @@ def _find_last_tracks(selection: _Selection) -> dict[int, dict[int, int]]:
 def _make_pair(
     selection: _Selection,
     scenario: ScenarioRecord,
-    tracks: Sequence[int],
-    names: Sequence[str | None],
+    track_rows: Sequence[int],
+    agent_names: Sequence[str | None],
 ) -> CollisionPair:
-    """Return the pair of two track rows, seen from the first of them."""
-    rotations = selection.column("track", "rotation")[list(tracks)]
+    """Build the pair from two track rows; angle and position are relative to the first actor."""
+    rotations = selection.column("track", "rotation")[list(track_rows)]
     actor_yaw, other_yaw = quaternions.yaw_of(rotations).tolist()
     centers = selection.column("track", "translation")
-    x, y, _ = centers[tracks[1]] - centers[tracks[0]]
+    x, y, _ = centers[track_rows[1]] - centers[track_rows[0]]
     cosine = np.cos(actor_yaw)
     sine = np.sin(actor_yaw)
     codes = selection.column("track", "category")
@@ -558,10 +616,10 @@ def _make_pair(
         scenario=scenario["token"],
         split=_split_of(scenario),
         end=selection.ends[scenario["token"]] or UNKNOWN_SPLIT,
-        actor=names[0],
-        category=CATEGORIES[codes.item(tracks[0])],
-        other=names[1],
-        other_category=CATEGORIES[codes.item(tracks[1])],
+        actor=agent_names[0],
+        category=CATEGORIES[codes.item(track_rows[0])],
+        other=agent_names[1],
+        other_category=CATEGORIES[codes.item(track_rows[1])],
         angle=_wrap_angle(np.degrees(other_yaw - actor_yaw)),
         x=float(cosine * x + sine * y),
         y=float(cosine * y - sine * x),
@@ -569,12 +627,13 @@ def _make_pair(
 
 
 def _wrap_angle(degrees: float) -> float:
-    """Return the angle in [−15, 345) degrees."""
-    return float((degrees + _ANGLE_BIN_DEG / 2) % 360 - _ANGLE_BIN_DEG / 2)
+    """Wrap an angle to [−15, 345) degrees."""
+    half_bin = _ANGLE_BIN_DEG / 2
+    return float((degrees + half_bin) % 360 - half_bin)
 
 
 def _sort_agents_first(ids: Sequence[int], names: Mapping[int | None, str]) -> list[int]:
-    """Return a pair's actor ids, agents first in the order of `AGENTS`, others in their order."""
+    """Sort two actor ids: agents in the order of `AGENTS`, then other actors as passed."""
     ranks: dict[str | None, int] = {name: rank for rank, name in enumerate(AGENTS)}
 
     def rank(actor: int) -> int:

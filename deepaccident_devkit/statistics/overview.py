@@ -1,4 +1,4 @@
-"""Counts of what a release holds, behind `deepaccident info` and the facade's `list_*` methods."""
+"""Counts of a release's content, for `deepaccident info` and the `list_*` methods."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ from deepaccident_devkit.taxonomy import (
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
+# Name → count.
+Counts = Mapping[str, int]
 _UNKNOWN = "unknown"
-# Whether a scenario has a collision → its words in a scenario's line.
+# Whether a scenario has a collision → the wording in the scenario's line.
 _ENDS = {"true": "collision", "false": "no collision", _UNKNOWN: "collision unknown"}
 
 
@@ -33,20 +35,22 @@ class Overview(Report):
 
     Attributes:
         dataroot: Folder of the release.
-        version: `v1` or `v1-mini`; of nuScenes such as `v1.0-mini`.
+        version: `v1` or `v1-mini`; for nuScenes, a name such as `v1.0-mini`.
         layout: `A`, `B` or `A+B`; or `nuScenes`.
         index: Folder of the index's tables.
-        tables: Table → rows.
-        splits: Split → scenarios present; `unknown` for scenarios without a known split.
-        expected: Split (or the version, for mini) → scenarios of the complete release; empty for
-            nuScenes.
-        agents: Agent → scenarios that have it.
-        labelled: Agent → scenarios in which it has labels.
-        channels: Channel → recordings (scenario and agent) that have files of it.
-        files: Channel → files of these recordings.
+        tables: Table → number of rows.
+        splits: Split → number of scenarios present; `unknown` for scenarios of no known split.
+        expected: Split (or the version, for mini) → number of scenarios in the complete release;
+            empty for nuScenes.
+        agents: Agent → number of scenarios that contain it.
+        labelled: Agent → number of scenarios in which it has labels.
+        channels: Channel → number of recordings (scenario and agent) that contain files of it.
+        files: Channel → number of files in these recordings.
         recordings: Number of all recordings.
-        samples: Number of their samples: the files that each channel of a complete release has.
-        attributes: Field → value → scenarios; of `collision` true, false and unknown.
+        samples: Number of their samples, which is the number of files per channel in a complete
+            release.
+        attributes: Field → value → number of scenarios; the values of `collision` are true, false
+            and unknown.
         left_out: Tokens of broken scenarios that were skipped.
     """
 
@@ -54,20 +58,20 @@ class Overview(Report):
     version: str
     layout: str
     index: str
-    tables: Mapping[str, int]
-    splits: Mapping[str, int]
-    expected: Mapping[str, int]
-    agents: Mapping[str, int]
-    labelled: Mapping[str, int]
-    channels: Mapping[str, int]
-    files: Mapping[str, int]
+    tables: Counts
+    splits: Counts
+    expected: Counts
+    agents: Counts
+    labelled: Counts
+    channels: Counts
+    files: Counts
     recordings: int
     samples: int
-    attributes: Mapping[str, Mapping[str, int]]
+    attributes: Mapping[str, Counts]
     left_out: Sequence[str]
 
     def to_text(self) -> str:
-        """Return a few aligned blocks for a terminal."""
+        """Return the counts as aligned blocks for a terminal."""
         head = f"DeepAccident {self.version} at {self.dataroot} (layout {self.layout})"
         blocks = [f"{head}\nindex: {self.index}"]
         tables = [(name, f"{rows:,}") for name, rows in self.tables.items()]
@@ -84,26 +88,27 @@ class Overview(Report):
             blocks.append(table_text(field, "scenarios", values))
         if self.left_out:
             tokens = "\n".join(f"  {token}" for token in self.left_out)
-            blocks.append(f"left out as broken:\n{tokens}")
+            blocks.append(f"excluded as broken:\n{tokens}")
         return "\n\n".join(blocks)
 
     def _split_rows(self) -> list[tuple[str, str]]:
-        """Return each split with its scenarios, present and expected."""
-        if set(self.expected) != set(SPLITS):
-            scenarios = self.tables["scenario"]
-            present = [(name, str(count)) for name, count in self.splits.items()]
-            return present + [
-                (name, f"{scenarios} of {count}") for name, count in self.expected.items()
-            ]
+        """Return a row per split: its name, and how many scenarios are present and expected."""
         rows = []
+        is_split_release = set(self.expected) == set(SPLITS)
         for name, count in self.splits.items():
-            of_expected = f" of {self.expected[name]}" if name in self.expected else ""
+            of_expected = ""
+            if is_split_release and name in self.expected:
+                of_expected = f" of {self.expected[name]}"
             rows.append((name, f"{count}{of_expected}"))
+        if not is_split_release:
+            scenarios = self.tables["scenario"]
+            for name, count in self.expected.items():
+                rows.append((name, f"{scenarios} of {count}"))
         return rows
 
 
 def overview(dataset: Dataset) -> Overview:
-    """Count what a release holds."""
+    """Count what a release contains."""
     scenarios = dataset.scenario[:]
     agents = dataset.agent[:]
     split_counts = Counter(scenario["split"] or _UNKNOWN for scenario in scenarios)
@@ -117,10 +122,15 @@ def overview(dataset: Dataset) -> Overview:
         if dataset.get("sample", agent["first_sample_token"])["labelled"]:
             labelled_counts[agent["name"]] += 1
     expected = {"v1": EXPECTED_SCENARIOS, "v1-mini": {"v1-mini": EXPECTED_MINI_SCENARIOS}}
-    files = _channel_files(dataset, scenarios)
-    attributes = {"collision": _count_values(map(_collides, scenarios))}
+    channels = Counter[str]()
+    files = Counter[str]()
+    for scenario in scenarios:
+        for (_, channel), frames in dataset.sensor_frames(scenario).items():
+            channels[channel] += len(frames) > 0
+            files[channel] += len(frames)
+    attributes = {"collision": _count_by_word(map(_collides, scenarios))}
     for field in SCENARIO_ATTRIBUTES:
-        attributes[field] = _count_values(scenario[field] for scenario in scenarios)
+        attributes[field] = _count_by_word(scenario[field] for scenario in scenarios)
     return Overview(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
@@ -131,8 +141,8 @@ def overview(dataset: Dataset) -> Overview:
         expected=expected.get(dataset.version, {}),
         agents={name: agent_counts[name] for name in AGENTS},
         labelled={name: labelled_counts[name] for name in AGENTS},
-        channels={channel: sum(count > 0 for count in counts) for channel, counts in files.items()},
-        files={channel: sum(counts) for channel, counts in files.items()},
+        channels={channel: channels[channel] for channel in CHANNELS},
+        files={channel: files[channel] for channel in CHANNELS},
         recordings=len(agents),
         samples=len(dataset.sample),
         attributes=attributes,
@@ -141,7 +151,7 @@ def overview(dataset: Dataset) -> Overview:
 
 
 def scenario_lines(scenarios: Iterable[ScenarioRecord]) -> list[str]:
-    """Return a line a scenario: token, frames, split, weather and how it ended."""
+    """Return a line per scenario: token, frames, split, weather and how it ended."""
     lines = []
     for scenario in scenarios:
         end = _ENDS[_collides(scenario)]
@@ -154,29 +164,38 @@ def scenario_lines(scenarios: Iterable[ScenarioRecord]) -> list[str]:
 
 
 def agent_lines(dataset: Dataset) -> list[str]:
-    """Return a line for each agent name, with the number of its scenarios."""
+    """Return a line per agent name, with the number of scenarios that contain it."""
     counts = Counter(agent["name"] for agent in dataset.agent)
-    return [f"{name}  {counted(counts[name], 'scenario')}" for name in AGENTS]
+    lines = []
+    for name in AGENTS:
+        scenarios = counted(counts[name], "scenario")
+        lines.append(f"{name}  {scenarios}")
+    return lines
 
 
 def category_lines(dataset: Dataset) -> list[str]:
-    """Return a line a category: index, name, instances, annotations."""
+    """Return a line per category: index, name, instances, annotations."""
     annotations = Counter(dataset.arrow("annotation")["category"].combine_chunks().to_pylist())
     instances = Counter(dataset.arrow("instance")["category"].combine_chunks().to_pylist())
-    return [
-        f"{record['index']}  {record['name']}  {instances[record['name']]:,} instances  "
-        f"{annotations[record['name']]:,} annotations"
-        for record in dataset.category
-    ]
+    lines = []
+    for record in dataset.category:
+        name = record["name"]
+        lines.append(
+            f"{record['index']}  {name}  {instances[name]:,} instances  "
+            f"{annotations[name]:,} annotations"
+        )
+    return lines
 
 
 def sample_lines(dataset: Dataset, sample: RowArgument) -> list[str]:
-    """Return lines of a sample: its time, then each file and each box."""
+    """Describe a sample in lines: its time, then each file, then each box."""
     record = dataset.get("sample", sample)
     lines = [f"sample {record['token']}, t = {record['timestamp']:.1f} s"]
     for channel in CHANNELS:
         path = dataset.sensor_path(f"{record['token']}/{channel}")
-        note = "" if path.is_file() else "  (not here)"
+        note = ""
+        if not path.is_file():
+            note = "  (not here)"
         lines.append(f"  {path}{note}")
     for box in dataset.get_boxes(record, "lidar"):
         lines.append(f"  {box.token}: {box}")
@@ -184,25 +203,20 @@ def sample_lines(dataset: Dataset, sample: RowArgument) -> list[str]:
 
 
 def table_text(name: str, value: str, rows: Sequence[tuple[str, str]]) -> str:
-    """Return two aligned columns under their headings."""
+    """Format rows as two aligned columns with headings."""
     return columns_text([(name, value), *rows])
 
 
 def _collides(scenario: ScenarioRecord) -> str:
-    if scenario["weather"] is None:  # The scenario has no meta.
+    if scenario["weather"] is None:  # the scenario has no meta file
         return _UNKNOWN
     return "true" if scenario["collision"] else "false"
 
 
-def _count_values(values: Iterable[object]) -> dict[str, int]:
-    counts = Counter("none" if value is None else str(value) for value in values)
-    return {word: counts[word] for word in sorted(counts, key=natural_order)}
-
-
-def _channel_files(dataset: Dataset, scenarios: Sequence[ScenarioRecord]) -> dict[str, list[int]]:
-    """Return channel → number of files of each recording; `validate` also reads their content."""
-    counts: dict[str, list[int]] = {channel: [] for channel in CHANNELS}
-    for scenario in scenarios:
-        for (_, channel), frames in dataset.sensor_frames(scenario).items():
-            counts[channel].append(len(frames))
-    return counts
+def _count_by_word(values: Iterable[object]) -> dict[str, int]:
+    counts = Counter[str]()
+    for value in values:
+        word = "none" if value is None else str(value)
+        counts[word] += 1
+    words = sorted(counts, key=natural_order)
+    return {word: counts[word] for word in words}

@@ -1,9 +1,7 @@
-"""Facts measured on the real release, and assumptions of our readers, behind `info --facts`.
+"""Facts measured on the real release, and assumptions of our readers, for `info --facts`.
 
-docs/validation.md, Facts of the real release, defines the rows.
+`release_facts` defines the rows.
 """
-
-from __future__ import annotations
 
 import json
 from collections.abc import Sequence
@@ -20,34 +18,35 @@ FactKind = Literal[
 ]
 """How a fact is compared.
 
-`all`, `some` and `share` are shares: always, sometimes, or a number. `few` are percentiles where
-there are few real cases, `most` and `least` extremes, `area` an AUC, and `range` a median that
-lies in a range.
+`all`, `some` and `share` are shares: always, sometimes, or a certain fraction. `few` are
+percentiles of few real cases. `most` and `least` are extremes. `area` is an AUC. `range` is a
+median that lies in a range.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Fact(ShortRepr):
-    """One fact and, once a release was examined, the release's value of it. Shares are from 0 to 1.
+    """A fact about the real release, and its value in an examined release; shares are in 0..1.
 
     Attributes:
         key: Key in `ScenarioFacts.values`.
         name: Description.
-        kind: How it is compared.
+        kind: How the fact is compared.
         confidence: `A`: several sources, or recomputed; `B`: one source; `C`: a remark; empty for
             an assumption of our readers.
         source: Part of the real release that was measured; empty for an assumption of our readers.
-        real_cases: Number of real cases; 0 where unknown.
-        real: Published values: one number, of `few` at least one, none of `all`, `some` and
+        real_cases: Number of real cases; 0 if unknown.
+        real: Published values: one number, or at least one for `few`; empty for `all`, `some` and
             `range`.
         unit: Unit of the numbers; `share` for shares.
-        limits: Lowest and highest value that agrees, of all kinds but `share`, `mean`, `median` and
+        limits: Lowest and highest value that agrees; unused for `share`, `mean`, `median` and
             `few`.
-        here: The release's share, mean, median, most, least or AUC; None where it has none.
-        ends: Ends of its 95 % interval, or 5th and 95th percentile of `few`; None without a value.
-        cases: Number of cases in the release.
+        here: The examined release's share, mean, median, maximum, minimum or AUC; None if it has no
+            cases.
+        ends: Ends of its 95 % interval, or 5th and 95th percentile for `few`; None without a value.
+        cases: Number of cases in the examined release.
         scenarios: Number of scenarios with a case.
-        verdict: Whether the release agrees.
+        verdict: Whether the examined release agrees.
     """
 
     key: str
@@ -66,25 +65,40 @@ class Fact(ShortRepr):
     verdict: FactVerdict = "cannot say"
 
     def texts(self) -> tuple[str, ...]:
-        """Return a table's cells: fact, confidence, others, here, cases, verdict."""
-        words = {"all": "always", "some": "occurs", "range": _text(self.limits, self.unit, " to ")}
-        published = words.get(self.kind) or _text(self.real, self.unit)
+        """Return the row's cells: fact, confidence, real values, value here, cases, verdict."""
+        if self.kind == "all":
+            published = "always"
+        elif self.kind == "some":
+            published = "occurs"
+        elif self.kind == "range":
+            published = _format_numbers(self.limits, self.unit, " to ")
+        else:
+            published = _format_numbers(self.real, self.unit)
         if self.source:
-            cases = f", {self.real_cases:,}" if self.real_cases else ""
+            cases = ""
+            if self.real_cases:
+                cases = f", {self.real_cases:,}"
             published += f" ({self.source}{cases})"
-        value = "–" if self.here is None else _text([self.here], self.unit)
-        if len({self.here, *(self.ends or ())}) > 1:
-            value += f" [{_text(self.ends or (), self.unit, ' … ')}]"
+        value = "–"
+        if self.here is not None:
+            value = _format_numbers([self.here], self.unit)
+        ends = self.ends or ()
+        if len({self.here, *ends}) > 1:
+            value += f" [{_format_numbers(ends, self.unit, ' … ')}]"
         return (self.name, self.confidence, published, value, f"{self.cases:,}", self.verdict)
 
 
-def _text(values: Sequence[float], unit: str, separator: str = ", ") -> str:
-    scale, sign = (100, "%") if unit == "share" else (1, unit)
+def _format_numbers(values: Sequence[float], unit: str, separator: str = ", ") -> str:
+    """Format numbers with their unit; shares are formatted in per cent."""
+    scale = 1
+    if unit == "share":
+        scale = 100
+        unit = "%"
     numbers = separator.join(f"{scale * value:.3g}" for value in values)
-    return f"{numbers} {sign}".rstrip()
+    return f"{numbers} {unit}".rstrip()
 
 
 FACTS: Final[tuple[Fact, ...]] = as_record(
     json.loads(Path(__file__).with_suffix(".json").read_bytes()), tuple[Fact, ...]
 )
-"""All rows of the table, in its order, from `real_facts.json`."""
+"""All rows of the table in order, read from `real_facts.json`."""

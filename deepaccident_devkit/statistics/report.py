@@ -1,6 +1,4 @@
-"""All statistics of a release in one value, and its forms: JSON, CSV, text."""
-
-from __future__ import annotations
+"""All statistics of a release in one object, which can be written as JSON, CSV and text."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -19,31 +17,32 @@ from deepaccident_devkit.statistics.results import (
     StatisticsTable,
     collision_rows,
 )
+from deepaccident_devkit.support.human_names import human_name
 from deepaccident_devkit.support.reports import Report
-from deepaccident_devkit.support.text import columns_text, number_text, share_text
+from deepaccident_devkit.support.text import columns_text, counted, number_text, share_text
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-# Edges of the histogram of least times to collision.
+# Edges of the histogram of smallest times to collision.
 _TTC_LIMITS_S = (0.5, 1.0, 1.5, 3.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetStatistics(Report):
-    """The statistics of a release, or of a selection of its scenarios; groups are from `GROUPS`.
+    """The statistics of a release, or of some of its scenarios; the groups are `GROUPS`.
 
     Attributes:
         dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        release_scenarios: Number of scenarios of the release, selected or not.
-        selected: Whether the statistics cover a selection of scenarios.
-        scenarios: Group → scenarios.
-        frames: Group → frames.
-        samples: Group → samples (an agent at a moment).
-        unlabelled: Group → scenarios without labels, which count only where labels are not needed.
+        release_scenarios: Number of scenarios in the release, selected or not.
+        selected: Whether the statistics cover only selected scenarios.
+        scenarios: Group → number of scenarios.
+        frames: Group → number of frames.
+        samples: Group → number of samples (one agent in one frame).
+        unlabelled: Group → number of scenarios without labels, counted only where none are needed.
         counts: Name → table of counts.
         histograms: Name → histogram.
         quantiles: Name → table of quantiles.
-        collisions: Colliding pairs at the last frame.
+        collisions: Colliding pairs in the last frame.
     """
 
     dataroot: str
@@ -64,11 +63,12 @@ class DatasetStatistics(Report):
         """All tables: counts, histograms, quantiles."""
         counts = self.counts.values()
         histograms = self.histograms.values()
-        return (*counts, *histograms, *self.quantiles.values())
+        quantiles = self.quantiles.values()
+        return (*counts, *histograms, *quantiles)
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The total and the groups that have a scenario."""
+        """The total, and the groups that contain a scenario."""
         split_groups = [group for group in GROUPS[1:] if self.scenarios[group]]
         return (TOTAL, *split_groups)
 
@@ -77,24 +77,24 @@ class DatasetStatistics(Report):
         return {**asdict(self), "probabilities": PROBABILITIES}
 
     def named_tables(self) -> dict[str, Iterable[StatisticsRow]]:
-        """Return the rows of all tables, and of the colliding pairs."""
+        """Return all tables, and the table of colliding pairs."""
         tables = {table.name: table.rows() for table in self.tables}
         return {**tables, "collision_pairs": collision_rows(self.collisions)}
 
     def to_text(self) -> str:
-        """Return aligned blocks for a terminal.
+        """Return the statistics as aligned blocks for a terminal.
 
-        They are the scenarios (without zeros), a line a category, and what is left out.
+        They list the attributes of scenarios (without zeros), each category, and what is left out.
         """
         head = f"DeepAccident {self.version} at {self.dataroot}"
         if self.selected:
             count = self.scenarios[TOTAL]
-            head += f"\nselected: {count} of {self.release_scenarios} scenarios"
-            head += "; all counts are of these"
+            head += f"\nselected: {count} of {counted(self.release_scenarios, 'scenario')}"
             if not count:
-                return f"{head}\nno scenario meets the filters, so there is nothing to count"
+                return f"{head}\nno scenario matches the filters, so there is nothing to count"
+            head += "; all counts cover only these"
         sums = {"scenarios": self.scenarios, "frames": self.frames, "samples": self.samples}
-        sum_rows = [(word, *self._cells(counts)) for word, counts in sums.items()]
+        sum_rows = [(word, *self._group_cells(counts)) for word, counts in sums.items()]
         blocks = [head, columns_text([("", *self.groups), *sum_rows])]
         for table in self.counts.values():
             if table.counted == "scenarios":
@@ -104,41 +104,44 @@ class DatasetStatistics(Report):
             blocks.append(self._critical_text())
         left_out = self._left_out_lines()
         if left_out:
-            blocks.append(
-                "\n".join(["left out where a value is needed that they lack:", *left_out])
-            )
+            blocks.append("\n".join(["excluded, because a value is missing:", *left_out]))
         return "\n\n".join(blocks)
 
     def _left_out_lines(self) -> list[str]:
-        """Return a sorted line for each kind of items that a table leaves out."""
+        """Return a line for each kind of item that a table leaves out, sorted."""
         lines = set()
         for table in self.tables:
-            if table.left_out and table.left_out.counts[TOTAL]:
-                lines.add(f"{table.left_out.counts[TOTAL]:,} {table.left_out.what}")
+            left_out = table.left_out
+            if left_out and left_out.counts[TOTAL]:
+                lines.add(f"{left_out.counts[TOTAL]:,} {left_out.what}")
         return sorted(lines)
 
-    def _cells(self, counts: Mapping[str, int]) -> list[str]:
+    def _group_cells(self, counts: Mapping[str, int]) -> list[str]:
         return [f"{counts[group]:,}" for group in self.groups]
 
     def _shares_text(self, table: CountTable) -> str:
-        """Return a row a value that occurs, with its share of each group."""
+        """Return a row for each value that occurs, with its share in each group."""
         rows = []
         for value, counts in table.counts.items():
             if counts[TOTAL]:
                 shares = [share_text(counts[group], table.total(group)) for group in self.groups]
-                rows.append((value, *shares))
-        return columns_text([(table.field, *self.groups), *rows])
+                rows.append((human_name(value), *shares))
+        return columns_text([(human_name(table.field, "attributes"), *self.groups), *rows])
 
     def _lengths_text(self) -> str:
         lengths = self.histograms["lengths"]
         rows = []
         for index, label in enumerate(lengths.bin_labels()):
-            rows.append((label, *(str(lengths.counts[group][index]) for group in self.groups)))
-        others = ("other", *self._cells(lengths.outside))
-        return columns_text([("length in frames", *self.groups), *rows, others])
+            counts = [str(lengths.counts[group][index]) for group in self.groups]
+            rows.append((label, *counts))
+        outside_cells = ("other", *self._group_cells(lengths.outside))
+        return columns_text([("length in frames", *self.groups), *rows, outside_cells])
 
     def _critical_text(self) -> str:
-        """Return shares of labelled scenarios with a moving pair under each time to collision."""
+        """Return how many labelled scenarios have a moving pair below each time to collision.
+
+        The numbers are shares of the scenarios.
+        """
         times = self.histograms[CRITICAL]
         rows = []
         for limit in _TTC_LIMITS_S:
@@ -148,26 +151,28 @@ class DatasetStatistics(Report):
                 labelled = self.scenarios[group] - self.unlabelled[group]
                 cells.append(share_text(critical, labelled))
             rows.append(cells)
-        return columns_text([("least TTC of moving pairs", *self.groups), *rows])
+        return columns_text([("min. TTC of moving pairs", *self.groups), *rows])
 
     def _categories_text(self) -> str:
-        """Return a line a category: counts, and medians of size, distance and speed."""
+        """Return a row per category: counts, and the median size, distance and speed."""
         sizes = self.quantiles["box_sizes"]
         distances = self.quantiles["distance_quantiles"]
         speeds = self.quantiles["speed_quantiles"]
+        instances = self.counts["instances"].counts
+        annotations = self.counts["annotations"].counts
         rows = []
         for category in CATEGORIES:
-            medians = [
-                sizes.median("length", category),
-                sizes.median("width", category),
-                sizes.median("height", category),
-            ]
-            size = [number_text(median, 2) for median in medians]
+            medians = []
+            for field in ("length", "width", "height"):
+                medians.append(number_text(sizes.median(field, category), 2))
+            size = "–"
+            if medians[0] != "–":
+                size = " × ".join(medians)
             cells = (
                 category,
-                f"{self.counts['instances'].counts[category][TOTAL]:,}",
-                f"{self.counts['annotations'].counts[category][TOTAL]:,}",
-                " × ".join(size) if size[0] != "–" else "–",
+                f"{instances[category][TOTAL]:,}",
+                f"{annotations[category][TOTAL]:,}",
+                size,
                 number_text(distances.median("distance", category), 1),
                 number_text(speeds.median("speed", category), 1),
             )

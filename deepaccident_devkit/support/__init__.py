@@ -1,1 +1,1 @@
-"""Helpers of all packages: arrays, texts, files, reports, pages, bulk work, plug-ins."""
+"""Helpers for all packages: arrays, texts, files, reports, pages, batch work, plug-ins."""

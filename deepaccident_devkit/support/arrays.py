@@ -1,7 +1,5 @@
 """Array aliases, and checks of the arrays and numbers that a caller passes."""
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,33 +18,38 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
 AnyArray = NDArray[Any]
-_FLOAT64: Final = np.dtype(np.float64)
+_FLOAT64 = np.dtype(np.float64)
+# Types of a single True or False.
+_BOOL_KINDS = (bool, np.bool_)
 # Kinds of the element types of numbers.
-_NUMBER_KINDS: Final = "biuf"
-# Largest number of metres, m/s, pixels, …: a larger one in a file is damage and counts as infinite,
-# since squares would overflow.
+_NUMBER_KINDS = "biuf"
+# Largest plausible number of metres, m/s, pixels, …: a larger one in a file is a fault and counts
+# as infinite, because its square could overflow.
 LARGEST_NUMBER: Final = 1e9
-# Limits of the text of a record: characters of all fields and of one, and entries of a collection.
-_MAX_FIELDS_LENGTH: Final = 160
-_MAX_VALUE_LENGTH: Final = 80
-_MAX_ENTRIES: Final = 4
+# Largest block that the allocator can keep, bytes.
+_MAX_KEPT_SIZE = 31 * 2**20
+# Limits of a record's repr: characters of all fields and of one field, and entries of a collection.
+_MAX_FIELDS_LENGTH = 160
+_MAX_VALUE_LENGTH = 80
+_MAX_ENTRIES = 4
 
 
-def keep_freed(size: int = 31 * 2**20) -> None:
-    """Make the allocator (of Linux) keep freed blocks of up to `size` bytes, 31 MiB at most.
+def keep_freed(size: int = _MAX_KEPT_SIZE) -> None:
+    """Make Linux's allocator keep freed blocks of up to `size` bytes, at most 31 MiB.
 
-    Otherwise memory is returned to the system each time, and page faults take as long as much of
-    the work. The allocator does so after it has once freed a block as large, which is never
-    touched.
+    Otherwise memory is returned to the system every time, and page faults take a large part of the
+    time. The allocator raises its threshold when it frees a block of that size, whose memory is
+    never touched.
     """
-    np.empty(min(size, 31 * 2**20), dtype=np.uint8)
+    kept_size = min(size, _MAX_KEPT_SIZE)
+    np.empty(kept_size, dtype=np.uint8)
 
 
 class ShortRepr:
-    """Base of dataclasses that hold arrays, with a text of one line.
+    """Base of dataclasses with arrays, whose repr is one line of fewer than 200 characters.
 
-    It has fewer than 200 characters, with the shapes of arrays; the text of an ordinary dataclass
-    would have the arrays' numbers. A subclass may have a `__repr__` of its own.
+    The repr shows the shapes of arrays, not their numbers. A subclass may define its own
+    `__repr__`.
     """
 
     __slots__ = ()
@@ -58,47 +61,47 @@ class ShortRepr:
         cls.__repr__ = inherited  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
-        """Return the class and its fields, as far as they fit."""
+        """Return the class name and as many fields as fit."""
         kind: type[Any] = type(self)
         text = ""
-        for number, name in enumerate(_field_names(kind)):
-            part = f"{', ' * (number > 0)}{name}={_value_text(getattr(self, name))}"
-            if len(text) + len(part) > _MAX_FIELDS_LENGTH:
+        separator = ""
+        for name in _list_field_names(kind):
+            value_text = _format_value(getattr(self, name))
+            field_text = f"{separator}{name}={value_text}"
+            if len(text) + len(field_text) > _MAX_FIELDS_LENGTH:
                 text += ", …"
                 break
-            text += part
+            text += field_text
+            separator = ", "
         return f"{kind.__name__}({text})"
 
 
 class FrozenArrays(ShortRepr):
-    """Base of frozen dataclasses with arrays that are read-only, from the start and in every copy.
+    """Base of frozen dataclasses whose arrays are read-only, in every copy as well.
 
-    numpy forgets on pickling and on `copy.deepcopy` that an array was read-only.
+    Without it, arrays would become writable by pickling or `copy.deepcopy`.
     """
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        """Freeze the arrays; a class that checks its arrays freezes them itself."""
-        kind: type[Any] = type(self)
-        for field in fields(kind):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, field.name, readonly(value))
+        """Freeze the arrays; a subclass that checks its arrays also freezes them."""
+        freeze_arrays(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return a copy's constructor, which skips `__init__` since the values were checked."""
+        """Copy without calling `__init__`, because the values were already checked."""
         kind = type(self)
-        values = {name: getattr(self, name) for name in _field_names(kind)}
+        values = {name: getattr(self, name) for name in _list_field_names(kind)}
         return _restore_arrays, (kind, values)
 
 
 class BitView(Sequence[bool]):
-    """A bool column as Arrow packs it, eight rows a byte; rows are unpacked on access."""
+    """A bool column as Arrow packs it, eight rows per byte; rows are unpacked on access."""
 
     def __init__(self, packed: ByteArray, length: int) -> None:
-        """View `length` bits, lowest first."""
-        self._packed, self._length = packed, length
+        """View `length` bits, the lowest bit of each byte first."""
+        self._packed = packed
+        self._length = length
 
     def __len__(self) -> int:
         return self._length
@@ -107,20 +110,23 @@ class BitView(Sequence[bool]):
         return iter(self[:].tolist())
 
     def __getitem__(self, rows: Any) -> Any:
-        """Return one row as bool, or a bool array of a slice (step 1) or of an array of rows."""
+        """Return one row as a bool, or a slice (step 1) or an array of rows as a bool array."""
         if isinstance(rows, slice):
             start, stop, _ = rows.indices(self._length)
             return self._unpack(start, max(start, stop))
         if isinstance(rows, np.ndarray):
-            return (self._packed[rows >> 3] >> (rows & 7).astype(np.uint8) & 1).view(np.bool_)
-        return bool(self._packed.item(rows >> 3) >> (rows & 7) & 1)
+            packed_bytes = self._packed[rows >> 3]
+            bits = packed_bytes >> (rows & 7).astype(np.uint8) & 1
+            return bits.view(np.bool_)
+        packed_byte = self._packed.item(rows >> 3)
+        return bool(packed_byte >> (rows & 7) & 1)
 
     def _unpack(self, start: int, stop: int) -> BoolArray:
-        window = self._packed[start >> 3 : (stop + 7) >> 3]
+        """Return the rows `start` to `stop` − 1 as a bool array."""
+        packed_bytes = self._packed[start >> 3 : (stop + 7) >> 3]
+        bits = np.unpackbits(packed_bytes, bitorder="little")
         offset = start & 7
-        return np.unpackbits(window, bitorder="little")[offset : offset + stop - start].view(
-            np.bool_
-        )
+        return bits[offset : offset + stop - start].view(np.bool_)
 
 
 def checked(
@@ -128,24 +134,24 @@ def checked(
 ) -> AnyArray:
     """Return `values` as an array of `dtype` and `shape` (None: any length); raise GeometryError.
 
-    With dtype None they keep their own; an array that has it already is not copied. For integers,
-    numbers must be whole and in range.
+    If `dtype` is None, the values keep their type. An array of the right type is not copied. For an
+    integer type, the numbers must be whole and in range.
     """
     if (
         type(values) is np.ndarray
         and values.dtype.kind in _NUMBER_KINDS
         and _has_shape(values.shape, shape)
     ):
-        # The fast path: many small arrays of a sample's labels come here.
+        # Fast path for the many small arrays of a sample's labels.
         if values.dtype == dtype:
             return values
         return as_numbers(name, values, dtype=dtype)
-    array = as_numbers(name, values, f"an array of shape {_shape_text(shape)}", dtype)
+    array = as_numbers(name, values, f"an array of shape {_format_shape(shape)}", dtype)
     if not _has_shape(array.shape, shape):
         is_transposed = array.ndim == 2 and _has_shape(array.shape[::-1], shape)
         remedy = "; transpose it (.T)" if is_transposed else ""
         raise GeometryError(
-            f"{name}: expected shape {_shape_text(shape)}, found {array.shape}{remedy}"
+            f"{name}: expected shape {_format_shape(shape)}, found {array.shape}{remedy}"
         )
     return array
 
@@ -153,19 +159,20 @@ def checked(
 def as_numbers(
     name: str, values: ArrayLike, expected: str = "numbers", dtype: DTypeLike | None = np.float64
 ) -> AnyArray:
-    """Return what `checked` returns, for any shape: the one way in for a caller's arrays.
+    """Convert a caller's numbers to an array of any shape; all arrays of callers pass here.
 
-    Everything is accepted that numpy can read without a copy from another device: its own arrays,
-    sequences, and objects with `__array__` or DLPack, such as torch tensors on the processor.
-    Nothing is detached, fetched from an accelerator or unmasked silently; the error explains how.
-    Numbers must be in the range of a float type too (NaN and inf pass).
+    Anything that numpy can read without a copy from another device is accepted: numpy arrays,
+    sequences, and objects with `__array__` or DLPack, such as torch tensors on the CPU. Nothing is
+    silently detached, fetched from an accelerator or unmasked; the GeometryError explains how to
+    convert it. Numbers must fit into the range of a float type (NaN and inf are accepted),
+    otherwise GeometryError is raised too.
     """
     source = _to_array(name, values, expected)
     target = source.dtype if dtype is None else np.dtype(dtype)
     if source.dtype.kind not in _NUMBER_KINDS:
         raise GeometryError(
-            f"{name}: expected {expected}, found {type(values).__name__} (no numbers: "
-            f"{source.dtype}){_remedy(values)}"
+            f"{name}: expected {expected}, found {type(values).__name__} (not numeric: "
+            f"{source.dtype}){_suggest_conversion(values)}"
         )
     if source.dtype == target:
         return source
@@ -175,17 +182,20 @@ def as_numbers(
         array = source.astype(target)
     if target.kind in "iu":
         if not np.array_equal(array, source):
-            other = source[array != source].flat[0]
-            raise GeometryError(f"{name}: expected whole numbers of {target}, found {other}")
+            changed_number = source[array != source].flat[0]
+            raise GeometryError(
+                f"{name}: expected whole numbers of {target}, found {changed_number}"
+            )
     elif (
         target.kind == "f"
         and target.itemsize < source.dtype.itemsize
         and not np.isfinite(array).all()
     ):
-        overflowed = np.isinf(array) & np.isfinite(source)
-        if overflowed.any():
+        has_overflowed = np.isinf(array) & np.isfinite(source)
+        if has_overflowed.any():
             raise GeometryError(
-                f"{name}: expected numbers within {target}'s range, found {source[overflowed][0]}"
+                f"{name}: expected numbers within {target}'s range, "
+                f"found {source[has_overflowed][0]}"
             )
     return array
 
@@ -196,7 +206,7 @@ def checked_number(
     expected: str = "a number",
     error: type[DeepAccidentError] = GeometryError,
 ) -> float:
-    """Return a single number, also one of numpy's scalars, as Python's float; or raise `error`."""
+    """Return `value` as a float; raise `error`, naming it, unless it is one (numpy) number."""
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     try:
@@ -213,7 +223,7 @@ def checked_whole(
     expected: str = "a whole number",
     error: type[DeepAccidentError] = GeometryError,
 ) -> int:
-    """Return a single whole number, also an integer of numpy, as Python's int; or raise `error`."""
+    """Return `value` as an int; raise `error` with its name unless it is a (numpy) integer."""
     try:
         return operator.index(value)  # type: ignore[arg-type]  # everything else is refused
     except TypeError:
@@ -221,17 +231,17 @@ def checked_whole(
 
 
 def checked_flag(name: str, value: object) -> bool:
-    """Return True or False; raise ConfigError."""
-    if not isinstance(value, bool | np.bool_):
+    """Return `value` if it is a bool; otherwise raise a ConfigError that names it."""
+    if not isinstance(value, _BOOL_KINDS):
         raise ConfigError(f"{name}: expected True or False, found {value!r}")
     return bool(value)
 
 
 def checked_count(name: str, value: object, subject: str, maximum: int) -> int:
-    """Return a whole number from 1 to `maximum`, or raise ConfigError, which names the subject."""
+    """Return `value` if it is an integer from 1 to `maximum`; otherwise raise ConfigError."""
     expected = f"a whole number from 1 to {maximum:,} ({subject})"
-    count = 0
-    if not isinstance(value, bool | np.bool_):
+    count = 0  # a bool keeps this count, which is out of range
+    if not isinstance(value, _BOOL_KINDS):
         count = checked_whole(name, value, expected, ConfigError)
     if not 1 <= count <= maximum:
         raise ConfigError(f"{name}: expected {expected}, found {value!r}")
@@ -241,16 +251,16 @@ def checked_count(name: str, value: object, subject: str, maximum: int) -> int:
 def checked_setting(
     name: str, value: object, expected: str, minimum: float = -math.inf, maximum: float = math.inf
 ) -> float:
-    """Return a finite number from `minimum` to `maximum`, or raise ConfigError."""
-    number = math.nan
-    if not isinstance(value, bool | np.bool_):
+    """Return `value` as a float; raise ConfigError unless `minimum` ≤ value ≤ `maximum`."""
+    number = math.nan  # a bool keeps this number, which is not allowed
+    if not isinstance(value, _BOOL_KINDS):
         number = checked_number(name, value, expected, ConfigError)
     if not (math.isfinite(number) and minimum <= number <= maximum):
         raise ConfigError(f"{name}: expected {expected}, found {value!r}")
     return number
 
 
-def check_least(record: object, **minima: float) -> None:
+def check_minima(record: object, **minima: float) -> None:
     """Raise ConfigError if a field of a configuration is below its minimum, or NaN."""
     for name, minimum in minima.items():
         value = getattr(record, name)
@@ -259,29 +269,29 @@ def check_least(record: object, **minima: float) -> None:
 
 
 def as_floats(values: ArrayLike) -> FloatArray:
-    """Return `values` as float64, without copying arrays of float64; raise GeometryError."""
+    """Convert `values` to float64, without copying float64; raise GeometryError if not real."""
     array = _to_array("", values, "numbers")
     if array.dtype == _FLOAT64:
         return array
     try:
         if array.dtype.kind == "c":
-            raise TypeError(f"no real numbers: {array.dtype}")
+            raise TypeError(f"not real numbers: {array.dtype}")
         return array.astype(_FLOAT64)
     except (TypeError, ValueError) as error:
         raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
 
 
 def in_range(numbers: AnyArray | float) -> BoolArray:
-    """Return which numbers are neither NaN, infinite, nor larger than any valid file contains."""
+    """Return which numbers are neither NaN, nor infinite, nor larger than `LARGEST_NUMBER`."""
     is_small: BoolArray = np.abs(numbers) <= np.float64(LARGEST_NUMBER)  # half precision has no 1e9
     return is_small
 
 
-def known(values: ArrayLike | None, digits: int | None = None) -> Any:
-    """Return numbers for JSON, in lists as deep as the array, rounded; None if not finite."""
+def json_numbers(values: ArrayLike | None, digits: int | None = None) -> Any:
+    """Convert numbers to JSON: nested lists of rounded numbers, None if not finite."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim:
-        return [known(row, digits) for row in array]
+        return [json_numbers(row, digits) for row in array]
     number = array.item() if np.isfinite(array) else None
     if number is None or digits is None:
         return number
@@ -295,15 +305,23 @@ def readonly(array: AnyArray) -> AnyArray:
     return view
 
 
+def freeze_arrays(record: ShortRepr) -> None:
+    """Make the arrays of a new frozen dataclass read-only."""
+    for name in _list_field_names(type(record)):
+        value = getattr(record, name)
+        if isinstance(value, np.ndarray):
+            object.__setattr__(record, name, readonly(value))
+
+
 def _to_array(name: str, values: Any, expected: str) -> AnyArray:
-    """Return `values` as an array of any type; raise GeometryError with the remedy."""
+    """Convert `values` to an array of any type; raise GeometryError if masked or unreadable."""
     if type(values) is np.ndarray:
         return values
     prefix = f"{name}: " if name else ""
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise GeometryError(
             f"{prefix}expected {expected}, found {np.count_nonzero(values.mask)} masked values; "
-            "pass array.filled(value) with the value that is to stand there"
+            "pass array.filled(value) with a value for them"
         )
     try:
         if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
@@ -311,7 +329,8 @@ def _to_array(name: str, values: Any, expected: str) -> AnyArray:
         return np.asarray(values)
     except (TypeError, ValueError, RuntimeError, BufferError) as error:
         raise GeometryError(
-            f"{prefix}expected {expected}, found {type(values).__name__} ({error}){_remedy(values)}"
+            f"{prefix}expected {expected}, found {type(values).__name__} ({error})"
+            f"{_suggest_conversion(values)}"
         ) from error
 
 
@@ -322,10 +341,10 @@ def _has_shape(actual: Sequence[int], shape: Sequence[int | None]) -> bool:
     return all(expected is None or expected == length for expected, length in lengths)
 
 
-def _remedy(values: object) -> str:
-    """Return the remedy for a point cloud, or another framework's array that numpy does not read.
+def _suggest_conversion(values: object) -> str:
+    """Return the remedy for a point cloud, or for another framework's array, as a text.
 
-    Empty for all other values.
+    It is empty for all other values.
     """
     if hasattr(values, "xyz"):
         return "; give its array, .xyz"
@@ -336,13 +355,13 @@ def _remedy(values: object) -> str:
     ):
         return ""
     return (
-        "; pass a torch tensor as tensor.detach().cpu().float(), another framework's as a float32 "
-        "numpy array"
+        "; pass a torch tensor as tensor.detach().cpu().float(), and a tensor of another "
+        "framework as a float32 numpy array"
     )
 
 
 def _restore_arrays(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:
-    """Undo `FrozenArrays.__reduce__`."""
+    """Make the copy that `FrozenArrays.__reduce__` describes."""
     result = object.__new__(kind)
     for name, value in values.items():
         frozen = readonly(value) if isinstance(value, np.ndarray) else value
@@ -350,8 +369,8 @@ def _restore_arrays(kind: type[FrozenArrays], values: Mapping[str, Any]) -> Froz
     return result
 
 
-def _value_text(value: object) -> str:
-    """Return an array's shape and type, and only the type and length of long collections."""
+def _format_value(value: object) -> str:
+    """Describe a value briefly: an array by shape and type, a long collection by its length."""
     if isinstance(value, np.ndarray):
         return f"{value.shape} {value.dtype}"
     if isinstance(value, float):
@@ -368,14 +387,16 @@ def _value_text(value: object) -> str:
 
 
 def _holds_arrays(collection: Mapping[Any, Any] | Sequence[Any]) -> bool:
+    """Return whether a collection contains arrays or other collections."""
     values = collection.values() if isinstance(collection, Mapping) else collection
-    return any(isinstance(value, np.ndarray | Mapping | list | tuple) for value in values)
+    kinds = (np.ndarray, Mapping, list, tuple)
+    return any(isinstance(value, kinds) for value in values)
 
 
-def _field_names(kind: type[Any]) -> Iterable[str]:
+def _list_field_names(kind: type[Any]) -> Iterable[str]:
     return [field.name for field in fields(kind)]
 
 
-def _shape_text(shape: Sequence[int | None]) -> str:
+def _format_shape(shape: Sequence[int | None]) -> str:
     lengths = ["N" if length is None else str(length) for length in shape]
     return f"({', '.join(lengths)})"

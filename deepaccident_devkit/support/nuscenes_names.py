@@ -1,9 +1,7 @@
 """Names of the nuScenes devkit that this devkit lacks, and their counterparts here.
 
-docs/reading.md lists all.
+docs/nuscenes_names.md lists them.
 """
-
-from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
@@ -17,26 +15,29 @@ from deepaccident_devkit.support.text import meant_text
 
 _T = TypeVar("_T")
 P = ParamSpec("P")
-_PAGE: Final = "docs/reading.md"
-_HINTS: Final = json.loads(Path(__file__).with_suffix(".json").read_bytes())
+_PAGE = "docs/nuscenes_names.md"
+_HINTS = json.loads(Path(__file__).with_suffix(".json").read_bytes())
 
 
-def _hints(kind: str) -> Mapping[str, str]:
-    return {name: hint for hint, names in _HINTS[kind].items() for name in names}
+def _collect_hints(kind: str) -> Mapping[str, str]:
+    hints: dict[str, str] = {}
+    for hint, names in _HINTS[kind].items():
+        hints |= dict.fromkeys(names, hint)
+    return hints
 
 
 # nuScenes' tables → what to use here.
-TABLES: Final = _hints("tables")
+TABLES: Final = _collect_hints("tables")
 # Attributes of nuScenes' `NuScenes` and `NuScenesExplorer` → what to use here.
-DATASET: Final = _hints("dataset")
+DATASET: Final = _collect_hints("dataset")
 # Attributes of nuScenes' `Box` → what to use here.
-BOX: Final = _hints("box")
+BOX: Final = _collect_hints("box")
 # Attributes of nuScenes' `LidarPointCloud` → what to use here.
-CLOUD: Final = _hints("cloud")
+CLOUD: Final = _collect_hints("cloud")
 # Arguments of nuScenes' methods → what to use here.
-KEYWORDS: Final = _hints("keywords")
+KEYWORDS: Final = _collect_hints("keywords")
 # Fields of nuScenes' records → what to use here.
-FIELD_HINTS: Final = _hints("fields")
+FIELD_HINTS: Final = _collect_hints("fields")
 # What to use here instead of constructing nuScenes' `Box`.
 BOX_MADE: Final = (
     "boxes[0] picks one, and nuScenes' Box(center, wlh, orientation) is Box.from_wlh(center, wlh, "
@@ -45,10 +46,10 @@ BOX_MADE: Final = (
 
 
 class AbsentName:
-    """A name of nuScenes' class in one of ours: reading it raises MissingNameError.
+    """An attribute that only nuScenes' class has: reading it in ours raises MissingNameError.
 
-    So `hasattr` is False. A `__getattr__` of the class would do the same, but slow down all other
-    attributes.
+    `hasattr` is therefore False. A `__getattr__` of the class would do the same, but would slow
+    down all other attributes.
     """
 
     def __init__(self, name: str, counterpart: str) -> None:
@@ -61,7 +62,7 @@ class AbsentName:
 
 
 def without_names(counterparts: Mapping[str, str]) -> Callable[[type[_T]], type[_T]]:
-    """Return a decorator of a class that lacks these names, and names the counterpart of each."""
+    """Return a class decorator: reading one of these names raises an error with its counterpart."""
 
     def add_absent_names(owner: type[_T]) -> type[_T]:
         for name, counterpart in counterparts.items():
@@ -72,16 +73,17 @@ def without_names(counterparts: Mapping[str, str]) -> Callable[[type[_T]], type[
 
 
 def missing_name(owner: type, name: str, counterpart: str) -> MissingNameError:
-    """Return the error of a class that lacks a name."""
-    return MissingNameError(f"{owner.__name__} has no {name!r}: {counterpart} (see {_PAGE})")
+    """Return the error for a name that a class lacks."""
+    message = f"{owner.__name__} has no {name!r}: {counterpart} (see {_PAGE})"
+    return MissingNameError(message)
 
 
 def with_keywords_named(function: Callable[P, _T], module: str | None = None) -> Callable[P, _T]:
-    """Return the same function, which raises a KeywordError for unknown arguments.
+    """Return a function that raises KeywordError for unknown arguments, and calls `function`.
 
-    For an argument of nuScenes' functions the error names the counterpart, for others a similar
-    one. `module` is the module of the result, where pickle finds it; None for that of the function
-    itself.
+    For an argument of nuScenes' functions the error names the counterpart here, and for any other
+    argument a similar one. `module` is where pickle finds the result; None for the module of the
+    function itself.
     """
     parameters = signature(function).parameters
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
@@ -89,7 +91,8 @@ def with_keywords_named(function: Callable[P, _T], module: str | None = None) ->
 
     @wraps(function)
     def checked(*arguments: P.args, **keywords: P.kwargs) -> _T:
-        for name in sorted(keywords.keys() - parameters.keys()) if keywords else ():
+        unknown_names = keywords.keys() - parameters.keys() if keywords else ()
+        for name in sorted(unknown_names):
             if name in KEYWORDS:
                 raise KeywordError(
                     f"{function_name} has no argument {name!r}: {KEYWORDS[name]} (see {_PAGE})"
@@ -105,15 +108,15 @@ def with_keywords_named(function: Callable[P, _T], module: str | None = None) ->
 
 
 def table_remedy(name: object) -> str:
-    """Return the end of a message about a table of nuScenes; empty for all others."""
+    """Return the end of a message about a table of nuScenes; empty for any other name."""
     counterpart = TABLES.get(name) if isinstance(name, str) else None
     if counterpart:
-        return f"; of nuScenes' table {name!r}: {counterpart} (see {_PAGE})"
+        return f"; for nuScenes' table {name!r}: {counterpart} (see {_PAGE})"
     return ""
 
 
 def field_remedy(name: object) -> str:
-    """Return the end of a message about a field of nuScenes' records; empty for all others."""
+    """Return the end of a message about a field of nuScenes' records; empty for any other name."""
     counterpart = FIELD_HINTS.get(name) if isinstance(name, str) else None
     if counterpart:
         return f": {counterpart} (see {_PAGE})"

@@ -10,13 +10,14 @@ import hashlib
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from deepaccident_devkit.errors import escaped
-from deepaccident_devkit.support.text import counted, number_text
+from deepaccident_devkit.support.human_names import human_name, metric_name
+from deepaccident_devkit.support.text import counted, number_text, with_minus
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import short_name
 
@@ -25,15 +26,15 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 # A browser loads nothing and runs nothing, even if a name in the results tries to.
-_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-_MAX_DIGITS: Final = 6
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_MAX_DIGITS = 6
 # Positions where a name may be broken.
-_BREAK_POINTS: Final = re.compile(r"(?<=[/_=])(?=\w)|(?=@)")
+_BREAK_POINTS = re.compile(r"(?<=[/_=])(?=\w)|(?=@)")
 
 
 @cache
 def environment() -> Environment:
-    """Return the templates; an undefined name is an error."""
+    """Return the templates' Jinja environment, in which an undefined name is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     templates = Environment(
@@ -44,13 +45,18 @@ def environment() -> Environment:
     )
     templates.filters |= {
         "agent": short_name,
+        "attribute": partial(human_name, kind="attributes"),
         "breakable": breakable,
         "counted": counted,
+        "human": human_name,
+        "metric": metric_name,
+        "minus": with_minus,
         "number": number_text,
         "path": path_in_address,
         "png": png_address,
         "result": result_text,
         "scalar": scalar,
+        "task": partial(human_name, kind="tasks"),
         "thousands": "{:,}".format,
     }
     templates.globals["version"] = __version__
@@ -80,17 +86,19 @@ def document(
 
 
 def part(name: str) -> str:
-    """Return a file beside the templates that is no template, such as a script."""
-    return (files("deepaccident_devkit.support") / "templates" / name).read_text(encoding="utf-8")
+    """Read a file that lies next to the templates, such as a script."""
+    path = files("deepaccident_devkit.support") / "templates" / name
+    return path.read_text(encoding="utf-8")
 
 
 def source_hash(text: str) -> str:
-    """Return a source in a content security policy that only allows this text."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+    """Return the source of a content security policy that allows only this text."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"sha256-{base64.b64encode(digest).decode('ascii')}"
 
 
 def breakable(text: str) -> Markup:
-    """Return an escaped text with names that may be broken after `/`, `_` and `=` and before `@`.
+    """Return escaped text in which a line may break after `/`, `_` and `=` and before `@`.
 
     `Markup` stays as it is.
     """
@@ -102,7 +110,7 @@ def breakable(text: str) -> Markup:
 
 
 def path_in_address(text: str) -> str:
-    """Return a token as a part of an address."""
+    """Return a token quoted as the path of an address."""
     return quote(text, safe="/")
 
 
@@ -123,25 +131,27 @@ def scalar(value: Any) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.{_MAX_DIGITS}g}" if isinstance(value, float) else str(value)
+    return with_minus(f"{value:.{_MAX_DIGITS}g}" if isinstance(value, float) else str(value))
 
 
 def result_text(value: Any) -> str:
-    """Return a result as text: three decimals, and three digits from 10 on.
+    """Return a result as text: three decimals below 10, and three digits from 10 on.
 
-    Whole numbers are whole; an unknown one is a dash.
+    Whole numbers have no decimals; an unknown value is a dash.
     """
     if isinstance(value, list | tuple):
         return _join_texts(value, result_text)
     if isinstance(value, bool | str) or value is None or not math.isfinite(value):
         return scalar(value)
     if value == round(value) or abs(value) >= 1000:
-        return f"{value:,.0f}"
+        return with_minus(f"{value:,.0f}")
     if abs(value) < 10:
-        return f"{value:.3f}"
-    return f"{value:.3g}"
+        return with_minus(f"{value:.3f}")
+    return with_minus(f"{value:.3g}")
 
 
-def _join_texts(values: Sequence[Any], text: Callable[[Any], str]) -> str:
-    separator = "; " if any(isinstance(value, list | tuple) for value in values) else ", "
-    return separator.join(map(text, values))
+def _join_texts(values: Sequence[Any], format_value: Callable[[Any], str]) -> str:
+    separator = ", "
+    if any(isinstance(value, list | tuple) for value in values):
+        separator = "; "
+    return separator.join(map(format_value, values))

@@ -1,17 +1,18 @@
-"""Plug-ins: products on top of the core that add verbs, formats, tasks and more (docs/plugins.md).
+"""Plug-ins: products on top of the core that add subcommands, formats, tasks and more.
 
-Our own are the folders of `deepaccident_devkit/plugins` with a `plugin.py`. Others are installed
-packages with an entry point in the group `deepaccident_devkit.plugins`. Either has one object, a
-`Plugin`. Its offers are imported when they are used.
+See docs/plugins.md. The devkit's own plug-ins are the folders of `deepaccident_devkit/plugins` with
+a `plugin.py`. Others are installed packages with an entry point in the group
+`deepaccident_devkit.plugins`. Each provides one object, a `Plugin`, whose offers are imported when
+they are first used.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
@@ -28,14 +29,14 @@ if TYPE_CHECKING:
 PROTOCOL_VERSION: Final = 1
 """Version of `Plugin`; a plug-in written for another version is left out."""
 ENTRY_POINT_GROUP: Final = "deepaccident_devkit.plugins"
-# Environment variable; `off` leaves other people's plug-ins out.
+# Environment variable; `off` disables plug-ins that are not the devkit's own.
 OFF_SWITCH: Final = "DEEPACCIDENT_PLUGINS"
-_FOLDER: Final = Path(__file__).parents[1] / "plugins"
-_PACKAGE: Final = f"{__package__.partition('.')[0]}.plugins"
+_FOLDER = Path(__file__).parents[1] / "plugins"
+_PACKAGE = f"{__package__.partition('.')[0]}.plugins"
 
 
 class LazyVerb(NamedTuple):
-    """A verb of the command line: a line for the list of verbs, and a function that imports it."""
+    """A subcommand: a line for the list of subcommands, and a function that imports it."""
 
     summary: str
     load: Callable[[], click.Command]
@@ -90,7 +91,7 @@ class Plugin:
     extra_results: Mapping[str, Callable[[], ExtraResult]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the types of the offers; raise TypeError."""
+        """Raise TypeError if an offer has the wrong type."""
         kinds = {
             "verbs": LazyVerb,
             "openers": Opener,
@@ -114,11 +115,11 @@ Offered = TypeVar("Offered")
 
 @dataclass(frozen=True, slots=True)
 class Offers(Generic[Offered]):
-    """The offers of one kind by all plug-ins.
+    """The offers of one kind that all plug-ins make.
 
     Attributes:
         by_name: Name → offer.
-        refused: Plug-in → why it, or one of its names, is left out.
+        refused: Plug-in → reason why it, or one of its names, is left out.
     """
 
     by_name: Mapping[str, Offered]
@@ -127,7 +128,7 @@ class Offers(Generic[Offered]):
     def refusals_text(self) -> str:
         """Return a line for each plug-in that is left out; empty if there is none."""
         return "\n".join(
-            f"The plug-in {name} is left out: {reason}." for name, reason in self.refused.items()
+            f"Plug-in {name} was ignored: {reason}." for name, reason in self.refused.items()
         )
 
 
@@ -137,37 +138,40 @@ def offers(
     *,
     own: bool = False,
 ) -> Offers[Offered]:
-    """Collect the offers of one kind by all plug-ins.
+    """Collect the offers of one kind that all plug-ins make.
 
     Args:
         read: Function that returns the offers of a plug-in.
-        core: Names that the core has; a plug-in cannot offer them.
-        own: Whether to ask only the devkit's own plug-ins, which reads no entry points.
+        core: Names that the core uses, which plug-ins cannot offer.
+        own: Whether to use only the devkit's own plug-ins, without reading entry points.
 
     Returns:
-        The names that one plug-in offers. If several offer a name, the devkit's own has it, or
-        nobody.
+        Offers by name. If several plug-ins offer the same name, the devkit's own plug-in gets it;
+            if none of them is the devkit's own, the name is left out.
     """
     installed = own_plugins() if own else all_plugins()
     refused = dict(installed.refused)
-    owners: dict[str, list[tuple[str, Offered]]] = {}
+    owners_by_name: dict[str, list[tuple[str, Offered]]] = {}
     for plugin in installed.plugins:
-        for name, value in read(plugin).items():
-            owners.setdefault(name, []).append((plugin.name, value))
+        for name, offer in read(plugin).items():
+            owners_by_name.setdefault(name, []).append((plugin.name, offer))
     by_name = {}
     own_names = {plugin.name for plugin in own_plugins().plugins}
-    for name, owned in owners.items():
-        names = [owner for owner, _ in owned]
+    for name, owners in owners_by_name.items():
+        first_plugin, first_offer = owners[0]
+        plugin_names = [plugin_name for plugin_name, _ in owners]
         if name in core:
-            refused |= dict.fromkeys(names, f"it offers {name!r}, which the devkit itself has")
-        elif len(owned) == 1:
-            by_name[name] = owned[0][1]
-        elif names[0] in own_names:  # they come first
-            by_name[name] = owned[0][1]
-            refused |= dict.fromkeys(names[1:], f"it offers {name!r}, which {names[0]} offers, too")
+            reason = f"it offers {name!r}, which is part of the devkit"
+            refused |= dict.fromkeys(plugin_names, reason)
+        elif len(owners) == 1:
+            by_name[name] = first_offer
+        elif first_plugin in own_names:  # the own plug-ins come first
+            by_name[name] = first_offer
+            reason = f"it offers {name!r}, which {first_plugin} also offers"
+            refused |= dict.fromkeys(plugin_names[1:], reason)
         else:
-            reason = f"{' and '.join(names)} both offer {name!r}; uninstall one of them"
-            refused |= dict.fromkeys(names, reason)
+            reason = f"{' and '.join(plugin_names)} both offer {name!r}; uninstall one of them"
+            refused |= dict.fromkeys(plugin_names, reason)
     return Offers(by_name, refused)
 
 
@@ -181,39 +185,38 @@ class Installed(NamedTuple):
 @cache
 def own_plugins() -> Installed:
     """Load the devkit's own plug-ins, without the packages that they describe."""
-    return _loaded(
-        (path.parent.name, _from_file, path) for path in sorted(_FOLDER.glob("*/plugin.py"))
-    )
+    paths = sorted(_FOLDER.glob("*/plugin.py"))
+    return _load_plugins((path.parent.name, partial(_load_plugin_file, path)) for path in paths)
 
 
 @cache
 def all_plugins() -> Installed:
-    """Load the devkit's own plug-ins and, unless switched off, other installed plug-ins."""
+    """Load the devkit's own plug-ins and, unless they are switched off, other installed ones."""
     from importlib.metadata import entry_points  # reading them takes milliseconds
 
     own = own_plugins()
     if os.environ.get(OFF_SWITCH, "").lower() == "off":
         return own
     points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name)
-    external = _loaded((point.name, lambda point: point.load(), point) for point in points)
+    external = _load_plugins((point.name, point.load) for point in points)
     return Installed((*own.plugins, *external.plugins), {**own.refused, **external.refused})
 
 
 def need_plugin(name: str, purpose: str) -> None:
-    """Raise MissingPluginError with the purpose if one of the devkit's own plug-ins is missing."""
+    """Raise MissingPluginError, with `purpose` in it, if a plug-in of the devkit is missing."""
     if not (_FOLDER / name / "plugin.py").is_file():
         raise MissingPluginError(
-            f"{purpose}: needs the plug-in {name}, which this installation lacks; install the "
-            "whole devkit"
+            f"{purpose}: needs the plug-in {name}, which is not installed; install the whole devkit"
         )
 
 
-def _loaded(sources: Iterator[tuple[str, Callable[[Any], Any], Any]]) -> Installed:
+def _load_plugins(loaders: Iterable[tuple[str, Callable[[], Any]]]) -> Installed:
+    """Load plug-ins with their loaders, and record why others cannot be loaded."""
     plugins: list[Plugin] = []
     refused: dict[str, str] = {}
-    for name, load, source in sources:
+    for name, load_plugin in loaders:
         try:
-            plugin = load(source)
+            plugin = load_plugin()
         except Exception as error:  # noqa: BLE001 - whatever somebody else's code raises
             refused[name] = f"{type(error).__name__}: {error}"
             continue
@@ -222,7 +225,7 @@ def _loaded(sources: Iterator[tuple[str, Callable[[Any], Any], Any]]) -> Install
         elif plugin.protocol_version != PROTOCOL_VERSION:
             version = plugin.protocol_version
             refused[name] = (
-                f"it is for version {version} of the plug-in protocol, this devkit has "
+                f"it is for version {version} of the plug-in protocol, but this devkit has "
                 f"{PROTOCOL_VERSION}"
             )
         else:
@@ -230,8 +233,8 @@ def _loaded(sources: Iterator[tuple[str, Callable[[Any], Any], Any]]) -> Install
     return Installed(tuple(plugins), refused)
 
 
-def _from_file(path: Path) -> Any:
-    """Return the object of a `plugin.py` without its package, which may be slow to import."""
+def _load_plugin_file(path: Path) -> Any:
+    """Load the object of a `plugin.py` without its package, which may be slow to import."""
     spec = importlib.util.spec_from_file_location(f"{_PACKAGE}.{path.parent.name}.plugin", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path}: cannot be imported")

@@ -1,8 +1,9 @@
-"""The one way in which files are read: only regular files, within the size limit of their kind.
+"""All reading of files: only regular files are read, up to the size limit of their kind.
 
-Whoever sends a file may send a pipe, a device, a bomb or a gigabyte in one line. This module only
-raises OSError; callers turn it into their own error, which names the remedy. Zip archives, and
-arrays in them, are checked before anything large is made, and compared with their checksums.
+An untrusted file may be a pipe, a device, a decompression bomb or a gigabyte in one line. This
+module only raises OSError; callers turn it into their own errors, which name the remedy. Zip
+archives, and arrays in them, are checked before anything large is made, and compared with their
+checksums.
 """
 
 import errno
@@ -20,7 +21,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
-from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO, Final, Literal, Protocol, TypeAlias
@@ -48,11 +48,8 @@ FileKind: TypeAlias = Literal[
     "weights",
     "tables",
 ]
-NO_NAME: Final = (
-    "cannot be a file's name: it holds a NUL character, or half of a pair that stands for one "
-    "character"
-)
-_MIB: Final = 1 << 20
+NO_NAME: Final = "cannot be a file name: it contains a NUL character, or half of a surrogate pair"
+_MIB = 1 << 20
 BYTE_LIMITS: Final[Mapping[str, int]] = MappingProxyType(
     {
         "label": 48 * _MIB,
@@ -79,22 +76,28 @@ not read at once.
 """
 # Environment variable that changes limits, here and in worker processes: `label=200M lidar=1G`.
 LIMITS_VARIABLE: Final = "DEEPACCIDENT_LIMITS"
-_LIMIT: Final = re.compile(r"([a-z_]+)=(\w+)", re.ASCII)
-_SIZE: Final = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
-_FACTORS: Final = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+_LIMIT = re.compile(r"([a-z_]+)=(\w+)", re.ASCII)
+_SIZE = re.compile(r"([1-9][0-9]{0,11})([KMGT]?)")
+_FACTORS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 # Opening does not wait for the writer of a pipe.
-_OPEN_FLAGS: Final = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
-# First bytes of a member of an archive, of the end of an archive, of the end of a large one, and of
-# the locator of that end.
-_MEMBER, _END, _LARGE_END, _LOCATOR = b"PK\x03\x04", b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07"
+_OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
+# First bytes of a member of an archive, of the archive's end record, of the end record of a large
+# archive, and of the record that locates it.
+_MEMBER = b"PK\x03\x04"
+_END = b"PK\x05\x06"
+_LARGE_END = b"PK\x06\x06"
+_LOCATOR = b"PK\x06\x07"
 # Number of bytes that identify a web page.
-_BEGINNING_LENGTH: Final = 256
-_END_LENGTH, _LARGE_END_LENGTH, _LOCATOR_LENGTH = 22, 56, 20
-# Largest number of bytes of an archive's end, which has a comment at last.
-_MAX_END_LENGTH: Final = _LARGE_END_LENGTH + _LOCATOR_LENGTH + _END_LENGTH + (1 << 16) - 1
+_BEGINNING_LENGTH = 256
+# Number of bytes of these records.
+_END_LENGTH = 22
+_LARGE_END_LENGTH = 56
+_LOCATOR_LENGTH = 20
+# Largest number of bytes of an archive's end records, the last of which ends with a comment.
+_MAX_END_LENGTH = _LARGE_END_LENGTH + _LOCATOR_LENGTH + _END_LENGTH + (1 << 16) - 1
 # Largest number of bytes of the directory of a results file or a bundle.
-_MAX_DIRECTORY_LENGTH: Final = 4 << 20
-_HEADER_READERS: Final = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}
+_MAX_DIRECTORY_LENGTH = 4 << 20
+_HEADER_READERS = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}
 # Errors of reading a damaged archive, or an array in it.
 DAMAGED_ARCHIVE: Final = (
     OSError,
@@ -115,10 +118,10 @@ DAMAGED_ARCHIVE: Final = (
 
 
 class StoredFile(Protocol):
-    """A file that is no file of the system (`release.store`)."""
+    """A file outside the file system, such as a member of an archive (`release.store`)."""
 
     def content(self, kind: FileKind) -> bytes:
-        """Return its bytes; raise OSError as `read_bytes` does."""
+        """Return the file's bytes, with the errors of `read_bytes`."""
 
 
 _observer: ContextVar[Callable[[Path | StoredFile, bytes], None] | None] = ContextVar(
@@ -131,15 +134,18 @@ class RefusedFileError(OSError):
 
 
 def byte_limit(kind: FileKind) -> int:
-    """Return the limit of bytes of a kind of file, also when decoded; raise RefusedFileError."""
+    """Return the largest number of bytes of a kind of file, which also holds after decoding.
+
+    Raises RefusedFileError if the environment sets limits that cannot be understood.
+    """
     setting = os.environ.get(LIMITS_VARIABLE)
     if not setting:
         return BYTE_LIMITS[kind]
-    return _changed_limits(setting).get(kind, BYTE_LIMITS[kind])
+    return _parse_limits(setting).get(kind, BYTE_LIMITS[kind])
 
 
 def bytes_of(text: str) -> int | None:
-    """Return the number of bytes of a size in the environment, such as `200M`; None if invalid."""
+    """Return the number of bytes that a size such as `200M` stands for; None if it is invalid."""
     match = _SIZE.fullmatch(text)
     if match is None:
         return None
@@ -147,20 +153,21 @@ def bytes_of(text: str) -> int | None:
 
 
 def read_bytes(path: Path | StoredFile, kind: FileKind) -> bytes:
-    """Return the bytes of a file, or of one in a store, which reads itself.
+    """Read the bytes of a file; a `StoredFile` reads itself.
 
-    It uses plain system calls, since `open` would double the time. Raises FileNotFoundError,
-    RefusedFileError (no regular file, or too large for its kind), or another OSError.
+    Plain system calls are used, since `open` would double the time. FileNotFoundError is raised if
+    the file does not exist, RefusedFileError if it is not a regular file or is too large for its
+    kind, and another OSError if it cannot be read.
     """
-    content = _read(path, kind) if isinstance(path, Path) else path.content(kind)
+    content = _read_file(path, kind) if isinstance(path, Path) else path.content(kind)
     observer = _observer.get()
     if observer is not None:
         observer(path, content)
     return content
 
 
-def _read(path: Path, kind: FileKind) -> bytes:
-    descriptor, size = _open_regular(path)
+def _read_file(path: Path, kind: FileKind) -> bytes:
+    descriptor, size = _open_regular_file(path)
     try:
         check_size(size, kind)
         content = os.read(descriptor, size)
@@ -179,8 +186,8 @@ def _read(path: Path, kind: FileKind) -> bytes:
 def observed(observer: Callable[[Path | StoredFile, bytes], None]) -> Iterator[None]:
     """Pass the path and the bytes of every file that `read_bytes` reads to `observer`.
 
-    This holds in the block, in this thread. So checksums cover exactly the bytes that something was
-    made from, without a second reading.
+    This holds within the block, in this thread. Checksums thus cover exactly the bytes that
+    something was made from, without reading them again.
     """
     token = _observer.set(observer)
     try:
@@ -190,15 +197,16 @@ def observed(observer: Callable[[Path | StoredFile, bytes], None]) -> Iterator[N
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file of any size, to read bounded parts of it; raise as `read_bytes`."""
-    descriptor, _ = _open_regular(path)
+    """Open a regular file of any size for reading in parts, with the errors of `read_bytes`."""
+    descriptor, _ = _open_regular_file(path)
     return os.fdopen(descriptor, "rb")
 
 
 def mapped_file(path: Path) -> Any:
-    """Map a regular file of any size into memory, as a `pyarrow.Buffer`; raise as `open_file`.
+    """Map a regular file of any size into memory, as a `pyarrow.Buffer`.
 
-    Some file systems cannot map files: then it is read, which is logged once for a folder.
+    On a file system that cannot map files it is read instead, which is logged once for each folder.
+    The errors are as in `open_file`.
     """
     import pyarrow as pa
 
@@ -209,14 +217,17 @@ def mapped_file(path: Path) -> Any:
             if os.strerror(errno.ENOMEM) in str(error):
                 raise  # there is no room to read it either
         warn_once(
-            f"{path.parent}: files cannot be mapped into memory there, so they are read as a "
-            "whole; another folder, for an index by --index-dir, needs less memory"
+            f"{path.parent}: files cannot be memory-mapped there and are read completely; to save "
+            "memory, use another folder (--index-dir for the index)"
         )
         return pa.py_buffer(file.read())
 
 
 def file_checksum(path: Path) -> str:
-    """Return a checksum of a file's bytes; 1.8 GB of tables take 2 s. Raise as `open_file` does."""
+    """Return a checksum of a file's bytes; 1.8 GB of tables take 2 s.
+
+    The errors are as in `open_file`.
+    """
     checksum = hashlib.blake2b(digest_size=16)
     with open_file(path) as file:
         while block := file.read(_MIB):
@@ -225,43 +236,46 @@ def file_checksum(path: Path) -> str:
 
 
 def check_size(size: int, kind: FileKind, subject: str = "") -> None:
-    """Raise RefusedFileError for too many bytes of a kind; `subject` is empty for the file."""
+    """Raise RefusedFileError if a file of a kind, or its part `subject`, has too many bytes."""
     limit = byte_limit(kind)
     if size > limit:
-        head = f"{subject} takes" if subject else "has"
-        more = (
-            f"more than {limit:,}, the limit for {kind}; if the file is sound, set "
-            f"{LIMITS_VARIABLE}={kind}"
+        beginning = f"{subject} takes" if subject else "has"
+        sufficient_mib = -(-size // _MIB)  # rounded up
+        raise RefusedFileError(
+            errno.EFBIG,
+            f"{beginning} {size:,} bytes, more than {limit:,}, the limit for {kind}; if the file "
+            f"is correct, set {LIMITS_VARIABLE}={kind}={sufficient_mib}M",
         )
-        raise RefusedFileError(errno.EFBIG, f"{head} {size:,} bytes, {more}={-(-size // _MIB)}M")
 
 
 def irregular_text(mode: int) -> str | None:
-    """Return what is no regular file: `not a regular file (a named pipe)`; None for regular files.
+    """Describe what is not a regular file, such as `not a regular file (a named pipe)`.
 
-    `mode` is the mode that `stat` returns. Opening a pipe waits for its writer, and a device may
-    have no end.
+    None is returned for a regular file. `mode` is the mode that `stat` returns. Opening a pipe
+    waits for its writer, and a device may have no end.
     """
     if stat.S_ISREG(mode):
         return None
-    kind = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}.get(
-        stat.S_IFMT(mode)
-    )
-    return f"not a regular file ({kind or 'a device'})"
+    kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
+    kind = kinds.get(stat.S_IFMT(mode), "a device")
+    return f"not a regular file ({kind})"
 
 
 def fault_text(error: Exception) -> str:
     """Return the message of an error without the path: `cannot be read (Permission denied)`."""
-    if not isinstance(error, OSError):
-        return str(error) or type(error).__name__
-    message = error.strerror or str(error)
-    if isinstance(error, RefusedFileError):
-        return message
-    return f"cannot be read ({message})"
+    if isinstance(error, OSError) and not isinstance(error, RefusedFileError):
+        return f"cannot be read ({reason_text(error)})"
+    return reason_text(error)
 
 
-def _open_regular(path: Path) -> tuple[int, int]:
-    """Return the descriptor of a regular file, and its size; raise OSError."""
+def reason_text(error: Exception) -> str:
+    """Return only the reason in an error, for a message of its own: `Permission denied`."""
+    message = error.strerror if isinstance(error, OSError) else None
+    return message or str(error) or type(error).__name__
+
+
+def _open_regular_file(path: Path) -> tuple[int, int]:
+    """Open a file, and return descriptor and size; raise OSError if it is not a regular file."""
     try:
         descriptor = os.open(path, _OPEN_FLAGS)
     except ValueError:  # the message of Python depends on its version
@@ -278,8 +292,8 @@ def _open_regular(path: Path) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=8)
-def _changed_limits(text: str) -> Mapping[str, int]:
-    """Return the limits that the environment variable changes."""
+def _parse_limits(text: str) -> Mapping[str, int]:
+    """Parse the environment variable's limits; raise RefusedFileError if they are invalid."""
     limits = {}
     for word in text.replace(",", " ").split():
         match = _LIMIT.fullmatch(word)
@@ -296,25 +310,26 @@ def _changed_limits(text: str) -> Mapping[str, int]:
 
 
 def open_zip(source: Path | bytes) -> zipfile.ZipFile:
-    """Open the archive in a file or in its bytes, if its directory needs little memory.
+    """Open the archive in a file, or in a file's bytes, if its directory needs little memory.
 
-    Raises OSError, or zipfile.BadZipFile if it does not begin at the first and end at the last
-    byte.
+    OSError is raised if the file cannot be read, and zipfile.BadZipFile if the archive does not
+    start at the first byte and end at the last one.
     """
     with io.BytesIO(source) if isinstance(source, bytes) else open_file(source) as file:
         check_end(file, _MAX_DIRECTORY_LENGTH)
     # It is opened again by its path, so that the archive closes the file.
     archive = zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source)
-    if min(map(attrgetter("header_offset"), archive.infolist()), default=0):
+    offsets = [entry.header_offset for entry in archive.infolist()]
+    if min(offsets, default=0):
         archive.close()
         raise zipfile.BadZipFile("bytes precede the archive")
     return archive
 
 
 def read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, kind: FileKind) -> bytes:
-    """Return the content of an archive's member; raise `DAMAGED_ARCHIVE`.
+    """Read the content of an archive's member, which agrees with its stored size and checksum.
 
-    It agrees with its stored size and checksum.
+    Raises one of `DAMAGED_ARCHIVE`.
     """
     for size in (entry.file_size, entry.compress_size):
         check_size(size, kind, shortened(entry.filename))
@@ -333,26 +348,32 @@ def read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, kind: FileKind
 
 
 def read_array(archive: zipfile.ZipFile, name: str, kind: FileKind) -> AnyArray:
-    """Return the array `<name>.npy` of an archive; raise `DAMAGED_ARCHIVE`, KeyError if missing."""
-    return array_of(read_member(archive, archive.getinfo(f"{name}.npy"), kind), kind)
+    """Read the array `<name>.npy` in an archive.
+
+    Raises KeyError if there is no such member, and otherwise one of `DAMAGED_ARCHIVE`.
+    """
+    entry = archive.getinfo(f"{name}.npy")
+    content = read_member(archive, entry, kind)
+    return array_of(content, kind)
 
 
 def array_of(content: bytes, kind: FileKind) -> AnyArray:
-    """Return the array of numbers or text in the bytes of a `.npy`; it is writable.
+    """Return the array of numbers or text in the bytes of a `.npy` file; it is writable.
 
-    It has the size in its header. Raises `DAMAGED_ARCHIVE`: an OSError if it would be larger than
-    its kind may be.
+    Its size is the one in the header. Raises one of `DAMAGED_ARCHIVE`, which is an OSError if the
+    array would be larger than its kind may be.
     """
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
     if version not in _HEADER_READERS:
-        raise ValueError(f"version {version} of its array is unknown")
+        raise ValueError(f"its array has the unknown version {version}")
     shape, fortran, dtype = getattr(np.lib.format, _HEADER_READERS[version])(file)
     if dtype.kind not in "biufcU" or min(shape, default=0) < 0:
         raise ValueError(
             f"expected numbers or text, found shape {shape} of {shortened(str(dtype))}"
         )
-    size, actual_size = math.prod(shape) * dtype.itemsize, len(content) - file.tell()
+    size = math.prod(shape) * dtype.itemsize
+    actual_size = len(content) - file.tell()
     check_size(size, kind, "its array")
     if size != actual_size:
         raise ValueError(
@@ -367,7 +388,7 @@ def array_of(content: bytes, kind: FileKind) -> AnyArray:
 def check_end(file: BinaryIO, max_length: int) -> None:
     """Check the end of an archive before Python reads its directory.
 
-    Python needs about twenty times the memory of the directory. Raises RefusedFileError for a
+    Python needs about twenty times the directory's size of memory. Raises RefusedFileError for a
     directory of more than `max_length` bytes, and zipfile.BadZipFile for a damaged end.
     """
     size = file.seek(0, os.SEEK_END)
@@ -376,29 +397,30 @@ def check_end(file: BinaryIO, max_length: int) -> None:
     end = tail.rfind(_END)
     if end < 0:
         file.seek(0)
-        raise zipfile.BadZipFile(_no_end_text(file.read(_BEGINNING_LENGTH)))
-    if end + _END_LENGTH + _number(tail, end + 20, 2) != len(tail):
+        raise zipfile.BadZipFile(_describe_missing_end(file.read(_BEGINNING_LENGTH)))
+    comment_length = _read_number(tail, end + 20, 2)
+    if end + _END_LENGTH + comment_length != len(tail):
         raise zipfile.BadZipFile("bytes follow the end of the archive")
-    directory, large = _number(tail, end + 12, 4), end - _LOCATOR_LENGTH
-    if large >= 0 and tail.startswith(_LOCATOR, large):
-        record = large - _LARGE_END_LENGTH
-        if (
-            not tail.startswith(_LARGE_END, max(0, record))
-            or _number(tail, large + 8, 8) != start + record
-        ):
+    directory_length = _read_number(tail, end + 12, 4)
+    locator = end - _LOCATOR_LENGTH
+    if locator >= 0 and tail.startswith(_LOCATOR, locator):
+        large_end = locator - _LARGE_END_LENGTH
+        located_at = _read_number(tail, locator + 8, 8)
+        is_record = tail.startswith(_LARGE_END, max(0, large_end))
+        if not is_record or located_at != start + large_end:
             raise zipfile.BadZipFile("its end is damaged")
-        directory = _number(tail, record + 40, 8)
-    if directory > max_length:
+        directory_length = _read_number(tail, large_end + 40, 8)
+    if directory_length > max_length:
         raise RefusedFileError(
             errno.EFBIG,
-            f"the archive's directory has {directory:,} bytes, more than {max_length:,}",
+            f"the archive's directory has {directory_length:,} bytes, more than {max_length:,}",
         )
 
 
-def _no_end_text(beginning: bytes) -> str:
-    """Return what a file without an archive's end is, by its first bytes."""
+def _describe_missing_end(beginning: bytes) -> str:
+    """Describe a file that lacks an archive's end, by its first bytes."""
     if beginning.startswith(_MEMBER):
-        return "its end is missing, so the download or the copy broke off"
+        return "the end is missing, as after an interrupted download or copy"
     if beginning.lstrip().startswith(b"<"):
         return "not a zip archive, but a web page"
     if beginning:
@@ -406,5 +428,7 @@ def _no_end_text(beginning: bytes) -> str:
     return "the file is empty"
 
 
-def _number(content: bytes, offset: int, length: int) -> int:
-    return int.from_bytes(content[offset : offset + length], "little")
+def _read_number(content: bytes, offset: int, length: int) -> int:
+    """Return the unsigned number in `length` bytes of the content."""
+    field = content[offset : offset + length]
+    return int.from_bytes(field, "little")

@@ -1,11 +1,8 @@
 """`Report`: base of reports on many scenarios, as a value for JSON, named tables, and a text."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -14,7 +11,7 @@ from typing import Any
 from deepaccident_devkit.errors import escaped
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder, write_bytes
-from deepaccident_devkit.support.text import columns_text, path_of
+from deepaccident_devkit.support.text import PathType, columns_text, path_of
 
 Row = Sequence[object]
 
@@ -32,12 +29,13 @@ class Table:
     notes: Sequence[str] = ()
 
     def to_text(self, left: int = 1) -> str:
-        """Return aligned lines, the first `left` columns flush left, and the notes."""
-        return "\n".join([columns_text(self.rows, left=left), *self.notes])
+        """Return the table as aligned lines, the first `left` columns flush left, and the notes."""
+        lines = [columns_text(self.rows, left=left), *self.notes]
+        return "\n".join(lines)
 
 
 class Report(ShortRepr):
-    """Base of reports, which are dataclasses: their value and their tables make all their forms."""
+    """Base of reports, which are dataclasses; their values and tables make all other forms."""
 
     __slots__ = ()
 
@@ -46,8 +44,12 @@ class Report(ShortRepr):
         return asdict(self)  # type: ignore[call-overload,no-any-return]
 
     def named_tables(self) -> Mapping[str, Iterable[Row]]:
-        """Return name of a table and its file → rows, the heading first; None is an empty cell."""
+        """Return name (of a table and its file) → rows, heading first; None is an empty cell."""
         return {}
+
+    def _readable_tables(self) -> Mapping[str, Iterable[Row]]:
+        """Return `named_tables` as people read them, with names instead of identifiers."""
+        return self.named_tables()
 
     def to_json(self) -> str:
         """Return `to_dict` as one JSON object, without characters that UTF-8 lacks.
@@ -58,15 +60,20 @@ class Report(ShortRepr):
 
     def to_text(self) -> str:
         """Return the tables, for a terminal."""
-        tables = self.named_tables().items()
-        return "\n\n".join(f"{name}\n{columns_text(_texts(rows))}" for name, rows in tables)
+        tables = []
+        for name, rows in self._readable_tables().items():
+            tables.append(f"{name}\n{columns_text(_format_rows(rows))}")
+        return "\n\n".join(tables)
 
     def to_html(self) -> str:
         """Return the tables, for a notebook or a page; all texts are escaped."""
-        return "".join(table_html(_texts(rows), name) for name, rows in self.named_tables().items())
+        html = ""
+        for name, rows in self._readable_tables().items():
+            html += table_html(_format_rows(rows), name)
+        return html
 
-    def to_csv(self, folder: str | os.PathLike[str]) -> list[Path]:
-        """Write a file for each table into a folder, each atomically; return their paths.
+    def to_csv(self, folder: PathType) -> list[Path]:
+        """Write a file for each table into a folder, each atomically, and return their paths.
 
         Existing files are replaced.
 
@@ -74,21 +81,20 @@ class Report(ShortRepr):
             folder: Output folder; it is made if it does not exist.
 
         Raises:
-            ConfigError: `folder` cannot be written to, or is not a folder.
+            ConfigError: If `folder` cannot be written to, or is not a folder.
         """
         folder = writable_folder(folder)
-        return [
-            write_csv(folder / f"{name}.csv", rows) for name, rows in self.named_tables().items()
-        ]
+        tables = self.named_tables()
+        return [write_csv(folder / f"{name}.csv", rows) for name, rows in tables.items()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckReport(Report):
-    """Base of reports on faults, which therefore also state what they compared.
+    """Base of reports on faults, which also say what was compared.
 
     Attributes:
-        compared: What is compared → its number.
-        cannot_say: What could not be judged, and why, a sentence each.
+        compared: Subject of the comparison → number of compared objects.
+        cannot_say: A sentence for each subject that could not be judged, with the reason.
     """
 
     compared: Mapping[str, int]
@@ -101,7 +107,7 @@ class CheckReport(Report):
 
     @property
     def exit_status(self) -> int:
-        """Exit status: 1 if something is wrong, otherwise 2 if nothing was compared, or 0."""
+        """Exit status: 1 for a fault, otherwise 2 if nothing was compared, and 0 if all is well."""
         if not self.is_good:
             return 1
         if any(self.compared.values()):
@@ -114,22 +120,31 @@ class CheckReport(Report):
 
     def basis_text(self) -> str:
         """Return lines on what was compared, and what could not be judged."""
-        compared = ", ".join(f"{number:,} {subject}" for subject, number in self.compared.items())
-        return "\n".join([f"Compared: {compared}.", *map("Cannot say: {}".format, self.cannot_say)])
+        counts = [f"{number:,} {subject}" for subject, number in self.compared.items()]
+        lines = [f"Compared: {', '.join(counts)}."]
+        lines += [f"Cannot say: {sentence}" for sentence in self.cannot_say]
+        return "\n".join(lines)
 
 
-def write_csv(path: str | os.PathLike[str], rows: Iterable[Row]) -> Path:
-    """Write rows, the heading first, into a file, replacing it; None is an empty cell."""
-    text, target = io.StringIO(newline=""), path_of(path)
+def write_csv(path: PathType, rows: Iterable[Row]) -> Path:
+    """Write rows as a CSV file, the heading first; None is an empty cell.
+
+    An existing file is replaced.
+    """
+    text = io.StringIO(newline="")
+    target = path_of(path)
     csv.writer(text, lineterminator="\n").writerows(rows)
     write_bytes(target, text.getvalue().encode())
     return target
 
 
 def record_rows(kind: type[Any], records: Iterable[object]) -> list[Row]:
-    """Return a row for each record of a dataclass, below the names of its fields."""
+    """Return a heading with a dataclass's field names, and a row for each record."""
     names = tuple(field.name for field in fields(kind))
-    return [names, *([getattr(record, name) for name in names] for record in records)]
+    rows: list[Row] = [names]
+    for record in records:
+        rows.append([getattr(record, name) for name in names])
+    return rows
 
 
 def table_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:
@@ -140,5 +155,9 @@ def table_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:
     return rendered("notebook_table.html", rows=rows, caption=caption)
 
 
-def _texts(rows: Iterable[Row]) -> list[list[str]]:
-    return [["" if cell is None else str(cell) for cell in row] for row in rows]
+def _format_rows(rows: Iterable[Row]) -> list[list[str]]:
+    """Return all cells as text."""
+    text_rows = []
+    for row in rows:
+        text_rows.append(["" if cell is None else str(cell) for cell in row])
+    return text_rows

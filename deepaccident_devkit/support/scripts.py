@@ -3,21 +3,14 @@
 Browsers load no modules from a disk, and the policy of a single page only allows one script.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
-from typing import Final
 
-_IMPORT: Final = re.compile(
-    r'^import \{(\s*\w+(?:,\s*\w+)*,?\s*)\} from "\./(\w+)\.js";$', re.MULTILINE
-)
-_EXPORT: Final = re.compile(
-    r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE
-)
+_IMPORT = re.compile(r'^import \{(\s*\w+(?:,\s*\w+)*,?\s*)\} from "\./(\w+)\.js";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
 # A comment with types, which browsers do not need.
-_TYPES: Final = re.compile(r"^ */\*\*(?:(?!\*/).)*\*/\n", re.MULTILINE | re.DOTALL)
-_UNKNOWN: Final = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
+_TYPES = re.compile(r"^ */\*\*(?:(?!\*/).)*\*/\n", re.MULTILINE | re.DOTALL)
+_UNKNOWN = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
 
 def bundled(read: Callable[[str], str], name: str) -> str:
@@ -28,27 +21,27 @@ def bundled(read: Callable[[str], str], name: str) -> str:
         name: Name of the module without its suffix.
 
     Raises:
-        ValueError: Modules import each other, or one has an import or export of another form than
-            `import { a, b } from "./name.js";` and `export` before a function, a class or a
+        ValueError: If modules import each other, or if one has an import or export of another form
+            than `import { a, b } from "./name.js";` and `export` before a function, a class or a
             constant.
-        OSError: `read` does not find a module.
+        OSError: If `read` does not find a module.
     """
     modules: dict[str, str] = {}
-    _add(read, name, (), modules)
+    _add_module(read, name, (), modules)
     return f'(() => {{\n"use strict";\n{"".join(modules.values())}}})();\n'
 
 
-def _add(
+def _add_module(
     read: Callable[[str], str], name: str, importers: tuple[str, ...], modules: dict[str, str]
 ) -> None:
-    """Add a module after its imports."""
+    """Add a module to `modules`, after its imports."""
     if name in importers:
         raise ValueError(f"modules import each other: {' imports '.join((*importers, name))}")
     if name in modules:
         return
     text = _TYPES.sub("", read(f"{name}.js"))
     for imported in _IMPORT.finditer(text):
-        _add(read, imported[2], (*importers, name), modules)
+        _add_module(read, imported[2], (*importers, name), modules)
     exports = ", ".join(_EXPORT.findall(text))
     body = _EXPORT.sub("", _IMPORT.sub(r"const {\1} = module_\2;", text))
     unknown = _UNKNOWN.search(body)

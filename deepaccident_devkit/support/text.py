@@ -1,4 +1,4 @@
-"""Texts for people and from people: columns, numbers, words in any case, paths, and suggestions."""
+"""Texts to and from users: columns, numbers, words in any case, paths and suggestions."""
 
 import base64
 import json
@@ -11,24 +11,27 @@ from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache
 from html import escape
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, TypeAlias, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, shortened
 
 AnyText = TypeVar("AnyText", bound=str | None)
+PathType: TypeAlias = str | os.PathLike[str]
+"""A path that a caller passes; `path_of` turns it into a Path."""
 # Largest number of words that a message lists.
 _MAX_WORDS = 20
 # Smallest number of letters of a word that a longer one suggests, as `validation` suggests `val`.
 _MIN_STEM_LENGTH = 3
 # Largest number of differing values that a message shows.
 _MAX_DIFFERENCES = 3
-_NUMBER: Final = re.compile(
+_NUMBER = re.compile(
     r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)", re.ASCII | re.IGNORECASE
 )
-_INTEGER: Final = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
+_INTEGER = re.compile(r"(-?)0*(\d{1,19})", re.ASCII)
+# Hyphen that is the sign of a number.
+_HYPHEN_SIGN = re.compile(r"(?<![^\s(\[])-(?=\.?\d)")
 
 
 @cache
@@ -43,21 +46,24 @@ def warn_once(text: str) -> None:
 def columns_text(rows: Sequence[Sequence[str]], *, left: int = 1) -> str:
     """Return lines of aligned columns; the first row is the heading.
 
-    The first `left` columns are flush left, the others flush right.
+    The first `left` columns are flush left, the others flush right. Negative numbers have minus
+    signs.
     """
-    widths = [max(len(word) for word in column) for column in zip(*rows, strict=True)]
+    rows = [[with_minus(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
-        cells = map(str.ljust, row[:left], widths), map(str.rjust, row[left:], widths[left:])
-        lines.append("  ".join(chain(*cells)).rstrip())
+        left_cells = map(str.ljust, row[:left], widths)
+        right_cells = map(str.rjust, row[left:], widths[left:])
+        lines.append("  ".join([*left_cells, *right_cells]).rstrip())
     return "\n".join(lines)
 
 
 def natural_order(value: str | None) -> tuple[bool, float, str]:
-    """Return a key that sorts words.
+    """Return the sort key of a word.
 
-    Numbers and words that begin with one (`2 s`) come first, by size, then others; unknown ones
-    come last.
+    Numbers, and words that begin with one (`2 s`), come first, by size; then other words; unknown
+    values come last.
     """
     text = "none" if value is None else value
     number = math.inf
@@ -66,48 +72,76 @@ def natural_order(value: str | None) -> tuple[bool, float, str]:
     return text == "none", number, text
 
 
-class Pictured:
+class PictureRepr:
     """Base of objects that a notebook shows with a picture above their text, if there is one."""
 
     __slots__ = ()
 
     png_of: ClassVar[Callable[[object], bytes]]
-    """Makes the picture. The package's `__init__` sets it, because rendering is a higher layer."""
+    """Renders the picture. The package's `__init__` sets it, as rendering is a higher layer."""
 
     def _repr_html_(self) -> str:
         html = f"<pre>{escape(repr(self))}</pre>"
         with suppress(Exception):  # a picture is an extra
-            content = base64.b64encode(Pictured.png_of(self)).decode("ascii")
+            content = base64.b64encode(PictureRepr.png_of(self)).decode("ascii")
             html = f'<img src="data:image/png;base64,{content}" alt="seen from above">{html}'
         return html
 
 
 def number_of(word: str) -> float | None:
-    """Return the number that a word is, NaN and infinity included; None if it is none."""
+    """Return the number that a word spells, which may be NaN or infinite; None for other words."""
     if _NUMBER.fullmatch(word):
         return float(word)
     return None
 
 
 def integer_of(word: str) -> int | None:
-    """Return the 64-bit integer that a word is; None if it is none.
+    """Return the 64-bit integer that a word spells; None for other words.
 
     Python itself reads no more than 4,300 digits.
     """
     match = _INTEGER.fullmatch(word)
-    value = int(match[1] + match[2]) if match else 2**63
+    if match is None:
+        return None
+    value = int(match[1] + match[2])
     if -(2**63) <= value < 2**63:
         return value
     return None
 
 
+def with_minus(text: str) -> str:
+    """Return a text for people, in which negative numbers have a minus sign instead of a hyphen.
+
+    >>> with_minus("-0.16 (type1-2)")
+    '−0.16 (type1-2)'
+    """
+    return _HYPHEN_SIGN.sub("−", text)
+
+
+def distinct_names(paths: Sequence[PathType]) -> list[str]:
+    """Return the last part of each path in which the paths differ, or the whole paths.
+
+    >>> distinct_names(["runs/single/accident", "runs/five/accident"])
+    ['single', 'five']
+    """
+    names = [list(path_of(path).parts) for path in paths]
+    while all(len(parts) > 1 for parts in names) and len({parts[-1] for parts in names}) == 1:
+        for parts in names:
+            parts.pop()
+    last_parts = [parts[-1] for parts in names if parts]
+    if len(set(last_parts)) < len(paths):
+        return list(map(str, paths))
+    return last_parts
+
+
 def fixed_text(value: float, digits: int) -> str:
-    """Return a number with a number of decimals, and no sign on zero."""
-    return f"{round(float(value), digits) + 0.0:.{digits}f}"
+    """Return a number as text with `digits` decimals, a minus sign, and no sign on zero."""
+    rounded = round(float(value), digits) + 0.0  # adding 0.0 removes a negative zero
+    return with_minus(f"{rounded:.{digits}f}")
 
 
 def number_text(value: float | None, digits: int = 1) -> str:
-    """Return a number with some decimals; a dash for None and NaN, `never` for an infinite one."""
+    """Return a number with `digits` decimals; a dash for None and NaN, `never` for infinity."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -117,17 +151,22 @@ def number_text(value: float | None, digits: int = 1) -> str:
 
 def share_text(count: int, total: int) -> str:
     """Return a count, and its share in percent: `1,200 ( 12 %)`."""
-    percent = round(100 * count / total) if total else 0
+    percent = 0
+    if total:
+        percent = round(100 * count / total)
     return f"{count:,} ({percent:>3} %)"
 
 
 def counted(count: int, word: str) -> str:
-    """Return a number with its noun: `1 scenario`, `1,200 scenarios`."""
-    return f"{count:,} {word}{'' if count == 1 else 's'}"
+    """Return a number with its noun: `1 scenario`, `1,200 scenarios`, `3 boxes`."""
+    if count == 1:
+        return f"1 {word}"
+    ending = "es" if word.endswith("x") else "s"
+    return f"{count:,} {word}{ending}"
 
 
 def size_text(count: int) -> str:
-    """Return bytes in GB, or in MB, kB or B if there are few.
+    """Return a number of bytes as text, in GB, MB, kB or B, whichever suits its size.
 
     >>> size_text(310_000_000_000), size_text(26_500), size_text(999)
     ('310.0 GB', '26.5 kB', '999 B')
@@ -139,24 +178,25 @@ def size_text(count: int) -> str:
 
 
 def possible_text(wrong: str, possible: Iterable[str]) -> str:
-    """Return the possible words in a line.
+    """Return a list of the possible words for a message.
 
-    Of more than twenty, it lists the words most similar to `wrong` first, and how many more there
-    are.
+    If there are more than twenty, the words most similar to `wrong` come first, and the list ends
+    with the number of further words.
     """
     words = list(possible)
     if len(words) <= _MAX_WORDS:
         return ", ".join(words)
     word_by_lower = {word.lower(): word for word in words}
     similar = get_close_matches(wrong.lower(), word_by_lower, n=3)
-    ordered = list(dict.fromkeys([*(word_by_lower[word] for word in similar), *words]))
+    similar_words = [word_by_lower[word] for word in similar]
+    ordered = list(dict.fromkeys(similar_words + words))
     return f"{', '.join(ordered[:_MAX_WORDS])} and {len(ordered) - _MAX_WORDS} more"
 
 
 def meant_text(wrong: object, possible: Iterable[object]) -> str:
-    """Return the end of a message, such as `; did you mean 'left'?`.
+    """Return the end of a message that suggests a word, such as `; did you mean 'left'?`.
 
-    Empty if no possible word is similar to the wrong one.
+    It is empty if no possible word is similar to the wrong one.
     """
     word_by_lower = {word.lower(): word for word in possible if isinstance(word, str)}
     if not isinstance(wrong, str) or not wrong:
@@ -176,16 +216,20 @@ def meant_text(wrong: object, possible: Iterable[object]) -> str:
     return ""
 
 
-def spelled(value: Any, words: Iterable[str]) -> Any:
-    """Return the word that a text is, in whatever case of letters; the value itself if none is."""
-    lowered = value.lower() if isinstance(value, str) else None
-    return next((word for word in words if word.lower() == lowered), value)
+def match_spelling(value: Any, words: Iterable[str]) -> Any:
+    """Return the word that equals a text, ignoring case; the value itself if none does."""
+    if isinstance(value, str):
+        for word in words:
+            if word.lower() == value.lower():
+                return word
+    return value
 
 
 def differing_text(actual: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
-    """Return which values differ: `training/steps: 2, asked for 3; …`; empty if none do."""
+    """Return which values differ, such as `training/steps: 2, asked for 3; …`; empty if none do."""
     expected_json = json.loads(json.dumps(expected))  # tuples are lists in a file
-    actual_values, expected_values = dict(_leaves(actual)), dict(_leaves(expected_json))
+    actual_values = dict(_walk_leaves(actual))
+    expected_values = dict(_walk_leaves(expected_json))
     differing = sorted(
         name
         for name in {*actual_values, *expected_values}
@@ -201,10 +245,11 @@ def differing_text(actual: Mapping[str, Any], expected: Mapping[str, Any]) -> st
     return "; ".join(differences)
 
 
-def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _walk_leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the path and the value of each leaf of nested mappings."""
     for name, value in values.items():
         if isinstance(value, dict) and value:
-            yield from _leaves(value, f"{prefix}{name}/")
+            yield from _walk_leaves(value, f"{prefix}{name}/")
         else:
             yield f"{prefix}{name}", value
 
@@ -218,25 +263,27 @@ def choice(
     elsewhere: Mapping[str, str] = MappingProxyType({}),
     also: str = "",
 ) -> AnyText:
-    """Return the word that a caller means, in its own spelling; or raise ChoiceError.
+    """Return the word in `words` that `value` matches; raise ChoiceError if there is none.
 
-    Small letters may stand for capital ones. None may be one of the words.
+    Case is ignored, and the result has the spelling in `words`. None may be one of the words.
 
     Args:
         name: Name of the argument.
         value: Value that the caller passes.
         words: Possible words.
-        error: Another kind of error.
-        elsewhere: Word with a meaning in another place → what to do with it.
-        also: What can be given instead of a word.
+        error: Class of error to raise instead of ChoiceError.
+        elsewhere: Word that is valid in another place → hint for it.
+        also: Text about what can be passed instead of a word.
     """
     expected = [word for word in words if word is not None]
-    spelled_word: AnyText = spelled(value, expected)
+    spelled_word: AnyText = match_spelling(value, expected)
     if any(spelled_word is word for word in words):
         return spelled_word
-    none = ", or None" if len(expected) < len(words) else ""
+    none_text = ", or None" if len(expected) < len(words) else ""
     hint = elsewhere.get(str(value).lower()) or meant_text(value, expected)
-    raise error(f"{name}: expected one of {', '.join(expected)}{none}{also}, found {value!r}{hint}")
+    raise error(
+        f"{name}: expected one of {', '.join(expected)}{none_text}{also}, found {value!r}{hint}"
+    )
 
 
 def members_of(
@@ -247,7 +294,7 @@ def members_of(
     A single text or record is a collection of one.
 
     Raises:
-        ChoiceError: It is no collection; or another kind of error.
+        ChoiceError: If `value` is not a collection; `error` is raised instead if it is passed.
     """
     if isinstance(value, str | Mapping):
         return [value]
@@ -264,13 +311,13 @@ def choices(
     empty: bool = False,
     error: type[DeepAccidentError] = ChoiceError,
 ) -> tuple[AnyText, ...]:
-    """Return some of the possible words, in the caller's order and in their own spelling.
+    """Return the words in `words` that the caller's values match, in the caller's order.
 
-    A single one needs no list.
+    A single word needs no list.
 
     Raises:
-        ChoiceError: A word is not possible, or there is none although `empty` is False; or another
-            kind of error.
+        ChoiceError: If a value matches no word, or there is no value and `empty` is False; `error`
+            is raised instead if it is passed.
     """
     expected = f"some of {', '.join(map(str, words))}"
     members = members_of(argument, value, expected, error=error)
@@ -285,7 +332,10 @@ def settle_choices(
     *,
     error: type[DeepAccidentError] = ChoiceError,
 ) -> None:
-    """Set fields of a new frozen dataclass to the spelling of their words; raise as `choice`."""
+    """Replace words in fields of a new frozen dataclass with their canonical spelling.
+
+    The errors are as in `choice`.
+    """
     for name, possible in words.items():
         word = choice(name, getattr(record, name), possible, error=error)
         object.__setattr__(record, name, word)
@@ -297,18 +347,18 @@ def path_text(
     *,
     error: type[DeepAccidentError] = ConfigError,
 ) -> str:
-    """Return the text of a path that a caller passes: a text, or a path object of one.
+    """Return the text of a path that a caller passes as a text or as a path object.
 
-    Raises ConfigError, or another kind of error, for an empty text, and for a text that cannot be
-    the name of a file. `expected` is how the message begins, such as `out: expected a folder`.
+    Raises `error` for an empty text, and for a text that cannot be the name of a file. `expected`
+    is how the message begins, such as `out: expected a folder`.
     """
-    with suppress(TypeError, ValueError, RuntimeError):  # no path; half a character; `~` of nobody
+    with suppress(TypeError, ValueError, RuntimeError):  # not a path; `~` of no user
         text = os.fspath(value)  # type: ignore[call-overload]
         if isinstance(text, str) and text and b"\0" not in os.fsencode(Path(text).expanduser()):
             return text
-    actual = (
-        "an empty path; give '.' for the current one" if value == "" else shortened(repr(value))
-    )
+    actual = shortened(repr(value))
+    if value == "":
+        actual = "an empty path; give '.' for the current one"
     raise error(f"{expected}, found {actual}")
 
 
@@ -318,5 +368,5 @@ def path_of(
     *,
     error: type[DeepAccidentError] = ConfigError,
 ) -> Path:
-    """Return a path that a caller passes, with `~` for the home folder; see `path_text`."""
+    """Return a path that a caller passes, with `~` replaced by the home folder; see `path_text`."""
     return Path(path_text(value, expected, error=error)).expanduser()

@@ -4,10 +4,10 @@ from deepaccident_devkit.tables.boxes import displacement_velocities, visible_id
 from deepaccident_devkit.tables.index import (
     Index,
     Problem,
+    choose_outside_index_dir,
     clear_index,
     current_index,
     open_index,
-    place_outside,
 )
 from deepaccident_devkit.tables.scan import SEVERITIES, Finding, Severity
 from deepaccident_devkit.tables.tables import OpenTables, RowArgument, Table, Tables, table_names
@@ -22,11 +22,11 @@ __all__ = [
     "Severity",
     "Table",
     "Tables",
+    "choose_outside_index_dir",
     "clear_index",
     "current_index",
     "displacement_velocities",
     "open_index",
-    "place_outside",
     "table_names",
     "visible_ids",
     "visible_mask",

@@ -1,8 +1,8 @@
-"""Tables on disk: one Arrow file a table with one uncompressed batch, streamed and memory-mapped.
+"""Tables on disk: one Arrow file per table, with one uncompressed batch that is memory-mapped.
 
 The end of the module defines how each kind of column is stored in Arrow, and how it is read back
-without copying. Rows of several tables that belong together, such as a scenario's, are compressed
-Arrow streams one after the other. They are few, and so neither written nor read by Arrow's threads.
+without copying. Rows of several tables that belong together, such as a scenario's, are stored as
+consecutive compressed Arrow streams. They are few, so Arrow's threads are not used for them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,33 +38,30 @@ from deepaccident_devkit.tables.records import record_columns
 ColumnArrays = Mapping[str, Any]
 """Stored column name → array (or list, for words) of one table's rows."""
 HASHES = "hashes"
-"""Metadata key of scenario rows and of the table of scenarios: hashes of source files, as JSON."""
-DAMAGED_INDEX_REMEDY = "mend it with: deepaccident check index DATAROOT"
+"""Metadata key of a scenario's rows and of the scenario table: hashes of source files, as JSON."""
+DAMAGED_INDEX_REMEDY = "repair it with: deepaccident check index DATAROOT"
 """Remedy for a damaged table."""
 
 
 def damaged_value(table: str) -> IndexStoreError:
-    """Return the error for a row key, a count or a code out of range.
-
-    Only damage to a file makes such a value.
-    """
+    """Return the error for a row key, count or code out of range, as in a damaged file."""
     return IndexStoreError(
-        f"the index is damaged: table '{table}' holds a value out of its range; "
+        f"the index is damaged: table '{table}' contains a value out of its range; "
         f"{DAMAGED_INDEX_REMEDY}"
     )
 
 
 def table_path(folder: Path, table: str) -> Path:
-    """Return the file of a table."""
+    """Return the path of a table's file."""
     return folder / f"{table}.arrow"
 
 
 class TableWriter(ExitStack):
-    """Collects a table's rows piece by piece and writes them as one batch.
+    """A context manager that collects a table's rows in pieces and writes them as one batch.
 
-    Rows of fixed width go to a scratch file a column, without a name; the batch is then written
-    from these, memory-mapped, so that a table of any size needs little memory. A context manager:
-    leaving it removes these files.
+    Rows of fixed width go to an unnamed scratch file per column. The batch is then written from
+    these memory-mapped files, so a table of any size needs little memory. Leaving the context
+    removes the files.
     """
 
     def __init__(self, folder: Path, spec: TableSpec) -> None:
@@ -81,22 +78,26 @@ class TableWriter(ExitStack):
                 self._columns[column.stored] = scratch_file
 
     def append(self, columns: ColumnArrays) -> None:
-        """Add rows, with arrays of one length for all stored columns."""
+        """Add rows: an array for each stored column, all of the same length."""
+        num_rows = 0
         for column in self._spec.stored_columns:
             values = columns[column.stored or ""]
+            num_rows = len(values)
             collected = self._columns[column.stored]
             if isinstance(collected, list):
                 collected.extend(values)
             else:
-                np.ascontiguousarray(values, dtype=numpy_dtype(column.kind)).tofile(collected)
-        self.num_rows += len(columns[self._spec.stored_columns[0].stored or ""])
+                array = np.ascontiguousarray(values, dtype=numpy_dtype(column.kind))
+                array.tofile(collected)
+        self.num_rows += num_rows
 
     def finish(self, metadata: Mapping[str, str]) -> None:
-        """Write the table's file, with metadata of the table."""
+        """Write the table's file, with this metadata."""
         import pyarrow as pa
 
         columns = {
-            column.stored or "": self._collected(column) for column in self._spec.stored_columns
+            column.stored or "": self._read_collected(column)
+            for column in self._spec.stored_columns
         }
         schema = arrow_schema(self._spec).with_metadata(dict(metadata))
         with (
@@ -106,18 +107,19 @@ class TableWriter(ExitStack):
         ):
             writer.write_batch(record_batch(self._spec, columns))
 
-    def _collected(self, column: Column) -> Any:
+    def _read_collected(self, column: Column) -> Any:
         collected = self._columns[column.stored]
         dtype = numpy_dtype(column.kind)
         if isinstance(collected, list):
             return collected
-        shape = (self.num_rows, width(column.kind)) if width(column.kind) > 1 else (self.num_rows,)
+        num_elements = width(column.kind)
+        shape = (self.num_rows, num_elements) if num_elements > 1 else (self.num_rows,)
         if not self.num_rows:
             return np.zeros(shape, dtype=dtype)
         collected.flush()
         try:
             return np.memmap(collected, dtype=dtype, mode="r", shape=shape)
-        except OSError:  # The file system cannot map files.
+        except OSError:  # the file system cannot map files
             collected.seek(0)
             return np.fromfile(collected, dtype=dtype).reshape(shape)
 
@@ -140,20 +142,20 @@ class StoredTable:
     """
 
     def __init__(self, folder: Path, spec: TableSpec) -> None:
-        """Map the file; raises IndexStoreError if it cannot be read."""
+        """Map the table's file; raise IndexStoreError if it cannot be read."""
         import pyarrow as pa
 
         path = table_path(folder, spec.name)
         try:
             batch = pa.ipc.open_file(mapped_file(path)).get_batch(0)
-            fault = _batch_fault(spec, batch)
+            fault = _find_batch_fault(spec, batch)
             if fault:
                 raise OSError(fault)
             self.views = views(spec, batch)
             self.words = _decode_metadata(batch.schema)
         except FileNotFoundError:
             raise IndexStoreError(
-                f"{path}: no such file: the index was made again; open the release again"
+                f"{path}: no such file, as the index was made again; open the release again"
             ) from None
         except (OSError, pa.ArrowException, IndexError, ValueError) as error:
             raise IndexStoreError(
@@ -166,10 +168,7 @@ class StoredTable:
 
     @cached_property
     def table(self) -> Any:
-        """The `pyarrow.Table` over the mapped memory.
-
-        Raises IndexStoreError if Arrow could not read a value.
-        """
+        """`pyarrow.Table` over the mapped memory; raises IndexStoreError if a value is damaged."""
         import pyarrow as pa
 
         table = pa.Table.from_batches([self._batch])
@@ -184,7 +183,7 @@ class StoredTable:
 def streams(
     tables: Sequence[tuple[TableSpec, ColumnArrays]], metadata: Mapping[str, str] | None = None
 ) -> bytes:
-    """Return the rows of each table as compressed Arrow streams one after the other."""
+    """Return the rows of several tables as consecutive compressed Arrow streams."""
     import pyarrow as pa
 
     options = pa.ipc.IpcWriteOptions(compression="zstd", use_threads=False)
@@ -198,7 +197,7 @@ def streams(
 
 
 def streams_metadata(content: bytes) -> dict[str, str]:
-    """Return the metadata of `streams`."""
+    """Return the metadata that `streams` stored."""
     import pyarrow as pa
 
     return _decode_metadata(pa.ipc.open_stream(content).schema)
@@ -210,7 +209,7 @@ def _decode_metadata(schema: Any) -> dict[str, str]:
 
 
 def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]] | None:
-    """Return stored column → values of each table in `streams`; None if they are other tables."""
+    """Read each table's stored column → values, as `streams` wrote them; None for other tables."""
     import pyarrow as pa
 
     options = pa.ipc.IpcReadOptions(use_threads=False)
@@ -218,7 +217,7 @@ def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]
     for spec in specs:
         # Reading to the stream's end leaves the source where the next stream starts.
         batches = list(pa.ipc.open_stream(source, options=options))
-        if len(batches) != 1 or _batch_fault(spec, batches[0]):
+        if len(batches) != 1 or _find_batch_fault(spec, batches[0]):
             return None
         columns = views(spec, batches[0])
         tables.append({name: unpacked(view) for name, view in columns.items()})
@@ -226,15 +225,12 @@ def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]
 
 
 def is_streamable(spec: TableSpec) -> bool:
-    """Return whether every column has a fixed width, so that rows can be appended to raw files."""
-    for column in spec.stored_columns:
-        if isinstance(column.kind, Word | Struct):
-            return False
-    return True
+    """Return whether every column has a fixed width, so rows can be appended to raw files."""
+    return not any(isinstance(column.kind, Word | Struct) for column in spec.stored_columns)
 
 
 def numpy_dtype(kind: ColumnKind) -> np.dtype[Any]:
-    """Return the element type of a fixed-width column (bool: one byte a row until it is packed)."""
+    """Return the element type of a fixed-width column; a bool takes one byte until it is packed."""
     if isinstance(kind, Key):
         return np.dtype(np.int32)
     if isinstance(kind, Choice):
@@ -245,8 +241,10 @@ def numpy_dtype(kind: ColumnKind) -> np.dtype[Any]:
 
 
 def width(kind: ColumnKind) -> int:
-    """Return the number of elements a row of a fixed-width column."""
-    return kind.length if isinstance(kind, Vector) else 1
+    """Return the number of elements in each row of a fixed-width column."""
+    if isinstance(kind, Vector):
+        return kind.length
+    return 1
 
 
 @cache
@@ -261,7 +259,7 @@ def arrow_type(kind: ColumnKind) -> Any:
     if isinstance(kind, Vector):
         return pa.list_(pa.float64(), kind.length)
     if isinstance(kind, Struct):
-        return _struct_type(kind.record)
+        return _make_struct_type(kind.record)
     return pa.from_numpy_dtype(numpy_dtype(kind))
 
 
@@ -278,10 +276,12 @@ def arrow_schema(spec: TableSpec) -> Any:
 
 
 def record_batch(spec: TableSpec, columns: ColumnArrays) -> Any:
-    """Return one Arrow record batch over columns; numbers are not copied (bools are packed)."""
+    """Make an Arrow record batch from columns; numbers are not copied, and bools are packed."""
     import pyarrow as pa
 
-    arrays = [_arrow_array(column, columns[column.stored or ""]) for column in spec.stored_columns]
+    arrays = [
+        _make_arrow_array(column, columns[column.stored or ""]) for column in spec.stored_columns
+    ]
     return pa.RecordBatch.from_arrays(arrays, schema=arrow_schema(spec))
 
 
@@ -293,12 +293,12 @@ def views(spec: TableSpec, batch: Any) -> dict[str, Any]:
     columns = {}
     for index, column in enumerate(spec.stored_columns):
         if column.stored:
-            columns[column.stored] = _view(column.kind, batch.column(index))
+            columns[column.stored] = _make_view(column.kind, batch.column(index))
     return columns
 
 
-def _batch_fault(spec: TableSpec, batch: Any) -> str | None:
-    """Return why a batch from a file is not one of the table's; None if its parts fit together.
+def _find_batch_fault(spec: TableSpec, batch: Any) -> str | None:
+    """Return why a batch from a file does not match the table's columns; None if it does.
 
     Fixed-width columns are not read: only their sizes are checked, at no cost for a table of any
     length. Words and structs occur in small tables and are read in full, since Arrow would follow a
@@ -308,7 +308,7 @@ def _batch_fault(spec: TableSpec, batch: Any) -> str | None:
 
     expected = [(column.stored, arrow_type(column.kind)) for column in spec.stored_columns]
     if [(field.name, field.type) for field in batch.schema] != expected:
-        return "its columns are not those of the table"
+        return "its columns differ from those of the table"
     try:
         batch.validate(full=not is_streamable(spec))
     except (pa.ArrowException, ValueError) as error:
@@ -317,10 +317,10 @@ def _batch_fault(spec: TableSpec, batch: Any) -> str | None:
 
 
 def value_fault_of(spec: TableSpec, table: Any) -> str | None:
-    """Return what Arrow itself could not read of a table without `_batch_fault`; None if nothing.
+    """Return a fault in a table's values that `_find_batch_fault` does not look for, or None.
 
-    The codes of all choices are read, for 8.6 million rows in 20 ms. The devkit's own views use no
-    dictionary.
+    The codes of all choices are read, which takes 20 ms for 8.6 million rows. The devkit's own
+    views use no dictionary.
     """
     import pyarrow as pa
 
@@ -331,63 +331,72 @@ def value_fault_of(spec: TableSpec, table: Any) -> str | None:
                 words = table[column.stored].chunk(0).dictionary
                 words.validate(full=True)
                 if words.to_pylist() != list(column.kind.values):
-                    return f"the words of {column.stored} are not those of the table"
+                    return f"the words of {column.stored} differ from those of the table"
     except (pa.ArrowException, ValueError) as error:
         return str(error)
     return None
 
 
 def unpacked(view: Any) -> Any:
-    """Return a view in the form for `record_batch`: bools as an array, words as a list."""
+    """Convert a view for `record_batch`: bools to an array, words to a list."""
     if isinstance(view, BitView):
         return view[:]
-    return view if isinstance(view, np.ndarray) else view.to_pylist()
+    if isinstance(view, np.ndarray):
+        return view
+    return view.to_pylist()
 
 
-def _struct_type(record: type) -> Any:
+def _make_struct_type(record: type) -> Any:
     import pyarrow as pa
 
-    def field_type(kind: ColumnKind) -> Any:
-        if not isinstance(kind, Items):
-            return arrow_type(kind)
-        item_type = pa.int64() if kind.type == "integer" else pa.string()
-        return pa.list_(item_type, 2)
+    fields = []
+    for column in record_columns(record):
+        if isinstance(column.kind, Items):
+            item_type = pa.int64() if column.kind.type == "integer" else pa.string()
+            field_type = pa.list_(item_type, 2)
+        else:
+            field_type = arrow_type(column.kind)
+        fields.append((column.field, field_type))
+    return pa.struct(fields)
 
-    return pa.struct([(column.field, field_type(column.kind)) for column in record_columns(record)])
 
-
-def _arrow_array(column: Column, values: Any) -> Any:
+def _make_arrow_array(column: Column, values: Any) -> Any:
     import pyarrow as pa
 
     kind = column.kind
     if isinstance(kind, Word | Struct):
         return pa.array(values, type=arrow_type(kind))
     data = np.ascontiguousarray(values, dtype=numpy_dtype(kind))
-    validity = _validity(data, len(values)) if column.nullable else None
+    validity = _make_validity(data, len(values)) if column.nullable else None
     if isinstance(kind, Vector):
-        children = [pa.Array.from_buffers(pa.float64(), data.size, [None, pa.py_buffer(data)])]
-        return pa.Array.from_buffers(arrow_type(kind), len(values), [validity], children=children)
-    content = pa.py_buffer(np.packbits(data, bitorder="little") if data.dtype == np.bool_ else data)
+        elements = pa.Array.from_buffers(pa.float64(), data.size, [None, pa.py_buffer(data)])
+        return pa.Array.from_buffers(arrow_type(kind), len(values), [validity], children=[elements])
+    if data.dtype == np.bool_:
+        data = np.packbits(data, bitorder="little")
+    content = pa.py_buffer(data)
     if isinstance(kind, Choice):
         codes = pa.Array.from_buffers(pa.int8(), len(values), [validity, content])
         return pa.DictionaryArray.from_arrays(codes, pa.array(kind.values), safe=False)
     return pa.Array.from_buffers(arrow_type(kind), len(values), [validity, content])
 
 
-def _validity(data: AnyArray, length: int) -> Any:
-    """Return Arrow's bitmap of rows that are not null, from the values stored under nulls."""
+def _make_validity(data: AnyArray, length: int) -> Any:
+    """Return Arrow's bitmap of non-null rows; −1 and NaN mark nulls."""
     import pyarrow as pa
 
     if not length:
         return None
-    marker = data.reshape(length, -1)[:, 0]
-    valid = ~np.isnan(marker) if data.dtype.kind == "f" else marker != NULL_INTEGER
-    if valid.all():
+    first_elements = data.reshape(length, -1)[:, 0]
+    if data.dtype.kind == "f":
+        is_valid = ~np.isnan(first_elements)
+    else:
+        is_valid = first_elements != NULL_INTEGER
+    if is_valid.all():
         return None
-    return pa.py_buffer(np.packbits(valid, bitorder="little"))
+    return pa.py_buffer(np.packbits(is_valid, bitorder="little"))
 
 
-def _view(kind: ColumnKind, array: Any) -> Any:
+def _make_view(kind: ColumnKind, array: Any) -> Any:
     if isinstance(kind, Word | Struct | Derived):
         return array
     if isinstance(kind, Choice):
@@ -395,15 +404,16 @@ def _view(kind: ColumnKind, array: Any) -> Any:
     length = len(array)
     if isinstance(kind, Vector):
         content = array.values.buffers()[1]
-        size = length * kind.length
-        return _buffer(content, np.dtype(np.float64), size).reshape(length, kind.length)
+        elements = _view_buffer(content, np.dtype(np.float64), length * kind.length)
+        return elements.reshape(length, kind.length)
     content = array.buffers()[1]
     if isinstance(kind, Number) and kind.dtype == "bool":
-        return BitView(_buffer(content, np.dtype(np.uint8), (length + 7) // 8), length)
-    return _buffer(content, numpy_dtype(kind), length)
+        packed_bits = _view_buffer(content, np.dtype(np.uint8), (length + 7) // 8)
+        return BitView(packed_bits, length)
+    return _view_buffer(content, numpy_dtype(kind), length)
 
 
-def _buffer(content: Any, dtype: np.dtype[Any], count: int) -> AnyArray:
+def _view_buffer(content: Any, dtype: np.dtype[Any], count: int) -> AnyArray:
     if not count:
         return np.zeros(0, dtype=dtype)
     return np.frombuffer(content, dtype=dtype, count=count)

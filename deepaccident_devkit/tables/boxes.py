@@ -1,7 +1,7 @@
-"""Data derived from labels: world poses, chains, instances, tracks, and visibility of actors.
+"""Data derived from labels: world poses, chains, instances, tracks and visible actors.
 
-Arrays are over the N boxes of one scenario, in the order agent, frame, row. Visibility follows the
-released rule (docs/released_code.md, Visibility and attributes).
+Arrays have one row for each of the N boxes of a scenario, sorted by agent, frame and label row.
+Visibility follows the released rule (docs/released_code.md, Visibility and attributes).
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,32 +36,33 @@ from deepaccident_devkit.taxonomy import (
 
 NEAR_VEHICLE = 10.0
 NEAR_INFRASTRUCTURE = 15.0
-"""Metres from the LiDAR below which (strictly) a box is near."""
+"""Distance from the LiDAR of a vehicle or a pole, metres, below which a box counts as near."""
 _IS_SMALL = np.array([name in SMALL_CATEGORIES for name in CATEGORIES])
 MIN_BOXES: Final = 20
-"""Moving boxes that a scenario needs to show the frame of its velocities."""
-# m/s; slower actors are not used.
+"""Smallest number of moving boxes that reveals the frame of the velocities."""
+# Slower actors are ignored, m/s.
 _MIN_SPEED = 1.0
-# Error of a velocity that fits: absolute, and as a share of the speed.
+# Largest error of a velocity that fits: absolute, and as a fraction of the speed.
 _TOLERANCE_MPS = 0.5
 _TOLERANCE_SHARE = 0.15
-# Share of the boxes that the best frame must fit.
+# Smallest share of boxes that fit the best frame.
 _MIN_FIT_SHARE = 0.5
-# Share of the best frame's boxes with which the release's own frame is preferred.
+# The release's own frame is preferred if it fits at least this share of the best frame's boxes.
 _RELEASED_FIT_SHARE = 0.95
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScenarioBoxes:
-    """The boxes of one scenario and where each was recorded.
+    """The boxes of one scenario, and the sample in which each was recorded.
 
     Attributes:
         labels: The N boxes themselves.
-        sample: Row of each box's sample within the scenario, shape (N,).
-        agent: Row of its agent within the scenario, shape (N,).
+        sample: Index of the box's sample within the scenario, shape (N,).
+        agent: Index of the sample's agent within the scenario, shape (N,).
         frame: Frame number, shape (N,), from 1.
-        agent_order: Position of its agent in `taxonomy.AGENTS`, shape (N,).
-        actor: CARLA id, shape (N,); the agent's own for −100, −1 where unknown.
+        agent_order: Index of the agent in `taxonomy.AGENTS`, shape (N,).
+        actor: CARLA id, shape (N,); where the label has −100 (the recording agent itself), that
+            agent's id; −1 if unknown.
         world_from_lidar: Pose of every sample, shape (S, 4, 4).
     """
 
@@ -78,7 +79,7 @@ class ScenarioBoxes:
 
 
 def box_rotation(boxes: ScenarioBoxes) -> FloatArray:
-    """Return quaternions of the boxes in their LiDAR frames, shape (N, 4)."""
+    """Return the boxes' orientations in their LiDAR frames as quaternions, shape (N, 4)."""
     return quaternions.from_yaw(boxes.labels.yaw)
 
 
@@ -90,22 +91,22 @@ def world_centers(boxes: ScenarioBoxes) -> FloatArray:
 
 
 def world_rotations(boxes: ScenarioBoxes) -> FloatArray:
-    """Return quaternions of the boxes in world, shape (N, 4), with an agent's pitch and roll."""
+    """Return the boxes' orientations in world (N, 4), including the agent's pitch and roll."""
     rotations = quaternions.from_matrix(boxes.world_from_lidar[:, :3, :3])
     multipliers = quaternions.left_multiplier(rotations)[boxes.sample]
     return as_floats(np.einsum("nij,nj->ni", multipliers, box_rotation(boxes)))
 
 
 def to_lidar(boxes: ScenarioBoxes, world_vectors: FloatArray) -> FloatArray:
-    """Return world vectors (N, 3) along the axes of each box's LiDAR frame."""
+    """Rotate world vectors (N, 3) into each box's LiDAR frame."""
     rotations = boxes.world_from_lidar[boxes.sample, :3, :3]
     return as_floats(np.einsum("nji,nj->ni", rotations, world_vectors))
 
 
 def chains(boxes: ScenarioBoxes) -> tuple[AnyArray, AnyArray]:
-    """Return rows of the same agent's previous and next box of the same label id, shape (N,) each.
+    """Return the rows of the agent's previous and next box with the same label id, (N,) each.
 
-    Rows are −1 at the ends and for id −1.
+    Rows are −1 at the ends of a track and for boxes with id −1.
     """
     label_id = boxes.labels.actor_id
     order = np.lexsort((np.arange(len(boxes)), boxes.frame, label_id, boxes.agent))
@@ -121,10 +122,15 @@ def chains(boxes: ScenarioBoxes) -> tuple[AnyArray, AnyArray]:
 
 
 def instances(boxes: ScenarioBoxes) -> tuple[Mapping[str, AnyArray], AnyArray]:
-    """Return columns of the scenario's instances, by actor id, and each box's instance row (N,)."""
-    known = np.flatnonzero(boxes.actor != UNTRACKED_ID)
-    keys = (known, boxes.agent_order[known], boxes.frame[known], boxes.actor[known])
-    order = known[np.lexsort(keys)]
+    """Return the instances' columns, sorted by actor id, and the instance of each box (N,)."""
+    known_rows = np.flatnonzero(boxes.actor != UNTRACKED_ID)
+    keys = (
+        known_rows,
+        boxes.agent_order[known_rows],
+        boxes.frame[known_rows],
+        boxes.actor[known_rows],
+    )
+    order = known_rows[np.lexsort(keys)]
     actors, start, count = np.unique(boxes.actor[order], return_index=True, return_counts=True)
     instance_row = np.full(len(boxes), NULL_INTEGER, dtype=np.int32)
     instance_row[order] = np.repeat(np.arange(len(actors)), count)
@@ -141,26 +147,34 @@ def instances(boxes: ScenarioBoxes) -> tuple[Mapping[str, AnyArray], AnyArray]:
 
 
 def tracks(boxes: ScenarioBoxes, instance_row: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Return the box that stands for each actor at each frame, and the agents that annotated it.
+    """Return the box that represents each actor in each frame, and the agents that annotated it.
 
-    It is the box of the first agent in order that saw the actor from outside. An agent's own row
-    only counts if nobody else annotated it, since it lies up to 0.3 m from where the others see it.
+    It is the box of the first agent, in order, other than the actor itself. An agent's own row is
+    used only if no other agent annotated that agent, because it is off by up to 0.3 m.
 
     Returns:
-        Rows of boxes, shape (M,), by frame and instance, and bit masks of agents, shape (M,).
+        Rows of boxes, shape (M,), sorted by frame and instance, and bit masks of agents, shape
+            (M,).
     """
-    known = np.flatnonzero(instance_row != NULL_INTEGER)
-    is_own = boxes.labels.actor_id[known] == OWN_ACTOR_ID
-    keys = (known, boxes.agent_order[known], is_own, instance_row[known], boxes.frame[known])
-    order = known[np.lexsort(keys)]
+    known_rows = np.flatnonzero(instance_row != NULL_INTEGER)
+    is_own = boxes.labels.actor_id[known_rows] == OWN_ACTOR_ID
+    keys = (
+        known_rows,
+        boxes.agent_order[known_rows],
+        is_own,
+        instance_row[known_rows],
+        boxes.frame[known_rows],
+    )
+    order = known_rows[np.lexsort(keys)]
     if not len(order):
         return order, np.zeros(0, dtype=np.uint8)
-    starts = _group_starts(boxes.frame[order], instance_row[order])
+    starts = _find_group_starts(boxes.frame[order], instance_row[order])
     bits = np.left_shift(1, boxes.agent_order[order]).astype(np.uint8)
     return order[starts], np.bitwise_or.reduceat(bits, np.flatnonzero(starts))
 
 
-def _group_starts(*keys: AnyArray) -> BoolArray:
+def _find_group_starts(*keys: AnyArray) -> BoolArray:
+    """Return which rows start a group of equal keys; the keys must be sorted."""
     starts = np.ones(len(keys[0]), dtype=bool)
     changes = [key[1:] != key[:-1] for key in keys]
     starts[1:] = np.any(changes, axis=0)
@@ -175,19 +189,19 @@ def visible_mask(
     *,
     infrastructure: ArrayLike,
 ) -> BoolArray:
-    """Return which boxes of an agent's label the agent sees, from its points and cameras only.
+    """Return which boxes of its label an agent sees, using only its own LiDAR points and cameras.
 
-    Boxes of several agents' labels can be given at once. Distant boxes need a camera and points (2,
-    or 1 for two-wheelers and pedestrians); near ones need a camera or points (5, or 2; near the
-    infrastructure 1).
+    Boxes from several agents' labels can be passed at once. A distant box must be seen by a camera
+    and have at least 2 points (two-wheelers and pedestrians: 1). A near box must be seen by a
+    camera or have at least 5 points (two-wheelers and pedestrians: 2; near the infrastructure: 1).
 
     Args:
         xy: Positions in the agent's LiDAR frame, shape (N, 2), metres, either handedness.
         category: Class indices, shape (N,).
         num_lidar_pts: The agent's LiDAR points in each box, shape (N,).
         camera_visible: Whether a camera sees the box, shape (N,), bool.
-        infrastructure: Whether the agent is the roadside pole; for boxes of several agents shape
-            (N,), bool.
+        infrastructure: Whether the agent is the roadside pole, bool; for boxes of several agents,
+            shape (N,).
 
     Returns:
         Mask of visible boxes, shape (N,), bool.
@@ -195,20 +209,22 @@ def visible_mask(
     position = as_floats(xy).reshape(-1, 2)
     points = np.asarray(num_lidar_pts)
     camera = np.asarray(camera_visible, dtype=bool)
-    small = _IS_SMALL[np.asarray(category, dtype=np.intp)]
-    # Squares and root, not hypot: the last bit decides about boxes on the very edge.
-    distance = np.sqrt(position[:, 0] * position[:, 0] + position[:, 1] * position[:, 1])
-    visible_if_distant = camera & (points >= np.where(small, 1, 2))
-    min_points = np.where(infrastructure, 1, np.where(small, 2, 5))
+    is_small = _IS_SMALL[np.asarray(category, dtype=np.intp)]
+    # Not np.hypot: its last bit may differ, which matters for boxes exactly at the limit.
+    x = position[:, 0]
+    y = position[:, 1]
+    distance = np.sqrt(x * x + y * y)
+    visible_if_distant = camera & (points >= np.where(is_small, 1, 2))
+    min_points = np.where(infrastructure, 1, np.where(is_small, 2, 5))
     visible_if_near = camera | (points >= min_points)
-    near = distance < np.where(infrastructure, NEAR_INFRASTRUCTURE, NEAR_VEHICLE)
-    return np.where(near, visible_if_near, visible_if_distant)
+    is_near = distance < np.where(infrastructure, NEAR_INFRASTRUCTURE, NEAR_VEHICLE)
+    return np.where(is_near, visible_if_near, visible_if_distant)
 
 
 def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> IntArray:
     """Return the actors that at least one agent sees, each id once, ascending.
 
-    The agents' own rows (−100) and untracked ones (−1) are left out.
+    Agents' own rows (−100) and untracked rows (−1) are left out.
 
     Args:
         masks: `visible_mask` of each agent.
@@ -223,13 +239,13 @@ def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> I
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VelocityFit(ShortRepr):
-    """Boxes with velocities that fit their displacement in each of `VELOCITY_FRAMES`.
+    """Counts of boxes whose velocity fits their displacement, for each of `VELOCITY_FRAMES`.
 
-    Fits add up over scenarios.
+    Counts of several scenarios add up.
 
     Attributes:
-        boxes: Number of moving, tracked boxes of others that have both velocities.
-        fits: Frame → boxes that fit.
+        boxes: Number of moving, tracked boxes (not agents' own) that have both velocities.
+        fits: Frame → number of boxes that fit.
     """
 
     boxes: int
@@ -237,10 +253,10 @@ class VelocityFit(ShortRepr):
 
     @property
     def best(self) -> str | None:
-        """The frame that fits most boxes; None if there are too few, or none fits half of them.
+        """Frame that fits most boxes; None for too few boxes, or if no frame fits half of them.
 
-        The release's own frame is taken where it fits nearly as many: on a straight road along x
-        all frames are alike.
+        The release's own frame is preferred if it fits nearly as many: on a straight road along x,
+        all frames fit equally well.
         """
         name = max(self.fits, key=lambda frame: self.fits[frame])
         if self.fits[RELEASED_VELOCITY_FRAME] >= _RELEASED_FIT_SHARE * self.fits[name]:
@@ -251,7 +267,7 @@ class VelocityFit(ShortRepr):
 
 
 def total_fit(fits: list[VelocityFit]) -> VelocityFit:
-    """Return the sum over scenarios."""
+    """Return the sum of several scenarios' counts."""
     return VelocityFit(
         boxes=sum(fit.boxes for fit in fits),
         fits={name: sum(fit.fits[name] for fit in fits) for name in VELOCITY_FRAMES},
@@ -261,38 +277,43 @@ def total_fit(fits: list[VelocityFit]) -> VelocityFit:
 def displacement_velocities(
     centers: FloatArray, agent: IntArray, label_id: IntArray, frame: IntArray
 ) -> FloatArray:
-    """Return velocities in world from displacements at 10 Hz, shape (N, 3), m/s; NaN where unknown.
+    """Return world velocities (N, 3), m/s, from displacements at 10 Hz; NaN if unknown.
 
-    A track is one agent's rows of one label id (−100 is its own track). Differences are central
-    where the frames before and after exist, one-sided where only one does, and NaN without any and
-    for untracked rows.
+    A track consists of one agent's rows with one label id (−100 is the agent's own track).
+    Differences are central if the frames before and after exist, and one-sided if only one does.
+    They are NaN if neither exists, and for untracked rows.
 
     Args:
         centers: Box centres in world, shape (N, 3), metres.
-        agent: Row of the agent, shape (N,).
+        agent: Index of the agent, shape (N,).
         label_id: Ids of the labels, shape (N,).
         frame: Frame numbers, shape (N,).
     """
     keys = np.column_stack([agent, label_id, frame])
-    steps, row_of_step, step_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    steps, row_of_step, step_of_row = np.unique(
+        keys, axis=0, return_index=True, return_inverse=True
+    )
+    step_tracks = steps[:, :2]
+    step_ids = steps[:, 1]
+    step_frames = steps[:, 2]
     position = centers[row_of_step]
-    same_track = (steps[1:, :2] == steps[:-1, :2]).all(axis=1)
-    follows = same_track & (steps[1:, 2] == steps[:-1, 2] + 1)
-    before = np.concatenate([[False], follows])[: len(steps)]
-    after = np.concatenate([follows, [False]])[: len(steps)]
+    is_same_track = (step_tracks[1:] == step_tracks[:-1]).all(axis=1)
+    follows = is_same_track & (step_frames[1:] == step_frames[:-1] + 1)
+    has_previous = np.concatenate([[False], follows])[: len(steps)]
+    has_next = np.concatenate([follows, [False]])[: len(steps)]
     index = np.arange(len(steps))
-    span = (before.astype(np.float64) + after) * FRAME_PERIOD
-    known = (before | after) & (steps[:, 1] != UNTRACKED_ID)
+    seconds = (has_previous.astype(np.float64) + has_next) * FRAME_PERIOD
+    is_known = (has_previous | has_next) & (step_ids != UNTRACKED_ID)
     velocity = np.full((len(steps), 3), np.nan)
-    # Labels may hold the largest numbers.
+    # Labels may contain the largest floats.
     with np.errstate(over="ignore"):
-        moved = position[index + after] - position[index - before]
-        velocity[known] = moved[known] / span[known, None]
-    return velocity[step_of.reshape(-1)]
+        displacement = position[index + has_next] - position[index - has_previous]
+        velocity[is_known] = displacement[is_known] / seconds[is_known, None]
+    return velocity[step_of_row.reshape(-1)]
 
 
 def fit_velocities(boxes: ScenarioBoxes, displacement: FloatArray) -> VelocityFit:
-    """Return how many labels' velocities fit their displacements (N, 3) in each frame."""
+    """Count the label velocities that fit their displacements (N, 3), m/s, for each frame."""
     rows, matches = match_velocities(boxes, displacement)
     fits = {name: int(mask.sum()) for name, mask in matches.items()}
     return VelocityFit(boxes=len(rows), fits=fits)
@@ -301,19 +322,21 @@ def fit_velocities(boxes: ScenarioBoxes, displacement: FloatArray) -> VelocityFi
 def match_velocities(
     boxes: ScenarioBoxes, displacement: FloatArray
 ) -> tuple[IntArray, dict[str, BoolArray]]:
-    """Match the labels' velocities with displacements (N, 3) in each of `VELOCITY_FRAMES`.
+    """Compare label velocities with displacements (N, 3), m/s, for each of `VELOCITY_FRAMES`.
 
     Returns:
-        Rows (M,) of the boxes that are used, and frame → mask (M,) of boxes that fit.
+        Rows (M,) of the boxes that were compared, and frame → mask (M,) of the boxes that fit.
     """
     label_id = boxes.labels.actor_id
     velocity = boxes.labels.velocity
     speed = np.linalg.norm(displacement[:, :2], axis=1)
-    tracked = (label_id != OWN_ACTOR_ID) & (label_id != UNTRACKED_ID) & (label_id < STATIC_ACTOR_ID)
-    rows = np.flatnonzero(tracked & (speed > _MIN_SPEED) & np.isfinite(velocity).all(axis=1))
+    is_other = (label_id != OWN_ACTOR_ID) & (label_id != UNTRACKED_ID)
+    is_moving = (label_id < STATIC_ACTOR_ID) & (speed > _MIN_SPEED)
+    is_finite = np.isfinite(velocity).all(axis=1)
+    rows = np.flatnonzero(is_other & is_moving & is_finite)
     tolerance = _TOLERANCE_MPS + _TOLERANCE_SHARE * speed[rows]
     matches = {}
-    for name, angle in _angles(boxes).items():
+    for name, angle in _compute_angles(boxes).items():
         turned = turned_vectors(velocity[rows], angle[rows])
         error = np.linalg.norm(turned - displacement[rows, :2], axis=1)
         matches[name] = error < tolerance
@@ -323,29 +346,29 @@ def match_velocities(
 def decoded_velocities(
     boxes: ScenarioBoxes, displacement: FloatArray, frame: str | None
 ) -> FloatArray:
-    """Return velocities in world, shape (N, 3), m/s: the labels' own, or displacements (N, 3).
+    """Return world velocities (N, 3), m/s, from labels, or from displacements if labels have none.
 
-    Displacements are used for labels without a velocity. A label has no vertical velocity: it comes
-    from the displacement, and is 0 without one.
+    A label has no vertical velocity: that comes from the displacement, and is 0 if it is unknown.
 
     Args:
         boxes: Boxes of a scenario.
         displacement: Velocities from displacements, shape (N, 3), m/s.
         frame: Frame of the labels' velocities; None for the release's own.
     """
-    angles = _angles(boxes)[frame or RELEASED_VELOCITY_FRAME]
+    angles = _compute_angles(boxes)[frame or RELEASED_VELOCITY_FRAME]
     horizontal = turned_vectors(boxes.labels.velocity, angles)
-    # Own rows are in world, whatever the frame of the others.
-    own = boxes.labels.actor_id == OWN_ACTOR_ID
-    horizontal[own] = boxes.labels.velocity[own]
-    velocity = np.column_stack([horizontal, np.nan_to_num(displacement[:, 2])])
-    unknown = np.flatnonzero(np.isnan(horizontal[:, 0] + horizontal[:, 1]))
-    velocity[unknown] = displacement[unknown]
+    # Agents' own rows are in world, whatever the frame of the others.
+    is_own = boxes.labels.actor_id == OWN_ACTOR_ID
+    horizontal[is_own] = boxes.labels.velocity[is_own]
+    vertical = np.nan_to_num(displacement[:, 2])
+    velocity = np.column_stack([horizontal, vertical])
+    unknown_rows = np.flatnonzero(np.isnan(horizontal[:, 0] + horizontal[:, 1]))
+    velocity[unknown_rows] = displacement[unknown_rows]
     return velocity
 
 
-def _angles(boxes: ScenarioBoxes) -> dict[str, FloatArray]:
-    """Return frame → angles (N,) that turn the labels' velocities into world."""
+def _compute_angles(boxes: ScenarioBoxes) -> dict[str, FloatArray]:
+    """Return frame → angles (N,), radians, that rotate label velocities to world."""
     pose = boxes.world_from_lidar[boxes.sample]
     heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
     return {

@@ -1,11 +1,11 @@
-"""Columns of tables: their storage in Arrow, their form in records, and their meaning.
+"""Columns of tables: how they are stored in Arrow, how records show them, and what they mean.
 
-A record's fields are declared once, in `records.py`, as annotated types; everything else (the Arrow
-schema, the JSON Schemas, the records themselves) is derived from there, through the classes of this
+A record's fields are declared once, in `records.py`, as annotated types. Everything else (the Arrow
+schema, the JSON Schemas, the records themselves) is derived from there through the classes of this
 module.
 
-Null is stored twice: as Arrow's null, for readers of the table, and as a value under it (−1 or NaN)
-that the devkit reads through plain numpy views without looking at a bitmap.
+Null is stored twice: as Arrow's null, for other readers of the table, and as −1 or NaN in the data,
+which the devkit reads through plain numpy views without a bitmap.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ NULL_INTEGER = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Documented:
-    """Base of the kinds; `doc` is the meaning of the values."""
+    """Base of all kinds of columns; `doc` is the meaning of the values."""
 
     doc: str
 
@@ -51,7 +51,7 @@ class Vector(_Documented):
 
     @property
     def length(self) -> int:
-        """Number of stored values a row."""
+        """Number of values that are stored for each row."""
         return int(np.prod(self.shape))
 
 
@@ -98,9 +98,9 @@ class Column:
 
     Attributes:
         field: Name in records.
-        stored: Name in the Arrow table; None if it is not stored.
-        kind: Storage and form.
-        nullable: Whether a record may hold None.
+        stored: Name in the Arrow table; None if the column is not stored.
+        kind: How the column is stored and shown.
+        nullable: Whether the value in a record may be None.
     """
 
     field: str
@@ -123,7 +123,7 @@ class TableSpec:
         return tuple(column for column in self.columns if column.stored)
 
     def column(self, field: str) -> Column | None:
-        """Return the column of a record's field; None without any."""
+        """Return the column of a field; None if the records have no such field."""
         for column in self.columns:
             if column.field == field:
                 return column

@@ -1,13 +1,11 @@
-"""Indexing: the stored rows of each scenario with their sources, and joining them into tables."""
-
-from __future__ import annotations
+"""Indexing: store each scenario's rows with hashes of their sources, and join them into tables."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -39,9 +37,10 @@ from deepaccident_devkit.tables.scan import (
 )
 from deepaccident_devkit.taxonomy import CATEGORIES, MINI_SPLITS, SPLITS
 
-# Tables that are the same for every scenario and are not stored with any.
+_Sentences: TypeAlias = tuple[str, ...]
+# Tables that are the same for all scenarios, and are not stored with each.
 _SHARED_TABLES = ("sensor", "category")
-# Table → column that is not stored with a scenario, and its computation from others; it would be a
+# Table → column that is computed from others instead of stored with a scenario; it would take a
 # twentieth of the index.
 _COMPUTED_COLUMNS: Mapping[str, Mapping[str, Callable[[ColumnArrays], AnyArray]]] = {
     "annotation": {"rotation": lambda rows: quaternions.from_yaw(rows["yaw"])}
@@ -53,86 +52,93 @@ class SplitAssignment:
     """The splits of a release's scenarios.
 
     Attributes:
-        split_of: Scenario token → split, without scenarios of unknown split.
-        problems: Scenario token → reasons why it has no single folder or split, a sentence each.
-        unlisted: Scenarios that no split file lists, though every split has a file.
-        contradictions: Scenario token → contradictions of files and folders; the files win.
-        notices: Oddities without effect, a sentence each.
+        split_of: Scenario token → split; scenarios whose split is unknown are left out.
+        problems: Scenario token → reasons why its folder or split is not unique, one sentence each.
+        unlisted: Scenarios that no split file lists, although every split has a file.
+        contradictions: Scenario token → contradictions between split files and folders; the files
+            take precedence.
+        notices: Oddities without effect, one sentence each.
     """
 
     split_of: Mapping[str, str]
-    problems: Mapping[str, tuple[str, ...]]
+    problems: Mapping[str, _Sentences]
     unlisted: tuple[str, ...]
-    contradictions: Mapping[str, tuple[str, ...]]
-    notices: tuple[str, ...]
+    contradictions: Mapping[str, _Sentences]
+    notices: _Sentences
 
 
 def assign_splits(layout: ReleaseLayout) -> SplitAssignment:
-    """Read the split files and compare them with the folders; raises SplitFileError."""
-    listed = {split: set(read_split_file(path)) for split, path in layout.split_files.items()}
+    """Read split files and compare them with the folders; raise SplitFileError if unreadable."""
+    listed_tokens = {
+        split: set(read_split_file(path)) for split, path in layout.split_files.items()
+    }
     tokens = {scenario.token for scenario in layout.scenarios}
-    in_folder = {
-        scenario.token: scenario.folder
-        for scenario in layout.scenarios
-        if scenario.folder in SPLITS
-    }
-    in_files = {token: split for split in SPLITS for token in listed.get(split, ())}
-    split_of = {
-        token: split for token, split in {**in_folder, **in_files}.items() if token in tokens
-    }
+    in_split_folders = [scenario for scenario in layout.scenarios if scenario.folder in SPLITS]
+    split_by_folder = {scenario.token: scenario.folder for scenario in in_split_folders}
+    split_by_file: dict[str, str] = {}
+    for split in SPLITS:
+        split_by_file |= dict.fromkeys(listed_tokens.get(split, ()), split)
+    all_splits = split_by_folder | split_by_file
+    split_of = {token: split for token, split in all_splits.items() if token in tokens}
     unlisted: list[str] = []
-    if set(SPLITS) <= set(listed):
-        unlisted = sorted(tokens - set(in_files))
+    if set(SPLITS) <= set(listed_tokens):
+        unlisted = sorted(tokens - set(split_by_file))
     notices = []
     for split in SPLITS:
-        missing = len(listed.get(split, set()) - tokens)
+        missing = len(listed_tokens.get(split, set()) - tokens)
         if missing:
             scenarios = counted(missing, "scenario")
             notices.append(f"{layout.split_files[split]}: lists {scenarios} not in this release")
     return SplitAssignment(
         split_of=split_of,
-        problems=_find_misplaced(layout, listed),
+        problems=_find_misplaced(layout, listed_tokens),
         unlisted=tuple(unlisted),
-        contradictions=_find_contradictions(listed, in_folder),
+        contradictions=_find_contradictions(listed_tokens, split_by_folder),
         notices=tuple(notices),
     )
 
 
 def _find_misplaced(
-    layout: ReleaseLayout, listed: Mapping[str, set[str]]
-) -> dict[str, tuple[str, ...]]:
-    """Return scenario token → why it is in several splits or folders, a sentence each."""
-    folders_of: dict[str, list[str]] = {}
+    layout: ReleaseLayout, listed_tokens: Mapping[str, set[str]]
+) -> dict[str, _Sentences]:
+    """Return scenario token → a sentence for each reason why its split or folder is not unique."""
+    folders_by_token: dict[str, list[str]] = {}
     for scenario in layout.scenarios:
-        folders_of.setdefault(scenario.token, []).append(scenario.folder)
+        folders_by_token.setdefault(scenario.token, []).append(scenario.folder)
     messages: dict[str, list[str]] = {}
-    for group in (SPLITS, MINI_SPLITS):
-        for split, other in combinations([split for split in group if split in listed], 2):
-            files = f"{layout.split_files[split]} and {layout.split_files[other]}"
-            message = f"stands in two splits: {files}; remove it from one"
-            for token in sorted(listed[split] & listed[other] & folders_of.keys()):
+    for all_splits in (SPLITS, MINI_SPLITS):
+        splits = [split for split in all_splits if split in listed_tokens]
+        for first_split, second_split in combinations(splits, 2):
+            files = f"{layout.split_files[first_split]} and {layout.split_files[second_split]}"
+            message = f"is in two splits: {files}; remove it from one"
+            common_tokens = (
+                listed_tokens[first_split] & listed_tokens[second_split] & folders_by_token.keys()
+            )
+            for token in sorted(common_tokens):
                 messages.setdefault(token, []).append(message)
-    for token, folders in folders_of.items():
+    for token, folders in folders_by_token.items():
         if len(folders) > 1:
             paths = " and ".join(str(layout.root / folder) for folder in folders)
-            messages.setdefault(token, []).append(f"stands in two folders: {paths}; remove one")
+            messages.setdefault(token, []).append(f"is in two folders: {paths}; remove one")
     return {token: tuple(sentences) for token, sentences in messages.items()}
 
 
 def _find_contradictions(
-    listed: Mapping[str, set[str]], in_folder: Mapping[str, str]
-) -> dict[str, tuple[str, ...]]:
-    """Return scenario token → contradictions of split files and folders, a sentence each."""
+    listed_tokens: Mapping[str, set[str]], split_by_folder: Mapping[str, str]
+) -> dict[str, _Sentences]:
+    """Return scenario token → one sentence for each contradiction of split files and folders."""
     messages: dict[str, list[str]] = {}
-    for token, folder in in_folder.items():
+    for token, folder in split_by_folder.items():
         for split in SPLITS:
-            if split != folder and token in listed.get(split, ()):
-                messages.setdefault(token, []).append(f"lies in {folder}/, {split}.txt lists it")
-    for mini in MINI_SPLITS:
-        split = mini.removesuffix("_mini")
-        if split in listed:
-            for token in sorted(listed.get(mini, set()) - listed[split]):
-                messages.setdefault(token, []).append(f"{mini}.txt lists it, {split}.txt does not")
+            if split != folder and token in listed_tokens.get(split, ()):
+                message = f"is in the folder {folder}/, but {split}.txt lists it"
+                messages.setdefault(token, []).append(message)
+    for mini_split in MINI_SPLITS:
+        split = mini_split.removesuffix("_mini")
+        if split in listed_tokens:
+            message = f"{mini_split}.txt lists it, but {split}.txt does not"
+            for token in sorted(listed_tokens.get(mini_split, set()) - listed_tokens[split]):
+                messages.setdefault(token, []).append(message)
     return {token: tuple(sentences) for token, sentences in messages.items()}
 
 
@@ -142,15 +148,15 @@ class Outcome:
 
     Attributes:
         scenario: The scenario.
-        contents: `content_hashes` of its files; empty if it has none.
-        messages: Its faults, a sentence each.
-        notices: Parts that were left aside, a sentence each.
+        contents: `content_hashes` of its files; empty if it has no files.
+        messages: A sentence for each of its faults.
+        notices: A sentence for each part that was ignored.
     """
 
     scenario: ScenarioFolder
     contents: str = ""
-    messages: tuple[str, ...] = ()
-    notices: tuple[str, ...] = ()
+    messages: _Sentences = ()
+    notices: _Sentences = ()
 
     @property
     def indexed(self) -> bool:
@@ -159,46 +165,48 @@ class Outcome:
 
 
 def index_scenario(store: Store, scenario: ScenarioFolder, *, check_files: bool = False) -> Outcome:
-    """Store the rows of one scenario, unless they are stored and its files are unchanged.
+    """Store the rows of one scenario, unless they are already stored and its files are unchanged.
 
-    Files are compared by their times, and with `check_files` by their contents.
+    Files are compared by their times, and with `check_files` also by their contents.
     """
-    # The key is made before any file is read, so that a later edit changes it.
+    # The key is computed before any file is read, so a later edit changes it.
     key = f"{SCHEMA_VERSION}:{times_digest(scenario)}"
     token = scenario.token
     scan = scan_scenario(scenario)
     if not scan.agents and not scan.problems:
-        notice = f"{token}: its calib folders hold no files; left out"
+        notice = f"{token}: its calib folders contain no files; the scenario is excluded"
         return Outcome(scenario=scenario, notices=(*scan.notices, notice))
     faults: Sequence[Finding] = scan.problems
-    content = None if faults else store.kept(token, key, "index")
-    contents = None if content is None else streams_metadata(content).get(HASHES)
-    if contents is None or (check_files and contents != content_hashes(scenario)):
+    stored_rows = None if faults else store.read_result(token, key, "index")
+    hashes = None if stored_rows is None else streams_metadata(stored_rows).get(HASHES)
+    if hashes is None or (check_files and hashes != content_hashes(scenario)):
         files = None
         if not faults:
             files, faults = read_scenario(scenario, scan)
-        contents = content_hashes(scenario) if files is None else files.hashes
+        hashes = content_hashes(scenario) if files is None else files.hashes
         if files is not None:
-            store.keep(token, key, rows_to_keep(scenario_rows(files), contents))
-    notices = scan.notices if faults else (*scan.notices, *_end_notices(scenario, scan))
+            store.write_result(token, key, rows_to_keep(scenario_rows(files), hashes))
+    notices = scan.notices if faults else (*scan.notices, *_find_end_notices(scenario, scan))
     return Outcome(
-        scenario=scenario, contents=contents, messages=tuple(map(str, faults)), notices=notices
+        scenario=scenario, contents=hashes, messages=tuple(map(str, faults)), notices=notices
     )
 
 
-def _end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
-    """Yield a notice if an accident ends at another frame by meta (validation's `meta-frames`)."""
-    meta = read_meta(scenario.meta_path) if scan.has_meta else None
-    if meta and meta.collision and meta.recorded_frames != scan.num_frames:
+def _find_end_notices(scenario: ScenarioFolder, scan: ScenarioScan) -> Iterator[str]:
+    """Yield a notice if meta's last frame differs from the recording's (`meta-frames`)."""
+    if not scan.has_meta:
+        return
+    meta = read_meta(scenario.meta_path)
+    if meta.collision and meta.recorded_frames != scan.num_frames:
         yield (
-            f"{scenario.meta_path}: the recording does not end with the accident: times to the "
-            "impact are wrong; see: deepaccident validate"
+            f"{scenario.meta_path}: the recording does not end with the accident, so times to the "
+            "impact are wrong; for details, run deepaccident validate"
         )
 
 
 def rows_to_keep(tables: Mapping[str, ColumnArrays], contents: str) -> bytes:
-    """Return the stored form of one scenario's rows, with the hashes of their source files."""
-    rows = [(spec, tables[spec.name]) for spec in _stored_specs()]
+    """Encode one scenario's rows and the hashes of their source files for storage."""
+    rows = [(spec, tables[spec.name]) for spec in _list_stored_specs()]
     return streams(rows, {HASHES: contents})
 
 
@@ -207,15 +215,15 @@ def join_tables(
 ) -> None:
     """Write every table to a folder, from the stored rows and the split of each scenario.
 
-    Row keys count on, scenario after scenario. The table of scenarios carries the hashes of their
-    files, by token, as JSON. Raises OSError, and IndexStoreError if a file holds no rows of a
-    scenario.
+    Row keys continue from one scenario to the next. The metadata of the scenario table has the
+    hashes of the scenarios' files, by token, as JSON. OSError is raised if a file cannot be read or
+    written, and IndexStoreError if a file does not contain the rows of a scenario.
     """
     specs = table_specs()
     with ExitStack() as stack:
         writers = {
             spec.name: stack.enter_context(TableWriter(folder, specs[spec.name]))
-            for spec in _stored_specs()
+            for spec in _list_stored_specs()
         }
         for path, split in zip(scenarios, splits, strict=True):
             tables = _read_rows(path)
@@ -231,8 +239,8 @@ def join_tables(
     write_table(folder, specs["category"], {"name": codes, "index": codes})
 
 
-def _stored_specs() -> list[TableSpec]:
-    """Return the tables with rows of single scenarios, with their stored columns only."""
+def _list_stored_specs() -> list[TableSpec]:
+    """Return the tables that are stored with each scenario, with only their stored columns."""
     specs = []
     for name, spec in table_specs().items():
         if name not in _SHARED_TABLES:
@@ -243,10 +251,10 @@ def _stored_specs() -> list[TableSpec]:
 
 
 def _read_rows(path: Path) -> dict[str, dict[str, Any]]:
-    """Return table → stored column → values from a file with the content of `rows_to_keep`."""
+    """Read table → stored column → values from a file that `rows_to_keep` encoded."""
     import pyarrow as pa
 
-    specs = _stored_specs()
+    specs = _list_stored_specs()
     with pa.OSFile(str(path), "rb") as source:
         tables = read_streams(source, specs)
     if tables is None:
@@ -265,9 +273,9 @@ def _read_rows(path: Path) -> dict[str, dict[str, Any]]:
 def _shift_keys(
     spec: TableSpec, rows: Mapping[str, Any], first_rows: Mapping[str, int]
 ) -> dict[str, Any]:
-    """Return the rows with keys that count from the joined tables' start.
+    """Shift the keys of rows so that they count from the start of the joined tables.
 
-    Nulls and shared tables' keys stay.
+    Nulls, and the keys of shared tables, stay as they are.
     """
     shifted = dict(rows)
     for column in spec.stored_columns:

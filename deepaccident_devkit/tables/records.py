@@ -11,11 +11,10 @@ from typing import Annotated, Any, TypedDict, Union, get_args, get_origin, get_t
 
 from deepaccident_devkit.errors import TableError
 from deepaccident_devkit.support.nuscenes_names import table_remedy
-from deepaccident_devkit.support.text import meant_text, spelled
+from deepaccident_devkit.support.text import match_spelling, meant_text
 from deepaccident_devkit.tables.columns import (
     Choice,
     Column,
-    ColumnKind,
     Derived,
     Items,
     Key,
@@ -38,7 +37,29 @@ from deepaccident_devkit.taxonomy import (
 )
 
 SCHEMA_VERSION = 4
-"""Counts up whenever the stored columns, their meaning or the form of the index change."""
+"""Increases whenever the stored columns, their meaning or the format of the index change."""
+
+
+# Fields that several records share.
+_Direction = Annotated[str | None, Word(doc="Direction: straight, left or right.")]
+_ScenarioToken = Annotated[str, Key(table="scenario", doc="Its scenario.")]
+_FrameToken = Annotated[str, Key(table="frame", doc="Its frame.")]
+_AgentToken = Annotated[str, Key(table="agent", doc="Its agent.")]
+_Timestamp = Annotated[float, Number(dtype="float64", doc="Time since the first frame.", unit="s")]
+_TimeToImpact = Annotated[
+    float | None,
+    Number(
+        dtype="float64", doc="Time until the recorded impact; null without an impact.", unit="s"
+    ),
+]
+_SampleToken = Annotated[str, Key(table="sample", doc="Its sample.")]
+_SensorToken = Annotated[str, Key(table="sensor", doc="Its sensor.")]
+_Channel = Annotated[str, Choice(values=CHANNELS, doc="The release's folder name.")]
+_LabelCategory = Annotated[str, Choice(values=CATEGORIES, doc="The label's class.")]
+_BoxSize = Annotated[list[float], Vector(shape=(3,), doc="Full length, width, height.", unit="m")]
+_IsCollider = Annotated[
+    bool, Number(dtype="bool", doc="Whether meta names this actor as one of the pair.")
+]
 
 
 class CollisionRecord(TypedDict):
@@ -58,8 +79,8 @@ class CollisionRecord(TypedDict):
         Items(
             type="string",
             nullable=True,
-            doc="Which agents the pair are; null for a road user that records nothing, null where "
-            "meta is silent.",
+            doc="Agents in the pair; null for a road user that records nothing, and null if meta "
+            "names no agents.",
         ),
     ]
 
@@ -71,7 +92,7 @@ class ScenarioRecord(TypedDict):
         str, Derived(doc="`<scenario_type>/<name>`; a name alone occurs under several types.")
     ]
     name: Annotated[str, Word(doc="Folder name, `<Town>_type001_subtype000<k>_scenario000<nn>`.")]
-    scenario_type: Annotated[str, Word(doc="Such as `type1_subtype1_accident`.")]
+    scenario_type: Annotated[str, Word(doc="Type, such as `type1_subtype1_accident`.")]
     folder: Annotated[
         str, Word(doc="Folder of layout B below the dataroot (`train`, …), empty in layout A.")
     ]
@@ -88,33 +109,38 @@ class ScenarioRecord(TypedDict):
     ]
     town: Annotated[str, Word(doc="CARLA town, first part of the name.")]
     weather: Annotated[str | None, Word(doc="Clear, Cloudy, HardRain, …; null without meta.")]
-    time_of_day: Annotated[str | None, Choice(values=TIMES_OF_DAY, doc="Null without meta.")]
+    time_of_day: Annotated[
+        str | None, Choice(values=TIMES_OF_DAY, doc="Time of day; null without meta.")
+    ]
     road_type: Annotated[
-        str | None, Word(doc="`four-way junction` or `three-way junction`; null where unsaid.")
+        str | None,
+        Word(doc="`four-way junction` or `three-way junction`; null if meta does not say."),
     ]
     spawn_side: Annotated[
-        str | None, Word(doc="Where the other vehicle comes from: left, right, opposite….")
+        str | None, Word(doc="Where the other vehicle comes from: left, right, opposite, ….")
     ]
-    ego_direction: Annotated[str | None, Word(doc="straight, left or right.")]
-    other_direction: Annotated[str | None, Word(doc="straight, left or right.")]
+    ego_direction: _Direction
+    other_direction: _Direction
     collision: Annotated[
         CollisionRecord | None,
-        Struct(record=CollisionRecord, doc="Null if meta names no collision, or is missing."),
+        Struct(
+            record=CollisionRecord, doc="The collision; null if meta names none, or is missing."
+        ),
     ]
     accident_type: Annotated[
         int | None,
         Number(
             dtype="int8",
-            doc="The paper's design 1 to 12 that the accident realises; null for any other end.",
+            doc="Design of the paper (1 to 12) that the accident follows; null for any other end.",
         ),
     ]
     velocity_frame: Annotated[
         str | None,
         Choice(
             values=tuple(VELOCITY_FRAMES),
-            doc="What the labels' velocities turned out to be in, by the displacements of moving "
-            "boxes (see docs/conventions.md); null where too few boxes move or nothing fits. They "
-            "are decoded by it; by `released` where it is null.",
+            doc="Frame of the labels' velocities, found from the displacements of moving boxes "
+            "(docs/conventions.md); null if too few boxes move or no frame fits. Velocities are "
+            "decoded from this frame, or from `released` if it is null.",
         ),
     ]
     num_frames: Annotated[
@@ -122,13 +148,13 @@ class ScenarioRecord(TypedDict):
     ]
     first_frame_token: Annotated[str, Key(table="frame", doc="The first moment.")]
     last_frame_token: Annotated[
-        str, Key(table="frame", doc="The last moment: of an accident, the impact.")
+        str, Key(table="frame", doc="The last moment; in an accident, the impact.")
     ]
     split: Annotated[
         str | None,
         Choice(
             values=SPLITS,
-            doc="From the split files, else the folder of layout B, else null (unknown).",
+            doc="Split by the split files, otherwise by the folder of layout B; null if unknown.",
         ),
     ]
 
@@ -137,17 +163,18 @@ class AgentRecord(TypedDict):
     """One of the up to five recorders of a scenario."""
 
     token: Annotated[str, Derived(doc="`<scenario>/<agent>`.")]
-    scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
+    scenario_token: _ScenarioToken
     name: Annotated[str, Choice(values=AGENTS, doc="The release's folder name.")]
     actor_id: Annotated[
-        int | None, Number(dtype="int64", doc="CARLA id by meta; null for infrastructure.")
+        int | None, Number(dtype="int64", doc="CARLA id in meta; null for infrastructure.")
     ]
     category: Annotated[
-        str | None, Choice(values=CATEGORIES, doc="Of its own label row; null without one.")
+        str | None,
+        Choice(values=CATEGORIES, doc="Class in its own label row; null without such a row."),
     ]
     size: Annotated[
         list[float] | None,
-        Vector(shape=(3,), doc="Length, width, height of its own label row.", unit="m"),
+        Vector(shape=(3,), doc="Length, width, height in its own label row.", unit="m"),
     ]
     is_infrastructure: Annotated[bool, Number(dtype="bool", doc="Whether it is the roadside pole.")]
     first_sample_token: Annotated[
@@ -159,47 +186,44 @@ class FrameRecord(TypedDict):
     """One moment of a scenario, shared by its agents."""
 
     token: Annotated[str, Derived(doc="`<scenario>/<NNN>`.")]
-    scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
+    scenario_token: _ScenarioToken
     index: Annotated[int, Number(dtype="int32", doc="The frame's number NNN, from 1.")]
     timestamp: Annotated[
-        float, Number(dtype="float64", doc="Since the first frame: (NNN − 1) · 0.1.", unit="s")
+        float, Number(dtype="float64", doc="Time since the first frame: (NNN − 1) · 0.1.", unit="s")
     ]
     time_to_impact: Annotated[
         float | None,
         Number(
             dtype="float64",
-            doc="Until the recorded impact (the paper's TTC); null without one.",
+            doc="Time until the recorded impact (the paper's TTC); null without an impact.",
             unit="s",
         ),
     ]
-    prev: Annotated[str | None, Key(table="frame", doc="The moment before.")]
-    next: Annotated[str | None, Key(table="frame", doc="The moment after.")]
+    prev: Annotated[str | None, Key(table="frame", doc="The previous moment.")]
+    next: Annotated[str | None, Key(table="frame", doc="The next moment.")]
 
 
 class SampleRecord(TypedDict):
     """One agent at one moment."""
 
     token: Annotated[str, Derived(doc="`<scenario>/<agent>/<NNN>`.")]
-    frame_token: Annotated[str, Key(table="frame", doc="Its moment.")]
-    scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
-    agent_token: Annotated[str, Key(table="agent", doc="Its agent.")]
+    frame_token: _FrameToken
+    scenario_token: _ScenarioToken
+    agent_token: _AgentToken
     agent: Annotated[str, Choice(values=AGENTS, doc="The agent's name.")]
-    timestamp: Annotated[float, Number(dtype="float64", doc="Since the first frame.", unit="s")]
+    timestamp: _Timestamp
     velocity: Annotated[
         list[float] | None,
         Vector(
             shape=(2,),
-            doc="The agent's, in world: the label's first line as (vx, −vy).",
+            doc="Velocity of the agent in world: the label's first line as (vx, −vy).",
             unit="m/s",
         ),
     ]
     time_to_end: Annotated[
-        float, Number(dtype="float64", doc="Until the scenario's last frame.", unit="s")
+        float, Number(dtype="float64", doc="Time until the scenario's last frame.", unit="s")
     ]
-    time_to_impact: Annotated[
-        float | None,
-        Number(dtype="float64", doc="Until the recorded impact; null without one.", unit="s"),
-    ]
+    time_to_impact: _TimeToImpact
     labelled: Annotated[bool, Number(dtype="bool", doc="Whether there is a label file.")]
     num_annotations: Annotated[
         int, Number(dtype="int32", doc="Boxes annotated by this agent at this moment.")
@@ -208,16 +232,16 @@ class SampleRecord(TypedDict):
         str | None,
         Key(table="annotation", doc="Its first box; the others are the rows that follow."),
     ]
-    prev: Annotated[str | None, Key(table="sample", doc="The same agent's moment before.")]
-    next: Annotated[str | None, Key(table="sample", doc="The same agent's moment after.")]
+    prev: Annotated[str | None, Key(table="sample", doc="The agent's previous sample.")]
+    next: Annotated[str | None, Key(table="sample", doc="The agent's next sample.")]
 
 
 class SampleDataRecord(TypedDict):
     """One sensor file of a sample; the row is there whether the file was downloaded or not."""
 
     token: Annotated[str, Derived(doc="`<sample>/<channel>`.")]
-    sample_token: Annotated[str, Key(table="sample", doc="Its sample.")]
-    sensor_token: Annotated[str, Key(table="sensor", doc="Its sensor.")]
+    sample_token: _SampleToken
+    sensor_token: _SensorToken
     calibrated_sensor_token: Annotated[
         str,
         Key(
@@ -225,35 +249,35 @@ class SampleDataRecord(TypedDict):
         ),
     ]
     ego_pose_token: Annotated[str, Key(table="ego_pose", doc="Where the agent was.")]
-    channel: Annotated[str, Choice(values=CHANNELS, doc="The release's folder name.")]
-    modality: Annotated[str, Choice(values=MODALITIES, doc="Of the sensor.")]
+    channel: _Channel
+    modality: Annotated[str, Choice(values=MODALITIES, doc="Kind of the sensor.")]
     filename: Annotated[str, Derived(doc="Path below the dataroot, with forward slashes.")]
     fileformat: Annotated[str, Choice(values=FILE_FORMATS, doc="Ending of the file.")]
     width: Annotated[
         int | None,
-        Number(dtype="int32", doc="Image width by calib (2·cx); null for lidar.", unit="px"),
+        Number(dtype="int32", doc="Image width in calib (2·cx); null for lidar.", unit="px"),
     ]
     height: Annotated[
         int | None,
-        Number(dtype="int32", doc="Image height by calib (2·cy); null for lidar.", unit="px"),
+        Number(dtype="int32", doc="Image height in calib (2·cy); null for lidar.", unit="px"),
     ]
     matrix: Annotated[
         list[list[float]],
         Vector(
             shape=(3, 4),
-            doc="Upper three rows of `ego_from_sensor` as this sample's calib file gives it; "
-            "`calibrated_sensor` holds the same apart from rounding.",
+            doc="Upper three rows of `ego_from_sensor` in this sample's calib file; "
+            "`calibrated_sensor` has the same matrix apart from rounding.",
         ),
     ]
-    prev: Annotated[str | None, Key(table="sample_data", doc="The same sensor's file before.")]
-    next: Annotated[str | None, Key(table="sample_data", doc="The same sensor's file after.")]
+    prev: Annotated[str | None, Key(table="sample_data", doc="The sensor's previous file.")]
+    next: Annotated[str | None, Key(table="sample_data", doc="The sensor's next file.")]
 
 
 class SensorRecord(TypedDict):
     """One kind of sensor that every agent has."""
 
     token: Annotated[str, Derived(doc="The channel.")]
-    channel: Annotated[str, Choice(values=CHANNELS, doc="The release's folder name.")]
+    channel: _Channel
     modality: Annotated[str, Choice(values=MODALITIES, doc="camera, lidar or bev.")]
 
 
@@ -268,14 +292,16 @@ class CalibratedSensorRecord(TypedDict):
     token: Annotated[
         str, Derived(doc="`<scenario>/<agent>/<channel>`, then `/2`, `/3`, … for further values.")
     ]
-    sensor_token: Annotated[str, Key(table="sensor", doc="Its sensor.")]
-    agent_token: Annotated[str, Key(table="agent", doc="Its agent.")]
-    number: Annotated[int, Number(dtype="int32", doc="Counts the rows of this sensor from 1.")]
+    sensor_token: _SensorToken
+    agent_token: _AgentToken
+    number: Annotated[
+        int, Number(dtype="int32", doc="Number of the row among the rows of this sensor, from 1.")
+    ]
     translation: Annotated[
         list[float],
         Vector(
             shape=(3,),
-            doc="Of the sensor in the agent's ego frame; 0 for the BEV camera.",
+            doc="Position of the sensor in the agent's ego frame; 0 for the BEV camera.",
             unit="m",
         ),
     ]
@@ -287,11 +313,12 @@ class CalibratedSensorRecord(TypedDict):
         ),
     ]
     camera_intrinsic: Annotated[
-        list[list[float]] | None, Vector(shape=(3, 3), doc="K of a camera, else null.", unit="px")
+        list[list[float]] | None,
+        Vector(shape=(3, 3), doc="K of a camera; null for other sensors.", unit="px"),
     ]
     matrix: Annotated[
         list[list[float]],
-        Vector(shape=(4, 4), doc="`ego_from_sensor` as the first of its calib files gives it."),
+        Vector(shape=(4, 4), doc="`ego_from_sensor` in the first of its calib files."),
     ]
 
 
@@ -300,15 +327,16 @@ class EgoPoseRecord(TypedDict):
 
     token: Annotated[str, Derived(doc="The sample's token.")]
     translation: Annotated[
-        list[float], Vector(shape=(3,), doc="Of the ego frame's origin in world.", unit="m")
+        list[float],
+        Vector(shape=(3,), doc="Position of the ego frame's origin in world.", unit="m"),
     ]
     rotation: Annotated[list[float], Vector(shape=(4,), doc="Quaternion w, x, y, z.")]
-    timestamp: Annotated[float, Number(dtype="float64", doc="Since the first frame.", unit="s")]
+    timestamp: _Timestamp
     matrix: Annotated[
         list[list[float]],
         Vector(
             shape=(4, 4),
-            doc="`world_from_ego` as the calib file gives it, right-handed, bit for bit.",
+            doc="`world_from_ego` in the calib file, right-handed, bit for bit.",
         ),
     ]
 
@@ -317,14 +345,18 @@ class InstanceRecord(TypedDict):
     """One actor of a scenario, over all frames and agents."""
 
     token: Annotated[str, Derived(doc="`<scenario>/actor/<actor_id>`.")]
-    scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
-    actor_id: Annotated[int, Number(dtype="int64", doc="CARLA id; from 20000 on parked.")]
-    category: Annotated[str, Choice(values=CATEGORIES, doc="By its first annotation.")]
-    num_annotations: Annotated[int, Number(dtype="int32", doc="Over all frames and agents.")]
-    first_annotation_token: Annotated[
-        str, Key(table="annotation", doc="First by frame, then agent.")
+    scenario_token: _ScenarioToken
+    actor_id: Annotated[
+        int, Number(dtype="int64", doc="CARLA id; ids from 20000 are parked vehicles.")
     ]
-    last_annotation_token: Annotated[str, Key(table="annotation", doc="Last by frame, then agent.")]
+    category: Annotated[str, Choice(values=CATEGORIES, doc="Class in its first annotation.")]
+    num_annotations: Annotated[int, Number(dtype="int32", doc="Number over all frames and agents.")]
+    first_annotation_token: Annotated[
+        str, Key(table="annotation", doc="First annotation, ordered by frame, then agent.")
+    ]
+    last_annotation_token: Annotated[
+        str, Key(table="annotation", doc="Last annotation, ordered by frame, then agent.")
+    ]
 
 
 class AnnotationRecord(TypedDict):
@@ -333,7 +365,7 @@ class AnnotationRecord(TypedDict):
     token: Annotated[
         str, Derived(doc="`<sample>/<row>`, row counted from 0 among the boxes of the label.")
     ]
-    sample_token: Annotated[str, Key(table="sample", doc="Its sample.")]
+    sample_token: _SampleToken
     instance_token: Annotated[
         str | None,
         Key(
@@ -342,85 +374,83 @@ class AnnotationRecord(TypedDict):
             "untracked rows (−1).",
         ),
     ]
-    category: Annotated[str, Choice(values=CATEGORIES, doc="The label's class.")]
+    category: _LabelCategory
     translation: Annotated[
         list[float], Vector(shape=(3,), doc="Box centre, LiDAR frame.", unit="m")
     ]
-    size: Annotated[list[float], Vector(shape=(3,), doc="Full length, width, height.", unit="m")]
+    size: _BoxSize
     rotation: Annotated[list[float], Vector(shape=(4,), doc="Quaternion w, x, y, z, LiDAR frame.")]
     velocity: Annotated[
         list[float],
         Vector(
             shape=(3,),
-            doc="Over the ground, in the LiDAR frame's axes: the label's own, decoded. Where that "
-            "is no number: differences of this agent's world positions of the actor at 10 Hz, NaN "
-            "without a neighbour frame or id.",
+            doc="Velocity over the ground, along the axes of the LiDAR frame: the label's own "
+            "velocity, decoded. Where the label has no number, it is computed from this agent's "
+            "positions of the actor in the world at 10 Hz; NaN without a neighbouring frame or "
+            "an id.",
             unit="m/s",
         ),
     ]
     yaw: Annotated[
-        float, Number(dtype="float64", doc="About z, counter-clockwise, LiDAR frame.", unit="rad")
+        float,
+        Number(
+            dtype="float64", doc="Rotation about z, counter-clockwise, LiDAR frame.", unit="rad"
+        ),
     ]
     actor_id: Annotated[
         int,
         Number(
             dtype="int64",
-            doc="As in the file: −100 the agent itself, −1 untracked, ≥ 20000 parked.",
+            doc="Id in the file: −100 for the agent itself, −1 if untracked, 20000 or more "
+            "for parked vehicles.",
         ),
     ]
     num_lidar_pts: Annotated[
-        int, Number(dtype="int64", doc="Points of this agent's LiDAR in the box.")
+        int, Number(dtype="int64", doc="Number of points of this agent's LiDAR in the box.")
     ]
     camera_visible: Annotated[
-        bool, Number(dtype="bool", doc="Whether any of this agent's cameras sees it.")
+        bool, Number(dtype="bool", doc="Whether any of this agent's cameras sees the box.")
     ]
     velocity_label: Annotated[
         list[float],
         Vector(
             shape=(2,),
-            doc="The label's own numbers as (vx, −vy): the world's velocity, turned once more by "
+            doc="The label's own numbers as (vx, −vy): the velocity in world, rotated once more by "
             "the box's yaw; NaN where the label has no number.",
             unit="m/s",
         ),
     ]
-    is_collider: Annotated[
-        bool, Number(dtype="bool", doc="Whether meta names this actor as one of the pair.")
-    ]
-    time_to_impact: Annotated[
-        float | None,
-        Number(dtype="float64", doc="Until the recorded impact; null without one.", unit="s"),
-    ]
+    is_collider: _IsCollider
+    time_to_impact: _TimeToImpact
     prev: Annotated[
-        str | None, Key(table="annotation", doc="The same agent's box of this actor before.")
+        str | None, Key(table="annotation", doc="The previous box of this actor by the same agent.")
     ]
     next: Annotated[
-        str | None, Key(table="annotation", doc="The same agent's box of this actor after.")
+        str | None, Key(table="annotation", doc="The next box of this actor by the same agent.")
     ]
 
 
 class TrackRecord(TypedDict):
     """One actor at one moment in the world, merged from all agents' labels.
 
-    Pose, size, velocity and category are those of one annotation: the first agent's, in the order
-    of the agent table, that saw the actor from outside; its own row (up to 0.3 m off) counts only
-    where nobody else saw it.
+    Pose, size, velocity and category come from one annotation: by the first agent, in the order of
+    the agent table, that saw the actor from outside. The actor's own row (up to 0.3 m off) is used
+    only if no other agent saw the actor.
     """
 
     token: Annotated[str, Derived(doc="`<frame>/actor/<actor_id>`.")]
-    frame_token: Annotated[str, Key(table="frame", doc="Its moment.")]
+    frame_token: _FrameToken
     instance_token: Annotated[str, Key(table="instance", doc="Its actor.")]
-    scenario_token: Annotated[str, Key(table="scenario", doc="Its scenario.")]
+    scenario_token: _ScenarioToken
     translation: Annotated[list[float], Vector(shape=(3,), doc="Box centre, world.", unit="m")]
     rotation: Annotated[list[float], Vector(shape=(4,), doc="Quaternion w, x, y, z, world.")]
-    size: Annotated[list[float], Vector(shape=(3,), doc="Full length, width, height.", unit="m")]
+    size: _BoxSize
     velocity: Annotated[
-        list[float], Vector(shape=(3,), doc="World; NaN where unknown.", unit="m/s")
+        list[float], Vector(shape=(3,), doc="Velocity in world; NaN where unknown.", unit="m/s")
     ]
-    category: Annotated[str, Choice(values=CATEGORIES, doc="The label's class.")]
-    is_collider: Annotated[
-        bool, Number(dtype="bool", doc="Whether meta names this actor as one of the pair.")
-    ]
-    agents: Annotated[list[str], Subset(values=AGENTS, doc="The agents that annotated it.")]
+    category: _LabelCategory
+    is_collider: _IsCollider
+    agents: Annotated[list[str], Subset(values=AGENTS, doc="The agents that annotated the actor.")]
 
 
 class CategoryRecord(TypedDict):
@@ -450,41 +480,39 @@ RECORDS: dict[str, type] = {
 
 @cache
 def table_specs() -> Mapping[str, TableSpec]:
-    """Return all tables, in the order in which they build on each other."""
+    """Return table name → specification, in the order in which the tables build on each other."""
     return {name: spec_of(name, record) for name, record in RECORDS.items()}
 
 
 def table_spec(name: str) -> TableSpec:
-    """Return a table's specification; raises TableError."""
+    """Return the specification of a table; raise TableError if its name is unknown."""
     specs = table_specs()
-    known = spelled(name, specs)
-    if known not in specs:
+    table_name = match_spelling(name, specs)
+    if table_name not in specs:
         remedy = table_remedy(name) or meant_text(name, specs)
         raise TableError(f"no table {name!r}; there are {', '.join(specs)}{remedy}")
-    return specs[known]
+    return specs[table_name]
 
 
 def record_columns(record: type) -> tuple[Column, ...]:
-    """Return the columns that a TypedDict of annotated fields declares."""
+    """Return the columns that a TypedDict declares with its annotated fields."""
     hints = get_type_hints(record, include_extras=True)
-    return tuple(_column(field, hint) for field, hint in hints.items())
+    return tuple(_make_column(field, hint) for field, hint in hints.items())
 
 
 def spec_of(name: str, record: type) -> TableSpec:
-    """Return the specification of a table with records of a TypedDict of annotated fields."""
+    """Return the specification of a table whose records have the type `record`, a TypedDict."""
     doc = " ".join((record.__doc__ or "").split())
     return TableSpec(name=name, doc=doc, columns=record_columns(record))
 
 
-def _column(field: str, hint: Any) -> Column:
-    plain, kind = get_args(hint)
-    nullable = get_origin(plain) in (Union, UnionType) and type(None) in get_args(plain)
-    return Column(field, _stored_name(field, kind), kind, nullable)
-
-
-def _stored_name(field: str, kind: ColumnKind) -> str | None:
+def _make_column(field: str, hint: Any) -> Column:
+    value_type, kind = get_args(hint)
+    is_union = get_origin(value_type) in (Union, UnionType)
+    nullable = is_union and type(None) in get_args(value_type)
+    stored: str | None = field
     if isinstance(kind, Derived):
-        return None
-    if isinstance(kind, Key):
-        return f"{field.removesuffix('_token')}_row"
-    return field
+        stored = None
+    elif isinstance(kind, Key):
+        stored = f"{field.removesuffix('_token')}_row"
+    return Column(field, stored, kind, nullable)

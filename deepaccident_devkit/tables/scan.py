@@ -1,4 +1,4 @@
-"""A scenario's small files: their presence, content and faults, and digests that show changes."""
+"""A scenario's small files: their existence, contents and faults, and digests of their state."""
 
 import hashlib
 import json
@@ -37,12 +37,12 @@ Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Levels of severity, worst first.
 
-An `error` cannot be indexed or cannot be true, a `warning` is probably wrong, a `note` is worth
+An `error` cannot be indexed or is impossible, a `warning` is probably wrong, and a `note` is worth
 knowing.
 """
 SMALL_FILE_ENDINGS = {"calib": "pkl", "label": "txt"}
 """Kind of small file → ending of its files."""
-_MAX_RUNS = 6
+_MAX_RANGES = 6
 _ARCHIVE_REMEDY = "unpack its archive again, or leave the scenario out with on_error='skip'"
 
 
@@ -57,7 +57,7 @@ class Finding(ShortRepr):
         where: File (with the line), folder, or agents and actors.
         what: Description of the fault.
         remedy: What the user should do.
-        known: Whether the real release has it too; then it is no fault of this copy.
+        known: Whether the real release has it too, so that it is not a fault of this copy.
     """
 
     code: str
@@ -74,17 +74,10 @@ class Finding(ShortRepr):
 
 
 def finding_of(error: ReleaseError, code: str, scenario: str | None) -> Finding:
-    """Return the finding of a reader's error; its text is the error's."""
+    """Convert a reader's error to a finding."""
     location, _, text = str(error).partition(": ")
     message, _, remedy = text.rpartition("; ")
-    return Finding(
-        code=code,
-        severity="error",
-        scenario=scenario,
-        where=location,
-        what=message,
-        remedy=remedy,
-    )
+    return _make_error_finding(scenario, code, location, message, remedy)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,11 +86,11 @@ class ScenarioScan:
 
     Attributes:
         agents: Agents with calib files.
-        has_meta: Whether it has a meta file.
+        has_meta: Whether the scenario has a meta file.
         labelled: Agents of `agents` with label files.
-        num_frames: Highest frame number of any of their files.
-        problems: Faults that make the scenario broken.
-        notices: Parts that were left aside, a sentence each.
+        num_frames: Highest frame number of any calib or label file.
+        problems: Faults that break the scenario.
+        notices: A sentence for each part that was ignored.
     """
 
     agents: tuple[AgentName, ...]
@@ -109,42 +102,52 @@ class ScenarioScan:
 
 
 def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
-    """List a scenario's calib and label folders and check that agents have all frames 1 to n."""
+    """List a scenario's calib and label folders, and check that each agent has all its frames."""
     problems: list[Finding] = []
     if scenario.token.encode(errors="replace") != os.fsencode(scenario.token):
         message = "the scenario's name is not UTF-8"
         remedy = "rename its folders and files"
-        problems.append(_broken(scenario, "odd-name", scenario.meta_path, message, remedy))
+        problems.append(
+            _make_error_finding(scenario.token, "odd-name", scenario.meta_path, message, remedy)
+        )
     frames: dict[tuple[AgentName, str], list[int]] = {}
     for agent in AGENTS:
         for kind, ending in SMALL_FILE_ENDINGS.items():
             frames[agent, kind] = _list_frames(scenario, agent, kind, ending, problems)
     agents = tuple(agent for agent in AGENTS if frames[agent, "calib"])
     notices = [
-        f"{scenario.token}: {agent} has labels but no calib files and is left out"
+        f"{scenario.token}: {agent} has labels but no calib files and is excluded"
         for agent in AGENTS
         if frames[agent, "label"] and agent not in agents
     ]
     labelled = tuple(agent for agent in agents if frames[agent, "label"])
-    has_meta = _exists(scenario.meta_path)
+    has_meta = False
+    with suppress(OSError):  # the folder may be unreadable
+        has_meta = scenario.meta_path.exists()
     if labelled and not has_meta:
         notices.append(
-            f"{scenario.meta_path}: missing or not readable: weather and collision of this "
-            "scenario are unknown, and find(collision=…) leaves it out; "
-            "find(designed_accident=True) goes by its folder"
+            f"{scenario.meta_path}: missing or not readable, so the weather and collision of this "
+            "scenario are unknown and find(collision=…) does not return it; use "
+            "find(designed_accident=True), which goes by the folder"
         )
     num_frames = 0
     for agent in agents:
         for kind in SMALL_FILE_ENDINGS:
             num_frames = max([num_frames, *frames[agent, kind]])
+    all_frames = set(range(1, num_frames + 1))
     for agent in agents:
-        for kind in ("calib", "label") if agent in labelled else ("calib",):
-            missing = sorted(set(range(1, num_frames + 1)) - set(frames[agent, kind]))
-            if missing:
-                message = f"lacks frames {frame_ranges(missing)} of 1 to {num_frames}"
+        kinds = ("calib", "label") if agent in labelled else ("calib",)
+        for kind in kinds:
+            missing_frames = sorted(all_frames - set(frames[agent, kind]))
+            if missing_frames:
+                message = (
+                    f"missing frames: {frame_ranges(missing_frames)} (expected 1 to {num_frames})"
+                )
                 folder = scenario.kind_folder(agent, kind)
                 problems.append(
-                    _broken(scenario, "frames-missing", folder, message, _ARCHIVE_REMEDY)
+                    _make_error_finding(
+                        scenario.token, "frames-missing", folder, message, _ARCHIVE_REMEDY
+                    )
                 )
     return ScenarioScan(
         agents=agents,
@@ -159,7 +162,7 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
 def _list_frames(
     scenario: ScenarioFolder, agent: AgentName, kind: str, ending: str, problems: list[Finding]
 ) -> list[int]:
-    """Return the frame numbers of an agent's files of a kind; faults join `problems`."""
+    """Return the frame numbers of an agent's files of a kind, and add faults to `problems`."""
     folder = scenario.kind_folder(agent, kind)
     try:
         frames, odd_names = frame_numbers(folder, ending)
@@ -168,17 +171,19 @@ def _list_frames(
         return []
     message = f"expected a name {scenario.name}_<NNN>.{ending}"
     for name in odd_names:
-        problems.append(_broken(scenario, "odd-name", folder / name, message, "rename it"))
+        problems.append(
+            _make_error_finding(scenario.token, "odd-name", folder / name, message, "rename it")
+        )
     return frames
 
 
-def _broken(
-    scenario: ScenarioFolder, code: str, path: ReleasePath, message: str, remedy: str
+def _make_error_finding(
+    scenario: str | None, code: str, path: ReleasePath | str, message: str, remedy: str
 ) -> Finding:
     return Finding(
         code=code,
         severity="error",
-        scenario=scenario.token,
+        scenario=scenario,
         where=str(path),
         what=message,
         remedy=remedy,
@@ -190,9 +195,9 @@ class ScenarioFiles:
     """Contents of a scenario's small files.
 
     Attributes:
-        scenario: Location of the files.
+        scenario: Folders of the files.
         scan: Listing of the files.
-        meta: Meta; None if the scenario has none.
+        meta: Content of the meta file; None if the scenario has none.
         calibs: Calib of every sample, agent by agent.
         labels: Labels of every labelled sample, agent by agent.
         hashes: Hashes of the files' bytes, as in `content_hashes`.
@@ -214,22 +219,22 @@ class ScenarioFiles:
 def read_scenario(
     scenario: ScenarioFolder, scan: ScenarioScan
 ) -> tuple[ScenarioFiles | None, list[Finding]]:
-    """Return a scenario's meta, calib and label files, None if any has a fault, and the faults.
+    """Read a scenario's meta, calib and label files; return their contents and faults.
 
-    Of every file, only the first fault is listed.
+    The contents are None if any file has a fault. Only the first fault of each file is returned.
     """
     faults: list[Finding] = []
 
-    def attempt(read: Any, code: str, paths: list[ReleasePath]) -> Any:
+    def read_or_add_faults(read: Any, code: str, paths: list[ReleasePath]) -> Any:
         try:
             return read(paths)
         except ReleaseError as error:
             num_faults = len(faults)
-            # The reader stops at the first fault, so each file is read again.
+            # The reader stops at the first fault, so read each file separately.
             if len(paths) > 1:
                 for path in paths:
-                    attempt(read, code, [path])
-            # Files may be good one by one, but not together.
+                    read_or_add_faults(read, code, [path])
+            # Files may be valid separately, but not together.
             if len(faults) == num_faults:
                 faults.append(finding_of(error, code, scenario.token))
             return None
@@ -241,9 +246,9 @@ def read_scenario(
     contents: dict[str, bytes] = {}
     paths = [*meta_paths, *calib_paths, *label_paths]
     with fetched(paths), observed(lambda path, content: contents.update({str(path): content})):
-        metas = attempt(_read_metas, "meta-unreadable", meta_paths)
-        calibs = attempt(read_calibs, "calib-unreadable", calib_paths)
-        labels = attempt(read_labels, "label-unreadable", label_paths)
+        metas = read_or_add_faults(_read_metas, "meta-unreadable", meta_paths)
+        calibs = read_or_add_faults(read_calibs, "calib-unreadable", calib_paths)
+        labels = read_or_add_faults(read_labels, "label-unreadable", label_paths)
     if faults:
         return None, faults
     meta = metas[0] if metas else None
@@ -261,10 +266,10 @@ def _read_metas(paths: Sequence[ReleasePath]) -> list[Meta]:
 def folder_digest(scenarios: Iterable[ScenarioFolder], split_files: Iterable[ReleasePath]) -> str:
     """Return a digest of the states of folders and meta files, and of the contents of split files.
 
-    It changes when a file is added, removed, renamed or replaced, also by a tool that restores all
-    times, since none can restore a folder's ctime. It does not change when a label or calib file is
-    written in place, nor when files get hard links, which change the ctime of a file. In a store it
-    changes with the list of the archives' members.
+    The digest changes if a file is added, removed, renamed or replaced, even by a tool that
+    restores all times, because no tool can restore a folder's ctime. It does not change if a label
+    or calib file is overwritten in place, nor if files get hard links (which only changes the
+    files' ctime). In a store, it changes with the list of the archives' members.
     """
     digest = hashlib.blake2b(digest_size=16)
     for scenario in scenarios:
@@ -278,15 +283,15 @@ def folder_digest(scenarios: Iterable[ScenarioFolder], split_files: Iterable[Rel
         for agent in AGENTS:
             for kind in SMALL_FILE_ENDINGS:
                 folder = f"{base}/{agent}/{kind}/{scenario.name}"
-                digest.update(_stat_words(folder, ctime=True))
-        digest.update(_stat_words(f"{base}/meta", ctime=True))
-        digest.update(_stat_words(f"{base}/meta/{scenario.name}.txt"))
+                digest.update(_format_status(folder, ctime=True))
+        digest.update(_format_status(f"{base}/meta", ctime=True))
+        digest.update(_format_status(f"{base}/meta/{scenario.name}.txt"))
     for file in split_files:
         digest.update(os.fsencode(file.name))
         if isinstance(file, StorePath):
-            digest.update(_stat_words(file))
+            digest.update(_format_status(file))
         else:
-            digest.update(_content_or_fault(file, "split"))
+            digest.update(_read_content_or_fault(file, "split"))
     return digest.hexdigest()
 
 
@@ -296,20 +301,20 @@ def times_digest(
     *,
     ctime: bool = True,
 ) -> str:
-    """Return a digest of names, sizes and times of a scenario's files of these kinds, and of meta.
+    """Return a digest of the names, sizes and times of a scenario's files (`kinds` and meta).
 
-    No file is opened. With `ctime` it changes with every change of a file, also if its time is
-    restored, and if it gets a hard link.
+    No file is opened. With `ctime`, the digest changes with every change of a file, even if the
+    file's time is restored, and also if a file gets a hard link.
     """
     digest = hashlib.blake2b(os.fsencode(f"{scenario.folder}/{scenario.token}"), digest_size=16)
     for agent, kind in product(AGENTS, kinds):
-        # The folder may be absent.
+        # The folder may be missing.
         with suppress(OSError):
             entries = folder_entries(scenario.kind_folder(agent, kind))
             for entry in sorted(entries, key=attrgetter("name")):
                 name = os.fsencode(f"{agent}/{kind}/{entry.name}")
-                digest.update(name + _stat_words(entry, ctime=ctime))
-    digest.update(_stat_words(scenario.meta_path, ctime=ctime))
+                digest.update(name + _format_status(entry, ctime=ctime))
+    digest.update(_format_status(scenario.meta_path, ctime=ctime))
     return digest.hexdigest()
 
 
@@ -319,34 +324,37 @@ def content_hashes(scenario: ScenarioFolder, known: Mapping[str, bytes] | None =
     The text is empty if a folder cannot be listed.
 
     Args:
-        scenario: Location of the files.
-        known: Path → bytes of files that were read before. The others are read now; for a file that
-            cannot be read, the fault is hashed.
+        scenario: Folders of the files.
+        known: Path → bytes of files that were already read. The others are read now; for a file
+            that cannot be read, the fault is hashed.
     """
     contents = known or {}
 
-    def read(path: ReleasePath, kind: FileKind) -> bytes:
+    def get_content(path: ReleasePath, kind: FileKind) -> bytes:
         content = contents.get(str(path))
         if content is None:
-            return _content_or_fault(path, kind)
+            return _read_content_or_fault(path, kind)
         return content
 
     try:
-        return json.dumps(folder_hashes(scenario, read=read).as_dict())
+        hashes = folder_hashes(scenario, read=get_content)
     except ReleaseError:
         return ""
+    return json.dumps(hashes.as_dict())
 
 
-def _content_or_fault(path: ReleasePath, kind: FileKind) -> bytes:
+def _read_content_or_fault(path: ReleasePath, kind: FileKind) -> bytes:
+    """Read a file's bytes; if it cannot be read, return the fault instead."""
     try:
         return read_bytes(path, kind)
     except OSError as error:
         return fault_text(error).encode()
 
 
-def _stat_words(path: ReleasePath | FolderEntry | str, *, ctime: bool = False) -> bytes:
+def _format_status(path: ReleasePath | FolderEntry | str, *, ctime: bool = False) -> bytes:
+    """Return the size and times of a path as one line of text."""
     try:
-        # There are 7,000 texts when a release is opened.
+        # Opening a release passes 7,000 texts, for which os.stat is faster.
         status = os.stat(path) if isinstance(path, str) else path.stat()  # noqa: PTH116
     except OSError:
         return b" none\n"
@@ -354,22 +362,18 @@ def _stat_words(path: ReleasePath | FolderEntry | str, *, ctime: bool = False) -
     return f" {status.st_size} {status.st_mtime_ns} {changed}\n".encode()
 
 
-def _exists(path: ReleasePath) -> bool:
-    try:
-        return path.exists()
-    except OSError:  # Its folder cannot be read.
-        return False
-
-
 def frame_ranges(numbers: Sequence[int]) -> str:
-    """Return `3–5, 9`: runs of consecutive numbers, at most six."""
-    runs: list[list[int]] = []
+    """Format ascending numbers as at most six ranges, such as `3–5, 9`."""
+    ranges: list[list[int]] = []
     for number in numbers:
-        if runs and runs[-1][1] == number - 1:
-            runs[-1][1] = number
+        if ranges and ranges[-1][1] == number - 1:
+            ranges[-1][1] = number
         else:
-            runs.append([number, number])
+            ranges.append([number, number])
     words = []
-    for low, high in runs[:_MAX_RUNS]:
-        words.append(f"{low}" if low == high else f"{low}–{high}")
-    return ", ".join(words) + (" …" if len(runs) > _MAX_RUNS else "")
+    for first, last in ranges[:_MAX_RANGES]:
+        words.append(f"{first}" if first == last else f"{first}–{last}")
+    text = ", ".join(words)
+    if len(ranges) > _MAX_RANGES:
+        text += " …"
+    return text

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, NoReturn, TypeVar, cast, get_args, overload
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar, cast, get_args, overload
 
 import numpy as np
 
@@ -25,7 +25,15 @@ from deepaccident_devkit.release.store import ReleasePath, places_of
 from deepaccident_devkit.support.arrays import checked_number
 from deepaccident_devkit.support.json_text import as_record, parsed_json
 from deepaccident_devkit.support.nuscenes_names import field_remedy, with_keywords_named
-from deepaccident_devkit.support.text import choice, meant_text, members_of, path_of, spelled
+from deepaccident_devkit.support.text import (
+    PathType,
+    choice,
+    counted,
+    match_spelling,
+    meant_text,
+    members_of,
+    path_of,
+)
 from deepaccident_devkit.tables.arrow_files import (
     DAMAGED_INDEX_REMEDY,
     HASHES,
@@ -51,8 +59,8 @@ if TYPE_CHECKING:
 
 _Record = TypeVar("_Record")
 _Getter = Callable[[int], Any]
-# Difference between a time and its frame, in frames.
-_FRAME_TOLERANCE: Final = 1e-6
+# Largest difference between a time and a frame, in frames.
+_FRAME_TOLERANCE = 1e-6
 RowArgument = str | Mapping[str, Any]
 """A row as callers name it: by its token, or by its record."""
 
@@ -83,7 +91,7 @@ class OpenTables:
         problems: tuple[Problem, ...] = (),
         tables: Tables | None = None,
     ) -> None:
-        """Open the tables of an index, or use opened ones; raises IndexStoreError."""
+        """Open an index's tables, or use open ones; raise IndexStoreError if they are damaged."""
         self.dataroot = dataroot
         self.version = version
         self.layout = layout
@@ -96,7 +104,7 @@ class OpenTables:
         return f"{type(self).__name__}({self.version!r}, {str(self.dataroot)!r})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle paths, not tables: the copy opens the same files again."""
+        """Pickle paths instead of tables: the copy opens the same files again."""
         arguments = {
             "dataroot": self.dataroot,
             "version": self.version,
@@ -109,7 +117,7 @@ class OpenTables:
 
     @property
     def places(self) -> tuple[Path, ...]:
-        """Folders that a worker on another host needs: those of the release and of its tables."""
+        """Folders that a worker on another host needs: the release's and its tables'."""
         return *places_of(self.dataroot), self._tables.folder
 
     @property
@@ -186,43 +194,45 @@ class OpenTables:
         """Return the hashes of the files that a scenario's rows were made from; None if unknown.
 
         Raises:
-            IndexStoreError: The table with the hashes is damaged.
+            IndexStoreError: If the table with the hashes is damaged.
         """
         return self._tables.hashes.get(scenario)
 
     @with_keywords_named
     def get(self, table: str, token: RowArgument) -> dict[str, Any]:
-        """Return the record of a token, as a fresh dict; raises TableError or TokenError."""
+        """Return a record as a new dict; raise TableError or TokenError if the name is unknown."""
         record: dict[str, Any] = self._tables.table(table).get(token_of(token))
         return record
 
     @with_keywords_named
     def getind(self, table: str, token: RowArgument) -> int:
-        """Return the row of a token; raises TableError or TokenError."""
+        """Return the row with a token; raise TableError or TokenError if the name is unknown."""
         return self._tables.table(table).row(token_of(token))
 
     @with_keywords_named
     def field2token(self, table: str, field: str, query: Any) -> list[str]:
-        """Return the tokens of all rows with a field equal to `query`, in order.
+        """Return the tokens of all rows whose `field` equals `query`, in order.
 
-        Raises TableError or FieldError.
+        TableError or
+        FieldError is raised if the table or the field is unknown.
         """
         return self._tables.table(table).tokens_where(field, query)
 
     def arrow(self, table: str) -> Any:
-        """Return a table as `pyarrow.Table`, without copying.
+        """Return a table as a `pyarrow.Table`, without copying it.
 
         Its `…_row` columns hold row numbers instead of tokens.
         """
         return self._tables.table(table).arrow
 
     def columns(self, table: str) -> Mapping[str, Any]:
-        """Return a table's stored columns by name as read-only arrays; raises TableError.
+        """Return stored column name → read-only array; raise TableError if the table is unknown.
 
-        Nothing is copied. Numbers are numpy views (row keys, choices as codes, null as −1 or NaN),
-        words Arrow arrays.
+        Nothing is copied. Numbers are numpy views: keys are row numbers, choices are codes, and
+        null is −1 or NaN. Words are Arrow arrays.
         """
-        return self._tables.views[self._tables.table(table).name]
+        name = self._tables.table(table).name
+        return self._tables.views[name]
 
     def get_sample(
         self,
@@ -232,80 +242,83 @@ class OpenTables:
         *,
         time_to_impact: float | None = None,
     ) -> records.SampleRecord:
-        """Return the sample of an agent at a moment of a scenario.
+        """Return an agent's sample in a frame of a scenario.
 
         Args:
             scenario: Token or record.
             agent: Name of the agent.
             frame: Number of the frame, from 1.
-            time_to_impact: Seconds before the impact, which is the last frame, as an alternative to
-                `frame`; a multiple of 0.1.
+            time_to_impact: Alternative to `frame`: seconds before the impact, which is the last
+                frame; a multiple of 0.1.
 
         Raises:
-            TokenError: The release has no such scenario, agent or frame; or not exactly one of
-                `frame` and `time_to_impact` is given.
-            NotAvailableError: The scenario has no collision, so that no impact is known.
+            TokenError: If the release has no such scenario, agent or frame; or if not exactly one
+                of `frame` and `time_to_impact` is passed.
+            NotAvailableError: If the scenario has no collision, so that no impact is known.
         """
         if time_to_impact is not None and frame is None:
-            frame = self._frame_before_impact(scenario, time_to_impact)
+            frame = self._find_frame_before_impact(scenario, time_to_impact)
         elif time_to_impact is not None or not isinstance(frame, int | np.integer):
             raise TokenError(
-                f"frame: expected a number from 1, found {frame!r}; or give time_to_impact= instead"
+                f"frame: expected a number from 1, found {frame!r}; or pass time_to_impact= instead"
             )
-        return self.sample.get(f"{token_of(scenario)}/{spelled(agent, AGENTS)}/{frame:03d}")
+        agent_name = match_spelling(agent, AGENTS)
+        return self.sample.get(f"{token_of(scenario)}/{agent_name}/{frame:03d}")
 
-    def _frame_before_impact(self, scenario: RowArgument, seconds: float) -> int:
+    def _find_frame_before_impact(self, scenario: RowArgument, seconds: float) -> int:
         record = self.scenario.get(token_of(scenario))
         if record["collision"] is None:
             raise NotAvailableError(
-                f"{record['token']}: has no collision by its meta file; give frame= instead"
+                f"{record['token']}: its meta file names no collision; pass frame= instead"
             )
+        num_frames = record["num_frames"]
         steps = checked_number("time_to_impact", seconds, "seconds", TokenError) / FRAME_PERIOD
-        frames = round(steps) if np.isfinite(steps) else -1
-        if not 0 <= frames < record["num_frames"] or abs(steps - frames) > _FRAME_TOLERANCE:
-            longest = (record["num_frames"] - 1) / 10
+        frames_before = round(steps) if np.isfinite(steps) else -1
+        is_between_frames = abs(steps - frames_before) > _FRAME_TOLERANCE
+        if not 0 <= frames_before < num_frames or is_between_frames:
+            longest_time = (num_frames - 1) / 10
             raise TokenError(
-                f"time_to_impact: expected 0, 0.1, 0.2, … up to {longest} s, found {seconds}"
+                f"time_to_impact: expected 0, 0.1, 0.2, … up to {longest_time} s, found {seconds}"
             )
-        return record["num_frames"] - frames
+        return num_frames - frames_before
 
     def samples_of(self, frame: RowArgument) -> list[records.SampleRecord]:
-        """Return the samples of one moment, one for each agent, in the order of `AGENTS`."""
-        record = self.frame[self.frame.row(token_of(frame))]
+        """Return all agents' samples of a frame, in the order of `AGENTS`."""
+        record = self.frame.get(token_of(frame))
         resolver = self._tables.resolver
-        agents = resolver.agents_of(self.scenario.row(record["scenario_token"])).values()
-        return [self.sample[resolver.sample_at(agent, record["index"])] for agent in agents]
+        scenario_row = self.scenario.row(record["scenario_token"])
+        agents = resolver.agents_of(scenario_row).values()
+        rows = [resolver.sample_at(agent, record["index"]) for agent in agents]
+        return [self.sample[row] for row in rows]
 
-    def split_scenarios(
-        self, split: str | os.PathLike[str], *, missing: OnError = "raise"
-    ) -> set[str]:
+    def split_scenarios(self, split: PathType, *, missing: OnError = "raise") -> set[str]:
         """Return the tokens of this release's scenarios that belong to a split.
 
         Args:
             split: `train`, `val`, `test`, `train_mini` or `val_mini`, or `all` for every scenario
-                of the release. Or a split file of your own, as a path object or a text that ends in
-                `.txt`: blank lines, CRLF and a byte order mark are fine, the same scenario in two
-                lines is a fault.
-            missing: Treatment of a file's scenarios that are not in this release: `raise`, or
+                of the release. Or your own split file, as a path object or a text that ends in
+                `.txt`. Blank lines, CRLF and a byte order mark are allowed; a scenario in two lines
+                is an error.
+            missing: What to do about listed scenarios that are not in this release: `raise`, or
                 `skip` them.
 
         Raises:
-            ChoiceError: The split is unknown, or `missing` is neither `raise` nor `skip`.
-            NotAvailableError: The splits are unknown: there are no split files and no split
-                folders; or scenarios of your file are not in this release.
-            MissingFileError: Your file does not exist.
-            SplitFileError: Your file is no split file: a line has not two words, or a scenario
-                occurs twice.
+            ChoiceError: If the split is unknown, or `missing` is neither `raise` nor `skip`.
+            NotAvailableError: If the splits are unknown because there are no split files and no
+                split folders; or if scenarios of your file are not in this release.
+            MissingFileError: If your file does not exist.
+            SplitFileError: If a line of your file does not have two words, or if a scenario occurs
+                twice.
         """
         missing = choice("missing", missing, get_args(OnError))
         if not isinstance(split, str | os.PathLike):
             raise ChoiceError(
-                f"split: expected the name of one, or the path of a split file, found {split!r}"
+                f"split: expected the name of a split, or the path of a split file, found {split!r}"
             )
         if not isinstance(split, str) or split.endswith(".txt"):
-            return self._listed_scenarios(path_of(split), missing)
-        own_split = self._own_split_text().removeprefix("or ")
-        remedy = f"; for scenarios whose split is unknown {own_split}"
+            return self._read_listed_scenarios(path_of(split), missing)
+        own_split = self._describe_own_split().removeprefix("or ")
+        remedy = f"; for scenarios of an unknown split, {own_split}"
         split = split_choice(split, elsewhere={"unknown": remedy})
         tokens = set(self._tables.resolver.scenario_tokens)
         if split == "all":
@@ -314,48 +327,50 @@ class OpenTables:
             if split not in self._split_files:
                 raise NotAvailableError(
                     f"{self.dataroot}: has no {split}.txt; put the release's split files there, "
-                    f"{self._own_split_text()}"
+                    f"{self._describe_own_split()}"
                 )
             return tokens.intersection(read_split_file(self._split_files[split]))
         if (self._tables.views["scenario"]["split"] < 0).all():
             raise NotAvailableError(
-                f"{self.dataroot}: the split of its scenarios is unknown: it has neither split "
-                f"files ({split}.txt) nor split folders ({split}/); put the release's split files "
-                f"into it, {self._own_split_text()}"
+                f"{self.dataroot}: the splits of the scenarios are unknown, as there are neither "
+                f"split files ({split}.txt) nor split folders ({split}/); put the release's split "
+                f"files there, {self._describe_own_split()}"
             )
         return set(self.scenario.tokens_where("split", split))
 
-    def _listed_scenarios(self, path: Path, missing: OnError) -> set[str]:
-        """Return the scenarios of this release in a split file of the user."""
+    def _read_listed_scenarios(self, path: Path, missing: OnError) -> set[str]:
+        """Return the scenarios of this release that a user's split file lists."""
         tokens = set(self._tables.resolver.scenario_tokens)
-        listed = read_split_file(path, unique=True)
-        absent = [token for token in listed if token not in tokens]
-        if absent and missing == "raise":
-            more = ", …" if len(absent) > 3 else ""
+        listed_tokens = read_split_file(path, unique=True)
+        absent_tokens = [token for token in listed_tokens if token not in tokens]
+        if absent_tokens and missing == "raise":
+            examples = ", ".join(absent_tokens[:3])
+            if len(absent_tokens) > 3:
+                examples += ", …"
             raise NotAvailableError(
-                f"{path}: {len(absent)} of its {len(listed)} scenarios are not in {self.dataroot}: "
-                f"{', '.join(absent[:3])}{more}; pass missing='skip' to go without them"
+                f"{path}: {len(absent_tokens)} of its {len(listed_tokens)} scenarios are not in "
+                f"{self.dataroot}: {examples}; pass missing='skip' to ignore them"
             )
-        return tokens.intersection(listed)
+        return tokens.intersection(listed_tokens)
 
-    def _own_split_text(self) -> str:
+    def _describe_own_split(self) -> str:
         dataroot = shlex.quote(str(self.dataroot))
         command = f"deepaccident split {dataroot} --out mine.txt"
         return f"or make a split file of your own: {command}, then --split mine.txt"
 
 
 class Tables:
-    """All tables of an index, memory-mapped: readable even if another process remakes the index."""
+    """All tables of an index, memory-mapped: readable even after another process rebuilds it."""
 
     def __init__(
         self, folder: Path, resolver: Callable[[ColumnViews], Resolver] = Resolver
     ) -> None:
-        """Open the tables in `folder`; raises IndexStoreError if they cannot be read.
+        """Open the tables in `folder`; raise IndexStoreError if they cannot be read.
 
         Args:
             folder: Folder with one Arrow file per table.
-            resolver: Makes the resolver of rows, tokens and files; other datasets name their files
-                differently.
+            resolver: Function that makes the `Resolver` of rows, tokens and files; other datasets
+                pass their own, because they name files differently.
         """
         self.folder = folder
         self._stored = {name: StoredTable(folder, spec) for name, spec in table_specs().items()}
@@ -375,7 +390,7 @@ class Tables:
     def hashes(self) -> dict[str, ScenarioHashes]:
         """Hashes of the files that each scenario's rows were made from, by token.
 
-        Raises IndexStoreError.
+        IndexStoreError is raised if the table with the hashes is damaged.
         """
         words = self._stored["scenario"].words.get(HASHES, "{}")
         try:
@@ -386,11 +401,11 @@ class Tables:
             ) from error
 
     def table(self, name: str) -> Table[Any]:
-        """Return a table; raises TableError."""
+        """Return a table; raise TableError if its name is unknown."""
         try:
             return self._tables[name]
         except KeyError:
-            # `name` may be spelt otherwise than the table.
+            # `name` may be in another case than the table's name.
             table_name = table_spec(name).name
             if table_name not in self._tables:
                 self._tables[table_name] = Table(self._stored[table_name], self.resolver)
@@ -398,22 +413,24 @@ class Tables:
 
 
 class Table(Sequence[_Record], Generic[_Record]):
-    """The rows of a table; each access makes a fresh dict, which belongs to the caller.
+    """The rows of a table; each access returns a new dict, which the caller may change.
 
     Attributes:
         name: Name of the table.
     """
 
     def __init__(self, stored: StoredTable, resolver: Resolver) -> None:
-        """Make the functions that read a stored table's fields."""
+        """Prepare the functions that read a stored table's fields."""
         self.name = stored.spec.name
         self._stored = stored
         self._resolver = resolver
-        self._getters = [(column.field, self._getter(column)) for column in stored.spec.columns]
+        self._getters = [
+            (column.field, self._make_getter(column)) for column in stored.spec.columns
+        ]
 
     @property
     def arrow(self) -> Any:
-        """The table as a `pyarrow.Table` over the mapped memory, with row keys instead of tokens.
+        """Table as a `pyarrow.Table` over the mapped memory, with row keys instead of tokens.
 
         Raises IndexStoreError if the file is so damaged that Arrow would read beyond its memory.
         """
@@ -429,51 +446,54 @@ class Table(Sequence[_Record], Generic[_Record]):
     def __getitem__(self, row: int | slice) -> _Record | list[_Record]:
         """Return the record of a row, or the records of a slice."""
         if isinstance(row, slice):
-            return [self._record(index) for index in range(*row.indices(len(self)))]
+            return [self._make_record(index) for index in range(*row.indices(len(self)))]
         if not isinstance(row, int | np.integer):
             raise TableError(
-                f"table '{self.name}' counts its rows: expected a number, found {row!r}; "
-                "use get(token)"
+                f"table '{self.name}' takes row numbers: expected a number, found {row!r}; "
+                "use get(token) for a token"
             )
-        index = row + len(self) if row < 0 else row
+        index = row
+        if row < 0:
+            index = row + len(self)
         if not 0 <= index < len(self):
-            raise IndexError(f"table '{self.name}' has {len(self)} rows, asked for row {row}")
-        return self._record(index)
+            rows = counted(len(self), "row")
+            raise IndexError(f"table '{self.name}' has {rows}, asked for row {row}")
+        return self._make_record(index)
 
     def __iter__(self) -> Iterator[_Record]:
-        return (self._record(row) for row in range(len(self)))
+        return map(self._make_record, range(len(self)))
 
     def __repr__(self) -> str:
-        fields = ", ".join(field for field, _ in self._getters)
-        return f"<table '{self.name}': {len(self):,} rows of {fields}>"
+        fields = ", ".join([field for field, _ in self._getters])
+        return f"<table '{self.name}': {counted(len(self), 'row')} of {fields}>"
 
     def get(self, token: str) -> _Record:
-        """Return the record of a token; raises TokenError."""
-        return self._record(self.row(token))
+        """Return the record with a token; raise TokenError if it is unknown."""
+        return self._make_record(self.row(token))
 
     def row(self, token: str) -> int:
-        """Return the row of a token; raises TokenError."""
+        """Return the row with a token; raise TokenError if it is unknown."""
         return self._resolver.row(self.name, token)
 
     def tokens_where(self, field: str, value: Any) -> list[str]:
-        """Return the tokens of the rows with a field equal to `value`, in order.
+        """Return the tokens of the rows whose `field` equals `value`, in order.
 
-        Raises FieldError.
+        FieldError is raised if the field is unknown.
         """
         try:
-            rows = self._rows_where(field, value)
+            rows = self._find_rows(field, value)
             return [self._resolver.token(self.name, int(row)) for row in rows]
         except IndexError as error:
             raise damaged_value(self.name) from error
 
-    def _record(self, row: int) -> _Record:
+    def _make_record(self, row: int) -> _Record:
         try:
             values = {field: getter(row) for field, getter in self._getters}
             return cast(_Record, RecordDict(values))
         except IndexError as error:
             raise damaged_value(self.name) from error
 
-    def _rows_where(self, field: str, value: Any) -> Sequence[int]:
+    def _find_rows(self, field: str, value: Any) -> Sequence[int]:
         column = self._stored.spec.column(field)
         if column is None:
             fields = [name for name, _ in self._getters]
@@ -482,15 +502,15 @@ class Table(Sequence[_Record], Generic[_Record]):
                 f"table '{self.name}' has no field '{field}'; it has {', '.join(fields)}"
                 f"{suggestion}"
             )
-        stored_value = self._stored_value(column, value)
+        stored_value = self._encode_value(column, value)
         view = self._stored.views.get(column.stored or "")
         if stored_value is not None and isinstance(view, np.ndarray):
             return np.flatnonzero(view == stored_value).tolist()
         getter = dict(self._getters)[field]
         return [row for row in range(len(self)) if getter(row) == value]
 
-    def _stored_value(self, column: Column, value: Any) -> Any:
-        """Return the stored form of `value`; None if rows must be compared one by one."""
+    def _encode_value(self, column: Column, value: Any) -> Any:
+        """Encode a field's value as it is stored; None if each record must be compared."""
         kind = column.kind
         if isinstance(kind, Key) and isinstance(value, str):
             try:
@@ -498,14 +518,17 @@ class Table(Sequence[_Record], Generic[_Record]):
             except TokenError:
                 return NULL_INTEGER - 1
         if isinstance(kind, Choice) and isinstance(value, str):
-            word = spelled(value, kind.values)
-            return kind.values.index(word) if word in kind.values else NULL_INTEGER - 1
+            word = match_spelling(value, kind.values)
+            if word in kind.values:
+                return kind.values.index(word)
+            return NULL_INTEGER - 1
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not isinstance(kind, Number) or not is_number:
+        is_null = is_number and column.nullable and value == NULL_INTEGER
+        if not isinstance(kind, Number) or not is_number or is_null:
             return None
-        return None if column.nullable and value == NULL_INTEGER else value
+        return value
 
-    def _getter(self, column: Column) -> _Getter:  # noqa: PLR0911 - one a kind
+    def _make_getter(self, column: Column) -> _Getter:  # noqa: PLR0911 - one a kind
         if column.stored is None:
             if column.field == "filename":
                 return self._resolver.filename
@@ -514,15 +537,15 @@ class Table(Sequence[_Record], Generic[_Record]):
         match column.kind:
             case Key(table=table):
                 make_token = self._resolver.token_makers[table]
-                return _key_getter(view, make_token, nullable=column.nullable)
+                return _make_key_getter(view, make_token, nullable=column.nullable)
             case Choice(values=values):
-                return _choice_getter(view, values)
+                return _make_choice_getter(view, values)
             case Subset(values=values):
-                return _subset_getter(view, values)
+                return _make_subset_getter(view, values)
             case Vector(shape=shape):
-                return _vector_getter(view, shape, nullable=column.nullable)
+                return _make_vector_getter(view, shape, nullable=column.nullable)
             case Number(dtype=dtype):
-                return _number_getter(view, dtype, nullable=column.nullable)
+                return _make_number_getter(view, dtype, nullable=column.nullable)
             case _:
                 return lambda row: view[row].as_py()
 
@@ -533,7 +556,9 @@ class RecordDict(dict[str, Any]):
     __slots__ = ()
 
     def __missing__(self, field: object) -> NoReturn:
-        remedy = field_remedy(field) or f"; it has {', '.join(self)}{meant_text(field, self)}"
+        remedy = field_remedy(field)
+        if not remedy:
+            remedy = f"; it has {', '.join(self)}{meant_text(field, self)}"
         raise FieldError(f"the record has no field {field!r}{remedy}")
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -546,9 +571,9 @@ def table_names() -> list[str]:
 
 
 def split_choice(split: str, **remedies: Any) -> str:
-    """Return the name of a split in its own spelling; raises ChoiceError.
+    """Return a split's name in canonical spelling; raise ChoiceError if it is unknown.
 
-    `remedies` are arguments of `choice`.
+    `remedies` are further arguments of `choice`.
     """
     return choice(
         "split", split, SPLIT_CHOICES, also=", or a split file (its name ends in .txt)", **remedies
@@ -556,7 +581,7 @@ def split_choice(split: str, **remedies: Any) -> str:
 
 
 def token_of(row: RowArgument) -> str:
-    """Return the token of a row that is named by token or record; raises TokenError."""
+    """Return the token in a token or record; raise TokenError if `row` is neither."""
     token = row.get("token") if isinstance(row, Mapping) else row
     if not isinstance(token, str):
         raise TokenError(f"expected a token or a record with one, found {row!r}")
@@ -566,9 +591,9 @@ def token_of(row: RowArgument) -> str:
 def rows_of_scenarios(
     tables: OpenTables, scenarios: RowArgument | Iterable[RowArgument] | None
 ) -> Sequence[int]:
-    """Return the rows of scenarios in their order, or of all for None.
+    """Return the rows of scenarios in the caller's order; None means all scenarios.
 
-    Raises TokenError or ChoiceError.
+    TokenError is raised if a scenario is unknown, ChoiceError if the argument is no collection.
     """
     if scenarios is None:
         return range(len(tables.scenario))
@@ -577,20 +602,22 @@ def rows_of_scenarios(
 
 
 def _reopen(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:
-    """Undo `OpenTables.__reduce__`, without looking for changes on disk.
+    """Make the copy that `OpenTables.__reduce__` describes, without looking for changes on disk.
 
-    A worker gets a dataset with each item: it opens the files once, which takes as long as a
-    sample's labels.
+    A worker receives a dataset with each item. It opens the files only once, because opening them
+    takes as long as reading a sample's labels.
     """
     dataset = kind.__new__(kind)
     folder = arguments["tables_folder"]
-    tables = _tables_of(folder, folder.stat().st_ino) if folder.is_dir() else None
+    tables = None
+    if folder.is_dir():
+        tables = _open_tables(folder, folder.stat().st_ino)
     OpenTables.__init__(dataset, **arguments, tables=tables)
     return dataset
 
 
 @lru_cache(maxsize=2)
-def _tables_of(folder: Path, _number: int) -> Tables:
+def _open_tables(folder: Path, _number: int) -> Tables:
     """Return the tables in a folder.
 
     The system's number of the folder distinguishes it from a later folder with the same path.
@@ -598,37 +625,37 @@ def _tables_of(folder: Path, _number: int) -> Tables:
     return Tables(folder)
 
 
-def _key_getter(view: Any, token_of: Callable[[int], str], *, nullable: bool) -> _Getter:
+def _make_key_getter(view: Any, make_token: Callable[[int], str], *, nullable: bool) -> _Getter:
     item = view.item
     if not nullable:
-        return lambda row: token_of(item(row))
+        return lambda row: make_token(item(row))
 
-    def get(row: int) -> str | None:
-        target = item(row)
-        if target == NULL_INTEGER:
+    def get_token(row: int) -> str | None:
+        target_row = item(row)
+        if target_row == NULL_INTEGER:
             return None
-        return token_of(target)
+        return make_token(target_row)
 
-    return get
+    return get_token
 
 
-def _choice_getter(view: Any, values: Sequence[str]) -> _Getter:
-    # Code −1 selects the last of these: None.
+def _make_choice_getter(view: Any, values: Sequence[str]) -> _Getter:
+    # Code −1 selects the last element, None.
     words = (*values, None)
     item = view.item
     return lambda row: words[item(row)]
 
 
-def _subset_getter(view: Any, values: Sequence[str]) -> _Getter:
-    def get(row: int) -> list[str]:
+def _make_subset_getter(view: Any, values: Sequence[str]) -> _Getter:
+    def get_words(row: int) -> list[str]:
         mask = view.item(row)
         return [value for bit, value in enumerate(values) if mask >> bit & 1]
 
-    return get
+    return get_words
 
 
-def _vector_getter(view: Any, shape: tuple[int, ...], *, nullable: bool) -> _Getter:
-    def get(row: int) -> Any:
+def _make_vector_getter(view: Any, shape: tuple[int, ...], *, nullable: bool) -> _Getter:
+    def get_values(row: int) -> Any:
         values = view[row]
         if nullable and np.isnan(values[0]):
             return None
@@ -636,18 +663,20 @@ def _vector_getter(view: Any, shape: tuple[int, ...], *, nullable: bool) -> _Get
             return values.tolist()
         return values.reshape(shape).tolist()
 
-    return get
+    return get_values
 
 
-def _number_getter(view: Any, dtype: str, *, nullable: bool) -> _Getter:
+def _make_number_getter(view: Any, dtype: str, *, nullable: bool) -> _Getter:
     if dtype == "bool":
         return cast(_Getter, view.__getitem__)
     item = view.item
     if not nullable:
         return cast(_Getter, item)
 
-    def get(row: int) -> Any:
+    def get_number(row: int) -> Any:
         value = item(row)
-        return None if value == NULL_INTEGER or value != value else value  # noqa: PLR0124 - NaN
+        if value == NULL_INTEGER or value != value:  # noqa: PLR0124 - NaN
+            return None
+        return value
 
-    return get
+    return get_number

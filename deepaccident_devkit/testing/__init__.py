@@ -1,8 +1,8 @@
 """Test kit: releases of less than 1 MB in both layouts, healthy or broken in a named way.
 
-They are for tests of loaders. A pytest plugin (`plugin`, loaded by pytest wherever the devkit is
-installed) has fixtures, and `strategies` draws contents with hypothesis; the functions here need
-neither of them. See docs/testing.md.
+They are for tests of loaders. A pytest plugin (`plugin`, which pytest loads wherever the devkit is
+installed) provides fixtures, and `strategies` draws contents with hypothesis; the functions here
+need neither. See docs/testing.md.
 """
 
 from importlib import import_module
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     )
     from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 
-# Public name → its module.
+# Public name → the module that defines it.
 _MODULES = {
     **dict.fromkeys(
         ("BREAKAGES", "Breakage", "BrokenRelease", "break_release", "broken_release"), "breakages"
@@ -38,7 +38,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name's module at its first use: pytest imports this package at each start."""
+    """Import a public name's module on first use, because pytest always imports this package."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

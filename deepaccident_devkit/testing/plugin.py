@@ -1,8 +1,8 @@
-"""The pytest plugin `deepaccident`: fixtures with small releases, healthy and broken, as folders.
+"""The pytest plugin `deepaccident`: fixtures with folders of small releases, healthy and broken.
 
-It adds no options, hooks or marks, and imports the remaining devkit only when a test uses a
-fixture. Turn it off with `-p no:deepaccident`. Override a fixture in a `conftest.py`, and all
-others use your value.
+It adds no options, hooks or markers, and only imports the rest of the devkit when a test uses a
+fixture. Turn it off with `-p no:deepaccident`. If you override a fixture in a `conftest.py`, all
+other fixtures use your value.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     from deepaccident_devkit.testing.releases import SmallRelease
 
 MakeRelease = Callable[..., Path]
-"""Options of `SmallRelease` → the folder of such a release."""
+"""Takes options of `SmallRelease`; returns the folder of such a release."""
 BreakRelease = Callable[[str], "BrokenRelease"]
-"""The name of a breakage → a release with this breakage."""
+"""Takes the name of a breakage; returns a release with this breakage."""
 
 
 @pytest.fixture(scope="session", params=["A", "B"], ids=["layout_A", "layout_B"])
 def deepaccident_layout(request: pytest.FixtureRequest) -> Layout:
-    """Return each of the two layouts in turn: a test that uses it, or a release, runs twice."""
+    """Return each of the two layouts in turn, so that tests that use a release run twice."""
     layout: Layout = request.param
     return layout
 
 
 @pytest.fixture(scope="session")
 def deepaccident_config(deepaccident_layout: Layout) -> SmallRelease:
-    """Return the options of the releases of all other fixtures."""
+    """Return the options of the releases in all other fixtures."""
     from deepaccident_devkit.testing.releases import SmallRelease
 
     return SmallRelease(layout=deepaccident_layout)
@@ -43,10 +43,10 @@ def deepaccident_config(deepaccident_layout: Layout) -> SmallRelease:
 
 @pytest.fixture(scope="session")
 def make_deepaccident_release(tmp_path_factory: pytest.TempPathFactory) -> MakeRelease:
-    """Return a factory: options of `SmallRelease` → the folder of a healthy release.
+    """Return a factory that takes options of `SmallRelease` and returns a healthy release's folder.
 
-    The same options give the same folder. `make(config, frames=2)` is like `config`, but with two
-    frames. Tests must not change the files, as with `deepaccident_release`.
+    Equal options return the same folder. `make(config, frames=2)` is like `config`, but with two
+    frames. Tests must not change the files, as for `deepaccident_release`.
     """
     from deepaccident_devkit.testing.releases import SmallRelease, write_small_release
 
@@ -68,7 +68,7 @@ def deepaccident_release(
 ) -> Path:
     """Return the folder of a healthy release, which tests must not change.
 
-    There is one for each session and layout.
+    It is made once per session and layout.
     """
     return make_deepaccident_release(deepaccident_config)
 
@@ -77,7 +77,7 @@ def deepaccident_release(
 def deepaccident_release_copy(
     deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """Return a copy of `deepaccident_release`, without an index, that the test may change."""
+    """Return a copy of `deepaccident_release`, without an index, which the test may change."""
     return _copy_release(deepaccident_release, tmp_path_factory.mktemp("deepaccident") / "copy")
 
 
@@ -85,7 +85,7 @@ def deepaccident_release_copy(
 def deepaccident_broken(
     deepaccident_release: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> BreakRelease:
-    """Return a factory: a name of `BREAKAGES` → a copy of `deepaccident_release` with it."""
+    """Return a factory that takes a name in `BREAKAGES` and returns a broken copy."""
     from deepaccident_devkit.testing.breakages import break_release, checked_breakage
 
     def break_copy(name: str) -> BrokenRelease:

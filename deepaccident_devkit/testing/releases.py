@@ -1,4 +1,4 @@
-"""`write_small_release`: a complete release of a few hundred kB, with all parts of the format."""
+"""`write_small_release`: writes a complete release of a few hundred kB, with all file types."""
 
 import re
 from collections.abc import Sequence
@@ -40,19 +40,19 @@ _MAX_IMAGE_SIZE = (1600, 900)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmallRelease:
-    """The options of a small release; raises ConfigError for wrong options.
+    """The options of a small release; ConfigError is raised if one is not allowed.
 
     Attributes:
-        layout: `A`, all splits in one folder, or `B`, one folder for each split.
-        frames: Recorded frames of each scenario, at 10 Hz; with three, the release has less than
-            1 MB.
-        splits: Splits to make, from `train` (an accident and its normal twin, signalised), `val`
-            (an accident, unsignalised) and `test` (a normal scenario without labels, BEV arrays and
-            meta, as published).
+        layout: `A` for all splits in one folder, or `B` for one folder per split.
+        frames: Number of recorded frames per scenario, at 10 Hz; with three, the release has less
+            than 1 MB.
+        splits: Splits to make: `train` (an accident and its normal twin, with traffic lights),
+            `val` (an accident, without traffic lights) and `test` (a normal scenario without
+            labels, BEV arrays and meta, as published).
         agents: Agents that record.
-        channels: Sensors with files; empty for only labels, calib and meta.
-        image_size: Width and height of the pictures, pixels.
-        seed: Seed of positions in town, speeds and weather; the same seed gives the same values.
+        channels: Sensors that have files; if empty, there are only labels, calib and meta.
+        image_size: Width and height of the images in pixels.
+        seed: Seed for positions in the town, speeds and weather; equal seeds yield equal values.
     """
 
     layout: Layout = "A"
@@ -64,7 +64,7 @@ class SmallRelease:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check every field; lists become tuples, so that equal options have equal hashes."""
+        """Check every field; convert lists to tuples, so that equal options have equal hashes."""
         object.__setattr__(self, "image_size", _as_tuple("image_size", self.image_size))
         settle_choices(self, {"layout": get_args(Layout)}, error=ConfigError)
         for name, known in (("splits", SPLITS), ("agents", AGENTS), ("channels", CHANNELS)):
@@ -78,12 +78,13 @@ class SmallRelease:
             raise ConfigError(f"seed: expected a whole number from 0, found {self.seed}")
         if len(self.image_size) != 2:
             raise ConfigError(f"image_size: expected (width, height), found {self.image_size}")
-        (width, height), low, high = self.image_size, _MIN_IMAGE_SIZE, _MAX_IMAGE_SIZE
-        if not (low[0] <= width <= high[0] and low[1] <= height <= high[1]):
-            raise ConfigError(
-                f"image_size: expected width and height from {low} to {high}, "
-                f"found {self.image_size}"
-            )
+        sides = zip(_MIN_IMAGE_SIZE, self.image_size, _MAX_IMAGE_SIZE, strict=True)
+        for minimum, side, maximum in sides:
+            if not minimum <= side <= maximum:
+                raise ConfigError(
+                    f"image_size: expected width and height from {_MIN_IMAGE_SIZE} to "
+                    f"{_MAX_IMAGE_SIZE}, found {self.image_size}"
+                )
 
 
 def _as_tuple(name: str, value: object) -> tuple[object, ...]:
@@ -110,13 +111,14 @@ class _Story:
 
     @property
     def published(self) -> bool:
-        """Whether its labels, BEV arrays and meta are published, unlike in the test split."""
+        """Whether its labels, BEV arrays and meta are published; the test split lacks them."""
         return self.split != "test"
 
     @property
     def number(self) -> int:
         """The number at the end of the name."""
-        return int(re.sub(r".*scenario", "", self.name))
+        digits = re.sub(r".*scenario", "", self.name)
+        return int(digits)
 
 
 _STORIES = (
@@ -144,17 +146,17 @@ _STORIES = (
 
 
 def write_small_release(out: Path, config: SmallRelease | None = None) -> Path:
-    """Write a healthy release of less than 1 MB; returns its folder.
+    """Write a healthy release of less than 1 MB; return its folder.
 
-    It needs neither a generator nor a GPU. `deepaccident validate --deep` finds nothing in it. The
-    default takes a second or two, `SmallRelease(channels=())` a tenth of it.
+    It needs neither a generator nor a GPU. `deepaccident validate --deep` finds no fault in it.
+    With default options it takes a second or two; with `SmallRelease(channels=())`, a tenth of it.
 
     Args:
         out: Folder to make; it must be empty, or not exist yet.
         config: Options of the release; `SmallRelease()` if None.
 
     Raises:
-        ConfigError: `out` is a file or is not empty.
+        ConfigError: If `out` is a file or is not empty.
     """
     config = config or SmallRelease()
     check_free(out)
@@ -214,7 +216,7 @@ def _meta(rng: np.random.Generator, scene: SmallScene, *, accident: bool) -> Met
 
 
 def _write_splits(root: Path, stories: Sequence[_Story]) -> None:
-    """Write all split files, empty ones too; the mini splits hold all of train and val."""
+    """Write all split files, even empty ones; the mini splits contain all of train and val."""
     for split in (*SPLITS, *MINI_SPLITS):
         full_split = split.removesuffix("_mini")
         tokens = [story.token for story in stories if story.split == full_split]

@@ -1,8 +1,8 @@
-"""Hypothesis strategies for poses, points, boxes, contents of files, and small releases.
+"""Hypothesis strategies for poses, points, boxes, file contents and small releases.
 
-Contents (`labels`, `metas`, `calibs`, `clouds`) can be all that the files can hold, also unusual
-values; `label_texts` look like real files. Raises MissingExtraError on import if hypothesis is not
-installed.
+Contents (`labels`, `metas`, `calibs`, `clouds`) can be anything that the files can store, including
+unusual values; `label_texts` look like real files. Importing this module raises MissingExtraError
+if hypothesis is not installed.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ try:
     from hypothesis.extra import numpy as hnp
 except ModuleNotFoundError as error:
     raise MissingExtraError(
-        "the strategies need hypothesis: in a checkout, pip install '.[testing]'"
+        "the strategies need hypothesis; run pip install '.[testing]' in a checkout"
     ) from error
 
 _T = TypeVar("_T")
@@ -45,30 +45,31 @@ ANGLES = st.floats(-np.pi, np.pi, allow_nan=False)
 
 
 def numbers(reach: float) -> st.SearchStrategy[float]:
-    """Draw finite floats from −`reach` to `reach`."""
+    """Draw finite floats in [−`reach`, `reach`]."""
     return st.floats(-reach, reach, allow_nan=False)
 
 
 def arrays(shape: tuple[int, ...], reach: float) -> st.SearchStrategy[FloatArray]:
-    """Draw float64 arrays of numbers from −`reach` to `reach`."""
+    """Draw float64 arrays of numbers in [−`reach`, `reach`]."""
     return hnp.arrays(np.float64, shape, elements=numbers(reach))
 
 
 def rotation_matrix(yaw: float, pitch: float, roll: float) -> FloatArray:
     """Return Rz(yaw) · Ry(pitch) · Rx(roll), shape (3, 3), right-handed.
 
-    It is computed here, so that tests do not use the devkit's own code.
+    It is computed here so that tests do not rely on the devkit's implementation.
     """
-    (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    cos_yaw, cos_pitch, cos_roll = np.cos([yaw, pitch, roll])
+    sin_yaw, sin_pitch, sin_roll = np.sin([yaw, pitch, roll])
+    about_z = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
+    about_y = np.array([[cos_pitch, 0, sin_pitch], [0, 1, 0], [-sin_pitch, 0, cos_pitch]])
+    about_x = np.array([[1, 0, 0], [0, cos_roll, -sin_roll], [0, sin_roll, cos_roll]])
     return np.asarray(about_z @ about_y @ about_x)
 
 
 @st.composite
 def matrices(draw: st.DrawFn, reach: float = 1e3) -> FloatArray:
-    """Draw rigid 4×4 matrices with any yaw, pitch and roll and a translation up to `reach`."""
+    """Draw rigid 4×4 matrices with any yaw, pitch and roll, and translations up to `reach`."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrix(draw(ANGLES), draw(ANGLES), draw(ANGLES))
     matrix[:3, 3] = draw(arrays((3,), reach))
@@ -76,27 +77,30 @@ def matrices(draw: st.DrawFn, reach: float = 1e3) -> FloatArray:
 
 
 def poses(reach: float = 1e3) -> st.SearchStrategy[SE3]:
-    """Draw SE3 objects of `matrices`."""
+    """Draw poses whose matrices are drawn by `matrices`."""
     return matrices(reach).map(SE3)
 
 
 def points(max_count: int = 8, reach: float = 100.0) -> st.SearchStrategy[FloatArray]:
-    """Draw arrays (N, 3), N from 0 to `max_count`."""
-    return st.integers(0, max_count).flatmap(lambda count: arrays((count, 3), reach))
+    """Draw points, shape (N, 3), with N from 0 to `max_count`."""
+    counts = st.integers(0, max_count)
+    return counts.flatmap(lambda count: arrays((count, 3), reach))
 
 
 @st.composite
 def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
-    """Draw boxes with any rotation; some velocities are unknown."""
+    """Draw boxes with arbitrary rotations; some velocities are unknown."""
     count = draw(st.integers(0, max_count))
-    rotation = [SE3(draw(matrices())).quaternion.elements for _ in range(count)]
+    rotation = np.zeros((count, 4))
+    for row in range(count):
+        rotation[row] = draw(poses()).quaternion.elements
     velocity = draw(arrays((count, 3), 30.0))
     velocity[draw(hnp.arrays(np.bool_, (count,)))] = np.nan
     return Boxes(
         frame=frame,
         center=draw(arrays((count, 3), 100.0)),
         size=np.abs(draw(arrays((count, 3), 10.0))) + 0.1,
-        rotation=np.array(rotation).reshape(count, 4),
+        rotation=rotation,
         velocity=velocity,
         category=draw(hnp.arrays(np.int8, (count,), elements=st.integers(0, len(CATEGORIES) - 1))),
         actor_id=draw(hnp.arrays(np.int64, (count,), elements=st.integers(-100, 30_000))),
@@ -110,46 +114,46 @@ def boxes(draw: st.DrawFn, max_count: int = 5, frame: str = "lidar") -> Boxes:
 def upright_boxes(
     draw: st.DrawFn, max_count: int = 4, reach: float = 10.0, frame: str = "lidar"
 ) -> Boxes:
-    """Draw boxes on the ground, so close that many overlap; some are parallel to the axes."""
+    """Draw boxes on the ground, so close that many overlap; some are axis-aligned."""
     count = draw(st.integers(0, max_count))
+    sizes = st.floats(0.1, 10)
     yaws = ANGLES | st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi])
-    return Boxes.from_arrays(
-        draw(arrays((count, 3), reach)),
-        draw(hnp.arrays(np.float64, (count, 3), elements=st.floats(0.1, 10))),
-        draw(hnp.arrays(np.float64, (count,), elements=yaws)),
-        frame=frame,
-    )
+    center = draw(arrays((count, 3), reach))
+    size = draw(hnp.arrays(np.float64, (count, 3), elements=sizes))
+    yaw = draw(hnp.arrays(np.float64, (count,), elements=yaws))
+    return Boxes.from_arrays(center, size, yaw, frame=frame)
 
 
 def cameras() -> st.SearchStrategy[PinholeCamera]:
-    """Draw pinhole cameras of all focal lengths and centres that a picture can have."""
+    """Draw pinhole cameras with all focal lengths and centres that an image can have."""
+
+    def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
+        first_row = [fx, 0, cx]
+        second_row = [0, fy, cy]
+        return np.array([first_row, second_row, [0, 0, 1]])
+
     focal = st.floats(50, 5000)
     centre = st.floats(0, 2000)
-    matrix = st.builds(
-        lambda fx, fy, cx, cy: np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
-        focal,
-        focal,
-        centre,
-        centre,
-    )
-    return st.builds(PinholeCamera, matrix, st.integers(1, 2000), st.integers(1, 2000))
+    side = st.integers(1, 2000)
+    intrinsic = st.builds(intrinsic_matrix, focal, focal, centre, centre)
+    return st.builds(PinholeCamera, intrinsic, side, side)
 
 
 @st.composite
 def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
     """Draw the content of a label file: numbers up to 1e9, unknown velocities, any handedness."""
     count = draw(st.integers(0, max_count))
-    anything = numbers(1e9)
-    velocity = draw(hnp.arrays(np.float64, (count, 2), elements=anything | st.just(np.nan)))
+    number = numbers(1e9)
+    velocity = draw(hnp.arrays(np.float64, (count, 2), elements=number | st.just(np.nan)))
     integers = st.integers(-(2**63), 2**63 - 1)
     return Labels(
         raw=draw(st.booleans()),
         num_boxes=np.array([count]),
-        agent_velocity=draw(hnp.arrays(np.float64, (1, 2), elements=anything)),
+        agent_velocity=draw(hnp.arrays(np.float64, (1, 2), elements=number)),
         category=draw(hnp.arrays(np.int8, (count,), elements=st.integers(0, len(CATEGORIES) - 1))),
-        center=draw(hnp.arrays(np.float64, (count, 3), elements=anything)),
-        size=draw(hnp.arrays(np.float64, (count, 3), elements=anything)),
-        yaw=draw(hnp.arrays(np.float64, (count,), elements=anything)),
+        center=draw(hnp.arrays(np.float64, (count, 3), elements=number)),
+        size=draw(hnp.arrays(np.float64, (count, 3), elements=number)),
+        yaw=draw(hnp.arrays(np.float64, (count,), elements=number)),
         velocity=velocity,
         actor_id=draw(hnp.arrays(np.int64, (count,), elements=integers)),
         num_lidar_pts=draw(hnp.arrays(np.int64, (count,), elements=integers)),
@@ -159,36 +163,41 @@ def labels(draw: st.DrawFn, max_count: int = 5) -> Labels:
 
 @st.composite
 def label_lines(draw: st.DrawFn) -> str:
-    """Draw a box line with realistic numbers, of a tracked, an untracked or a parked actor."""
+    """Draw a box line with realistic numbers, for a tracked, untracked or parked actor."""
     number = numbers(100.0)
     size = st.floats(0.3, 10.0)
-    floats = [draw(number) for _ in range(3)] + [draw(size) for _ in range(3)] + [draw(ANGLES)]
-    actor_id = draw(
-        st.just(UNTRACKED_ID)
-        | st.integers(1, 10_000)
-        | st.integers(STATIC_ACTOR_ID, STATIC_ACTOR_ID + 500)
-    )
-    speeds = [draw(number), draw(number)] if 0 < actor_id < STATIC_ACTOR_ID else [0.0, 0.0]
-    words = [draw(st.sampled_from(CATEGORIES)), *map(repr, floats + speeds)]
-    return " ".join(
-        [*words, str(actor_id), str(draw(st.integers(0, 2000))), str(draw(st.booleans()))]
-    )
+    center = [draw(number), draw(number), draw(number)]
+    dimensions = [draw(size), draw(size), draw(size)]
+    yaw = draw(ANGLES)
+    parked_ids = st.integers(STATIC_ACTOR_ID, STATIC_ACTOR_ID + 500)
+    actor_id = draw(st.just(UNTRACKED_ID) | st.integers(1, 10_000) | parked_ids)
+    velocity = [0.0, 0.0]
+    if 0 < actor_id < STATIC_ACTOR_ID:
+        velocity = [draw(number), draw(number)]
+    category = draw(st.sampled_from(CATEGORIES))
+    point_count = draw(st.integers(0, 2000))
+    is_visible = draw(st.booleans())
+    values = [*center, *dimensions, yaw, *velocity, actor_id, point_count, is_visible]
+    return " ".join([category, *map(repr, values)])
 
 
 @st.composite
 def label_texts(draw: st.DrawFn, max_count: int = 5) -> str:
-    """Draw a complete label file of a vehicle: header, own line, other lines, and lines to skip.
+    """Draw a vehicle's complete label file: header, own line, other lines, and lines to skip.
 
-    Lines to skip are blank or have one word. Line ends are of Unix or Windows.
+    Lines to skip are blank or contain one word. Line endings are Unix or Windows.
     """
-    speed = " ".join(repr(draw(numbers(30.0))) for _ in range(2))
-    points = draw(st.integers(0, 2000))
-    own = f"car 0.0 0.0 -1.2 4.6 1.9 1.5 0.0 {speed} {OWN_ACTOR_ID} {points} False"
-    lines = [speed, own, *draw(st.lists(label_lines(), max_size=max_count))]
-    for skipped in draw(st.lists(st.sampled_from(["", "car"]), max_size=2)):
-        lines.insert(draw(st.integers(1, len(lines))), skipped)
-    end = draw(st.sampled_from(["\n", "\r\n"]))
-    return "".join(line + end for line in lines)
+    speed = numbers(30.0)
+    velocity = f"{draw(speed)!r} {draw(speed)!r}"
+    point_count = draw(st.integers(0, 2000))
+    own_line = f"car 0.0 0.0 -1.2 4.6 1.9 1.5 0.0 {velocity} {OWN_ACTOR_ID} {point_count} False"
+    other_lines = draw(st.lists(label_lines(), max_size=max_count))
+    lines = [velocity, own_line, *other_lines]
+    for skipped_line in draw(st.lists(st.sampled_from(["", "car"]), max_size=2)):
+        index = draw(st.integers(1, len(lines)))
+        lines.insert(index, skipped_line)
+    line_end = draw(st.sampled_from(["\n", "\r\n"]))
+    return line_end.join([*lines, ""])
 
 
 @st.composite
@@ -222,26 +231,31 @@ def metas(draw: st.DrawFn) -> Meta:
 def calibs(draw: st.DrawFn) -> Calib:
     """Draw the content of a calib file: any poses, and cameras with different intrinsics."""
     focal = st.floats(100, 2000)
+    ego_from_lidar = draw(poses(5.0))
+    world_from_ego = draw(poses())
+    camera_from_lidar = {camera: draw(poses(5.0)) for camera in CAMERAS}
+    intrinsic = {}
+    for camera in CAMERAS:
+        first_row = [draw(focal), 0, draw(focal)]
+        second_row = [0, draw(focal), draw(focal)]
+        intrinsic[camera] = np.array([first_row, second_row, [0, 0, 1]])
     return Calib(
-        ego_from_lidar=draw(poses(5.0)),
-        world_from_ego=draw(poses()),
-        camera_from_lidar={camera: draw(poses(5.0)) for camera in CAMERAS},
-        intrinsic={
-            camera: np.array(
-                [[draw(focal), 0, draw(focal)], [0, draw(focal), draw(focal)], [0, 0, 1]]
-            )
-            for camera in CAMERAS
-        },
+        ego_from_lidar=ego_from_lidar,
+        world_from_ego=world_from_ego,
+        camera_from_lidar=camera_from_lidar,
+        intrinsic=intrinsic,
     )
 
 
 @st.composite
 def clouds(draw: st.DrawFn) -> LidarPointCloud:
-    """Draw point clouds of single-precision numbers, as in the files."""
-    shape = (draw(st.integers(0, 20)), 4)
+    """Draw point clouds of single-precision numbers, as stored in the files."""
+    point_count = draw(st.integers(0, 20))
     elements = st.floats(-100, 100, width=32)
-    values = draw(hnp.arrays(np.float32, shape, elements=elements))
-    return LidarPointCloud(values[:, :3].astype(np.float64), values[:, 3])
+    points = draw(hnp.arrays(np.float32, (point_count, 4), elements=elements))
+    xyz = points[:, :3].astype(np.float64)
+    intensity = points[:, 3]
+    return LidarPointCloud(xyz, intensity)
 
 
 def damaged(content: bytes) -> st.SearchStrategy[bytes]:
@@ -252,19 +266,22 @@ def damaged(content: bytes) -> st.SearchStrategy[bytes]:
     offsets = st.integers(0, len(content) - 1)
     lengths = st.integers(0, 12)
 
-    def damage(kind: str, offset: int, length: int, new: bytes, source: int) -> bytes:
+    def damage(kind: str, offset: int, length: int, new_bytes: bytes, source: int) -> bytes:
+        start = content[:offset]
         if kind == "change":
-            return content[:offset] + new + content[offset + len(new) :]
+            return start + new_bytes + content[offset + len(new_bytes) :]
         if kind == "insert":
-            return content[:offset] + new + content[offset:]
+            return start + new_bytes + content[offset:]
         if kind == "remove":
-            return content[:offset] + content[offset + length + 1 :]
+            return start + content[offset + length + 1 :]
         if kind == "repeat":
-            return content[:offset] + content[source : source + length + 1] + content[offset:]
-        return content[:offset]
+            piece = content[source : source + length + 1]
+            return start + piece + content[offset:]
+        return start
 
     kinds = st.sampled_from(["change", "change", "insert", "remove", "repeat", "cut"])
-    return st.builds(damage, kinds, offsets, lengths, st.binary(min_size=1, max_size=4), offsets)
+    new_bytes = st.binary(min_size=1, max_size=4)
+    return st.builds(damage, kinds, offsets, lengths, new_bytes, offsets)
 
 
 def small_releases() -> st.SearchStrategy[SmallRelease]:
@@ -281,6 +298,9 @@ def small_releases() -> st.SearchStrategy[SmallRelease]:
 
 
 def _subsets(names: Sequence[_T]) -> st.SearchStrategy[tuple[_T, ...]]:
-    """Draw one or more of the names, in their order."""
-    sets = st.sets(st.sampled_from(names), min_size=1)
-    return sets.map(lambda subset: tuple(name for name in names if name in subset))
+    """Draw one or more of the names, keeping their order."""
+
+    def in_order(subset: set[_T]) -> tuple[_T, ...]:
+        return tuple(name for name in names if name in subset)
+
+    return st.sets(st.sampled_from(names), min_size=1).map(in_order)

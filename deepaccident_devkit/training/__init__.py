@@ -1,1 +1,1 @@
-"""The data of training: cached images, and datasets and batches for PyTorch."""
+"""Training data: cached images, and datasets and batches for PyTorch."""

@@ -1,4 +1,4 @@
-"""Agents and their links: cooperation, common views, poses, tracks and accidents."""
+"""Agents and their radio links: cooperation, merged views, poses, tracks and accidents."""
 
 from deepaccident_devkit.v2x.agents import (
     AGENT_CONFIGS,

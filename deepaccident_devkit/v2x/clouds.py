@@ -1,6 +1,4 @@
-"""Point clouds of several agents and moments in one coordinate frame."""
-
-from __future__ import annotations
+"""Point clouds of several agents and frames, merged into one coordinate frame."""
 
 from dataclasses import replace
 
@@ -29,38 +27,38 @@ def aggregate_point_cloud(
     link: Link | None = None,
     on_missing: OnError = "raise",
 ) -> LidarPointCloud:
-    """Merge the LiDAR points of several agents at a sample's moment and at the frames before it.
+    """Merge the LiDAR points of several agents at a sample's time and in the frames before it.
 
     Args:
         dataset: The release.
-        sample: Token or record of a sample; its agent is the ego, its frame the present.
+        sample: Token or record of a sample; its agent is the ego, its frame the current one.
         agents: Names of agents, a configuration or its name relative to the ego, or None for all
             available agents.
-        sweeps: Number of frames (0.1 s each), the present included; frames before the recording
-            began are left out.
-        frame: Coordinate frame of the result, at the sample: `world`, `ego`, `lidar` or a camera
-            channel.
-        compensate: Whether to move the points in the box of an actor to the position of the actor
-            at the present, by the track table (all agents' labels); points of actors that are not
-            annotated at both moments stay.
+        sweeps: Number of frames (0.1 s each), including the current one; frames before the
+            recording began are left out.
+        frame: Coordinate frame of the result, at the sample's time: `world`, `ego`, `lidar` or a
+            camera channel.
+        compensate: Whether to move the points in an actor's box to where the actor is in the
+            current frame, according to the track table (all agents' labels). Points of actors that
+            are not annotated in both frames stay where they are.
         link: Effects of the link on the partners' data; None for a perfect link. Each sweep is a
-            message of its own, with its own loss, pose error and delay. `compensate` corrects
+            separate message, with its own loss, pose error and delay. `compensate` corrects
             latency, not wrong poses.
-        on_missing: Treatment of point clouds that were not downloaded: `raise`, or `skip`, which
-            leaves them out and logs how many.
+        on_missing: What to do about point clouds that were not downloaded: `raise`, or `skip` them
+            and log how many.
 
     Returns:
-        The points by frame, the present first and then backwards, and for each frame by agent, the
-        ego first; no points if all were lost or left out. Its `agent` is the agent with the LiDAR
-        that recorded each point, its `time_lag` the seconds before the sample's moment (a link's
-        latency included).
+        The points, sorted by frame, the current one first and then backwards; within a frame by
+            agent, the ego first. The cloud is empty if all points were lost or left out. `agent` is
+            the agent whose LiDAR recorded each point; `time_lag` is its age in seconds at the
+            sample's time, including the link's latency.
 
     Raises:
-        TokenError: There is no such sample.
-        ChoiceError: There is no such agent, configuration, frame or `on_missing`, or `sweeps` is no
-            whole number from 1.
+        TokenError: The sample is unknown.
+        ChoiceError: An agent, the configuration, the frame or `on_missing` is unknown, or `sweeps`
+            is not a whole number from 1.
         NotAvailableError: An agent is not in this (partial) release.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
+        ConfigError: `link` is not a Link, or its latency reaches back before the recording.
         MissingFileError: A point cloud was not downloaded, and `on_missing` is `raise`.
         SensorFileError: A point cloud cannot be read.
     """
@@ -71,7 +69,9 @@ def aggregate_point_cloud(
     target_from_world = dataset.world_from(sample, frame).inverse()
     record = dataset.get("sample", sample)
     scenario, _, present = record["token"].rsplit("/", 2)
-    tracks = scenario_tracks(dataset, scenario) if compensate else None
+    tracks = None
+    if compensate:
+        tracks = scenario_tracks(dataset, scenario)
     files = MissingFiles(dataset.dataroot, on_missing)
     clouds = []
     for message in messages(dataset, sample, agents, link, sweeps=sweeps):
@@ -81,7 +81,7 @@ def aggregate_point_cloud(
         cloud = dataset.load_point_cloud(message.sample, "lidar")
         if tracks is not None:
             world_from_lidar = dataset.world_from(message.sample, "lidar")
-            cloud = _compensated(cloud, world_from_lidar, tracks, message, int(present))
+            cloud = _move_actors(cloud, world_from_lidar, tracks, message, int(present))
         target_from_lidar = message.target_from(dataset, "lidar", target_from_world)
         cloud = cloud.transform(target_from_lidar, frame)
         lag = record["timestamp"] - dataset.get("sample", message.sample)["timestamp"]
@@ -93,15 +93,15 @@ def aggregate_point_cloud(
 
 
 def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
-    """Move points along with the actors of the boxes in which they lie.
+    """Move points that lie in boxes of actors along with these actors.
 
-    Actors that are in only one of the two sets of boxes are ignored. If a point lies in several
-    boxes, the last box counts; a point outside all boxes stays.
+    Actors in only one of the two sets of boxes are ignored. If a point lies in several boxes, it
+    moves with the last one; a point outside all boxes stays.
 
     Args:
         points: Points (P, 3), metres, in the frame of the boxes.
         then: Boxes of the actors when the points were measured.
-        now: Boxes of the actors to which the points move, in the same frame.
+        now: Boxes of the actors at the time to which the points move, in the same frame.
 
     Returns:
         The moved points (P, 3).
@@ -111,33 +111,43 @@ def moved_points(points: FloatArray, then: Boxes, now: Boxes) -> FloatArray:
     )
     before = then.select(rows_then)
     after = now.select(rows_now)
-    shifted = (before.center != after.center).any(axis=1)
-    turned = (before.rotation != after.rotation).any(axis=1)
-    moving = shifted | turned
-    before = before.select(moving)
-    after = after.select(moving)
+    is_shifted = (before.center != after.center).any(axis=1)
+    is_turned = (before.rotation != after.rotation).any(axis=1)
+    is_moved = is_shifted | is_turned
+    before = before.select(is_moved)
+    after = after.select(is_moved)
     result = np.array(points)
     if not len(shared_ids):
         return result
     world_from_before = quaternions.to_matrix(before.rotation)
     world_from_after = quaternions.to_matrix(after.rotation)
     for box, in_box in enumerate(before.contains(points)):
-        box_points = (points[in_box] - before.center[box]) @ world_from_before[box]
+        offsets = points[in_box] - before.center[box]
+        box_points = offsets @ world_from_before[box]
         result[in_box] = box_points @ world_from_after[box].T + after.center[box]
     return result
 
 
-def _compensated(
+def _move_actors(
     cloud: LidarPointCloud,
     world_from_lidar: SE3,
     tracks: ScenarioTracks,
     message: Message,
     present: int,
 ) -> LidarPointCloud:
-    """Return a cloud in its LiDAR frame with moving actors at their places of frame `present`."""
+    """Move the points of actors in a cloud to where the actors are in the frame `present`.
+
+    Args:
+        cloud: Points in the LiDAR frame of the message.
+        world_from_lidar: Pose of the LiDAR.
+        tracks: Tracks of the scenario.
+        message: Message of the cloud.
+        present: Number of the frame to which the actors are moved.
+    """
     recorded = int(message.sample.rsplit("/", 1)[1])
     if recorded == present:
         return cloud
     world_points = world_from_lidar.apply(cloud.xyz)
-    moved = moved_points(world_points, tracks.at(recorded), tracks.at(present))
-    return replace(cloud, xyz=world_from_lidar.inverse().apply(moved))
+    moved_world_points = moved_points(world_points, tracks.at(recorded), tracks.at(present))
+    xyz = world_from_lidar.inverse().apply(moved_world_points)
+    return replace(cloud, xyz=xyz)

@@ -1,13 +1,10 @@
-"""The common view of several agents: visible actors, and one box for each actor.
+"""The merged view of several agents: visible actors, and one box for each actor.
 
-`seen_actors` returns every actor that is seen by the released rule (docs/released_code.md,
-Visibility and attributes) with its true state, apart from the effects of the link.
+`seen_actors` returns every actor that is visible under the released rule (docs/released_code.md,
+Visibility and attributes). The actors' states are true, except for the effects of the link.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -35,25 +32,24 @@ from deepaccident_devkit.taxonomy import (
 from deepaccident_devkit.v2x.agents import Agents
 from deepaccident_devkit.v2x.messages import Link, Message, messages
 
-SAME_ACTOR_DISTANCE: Final = 0.5
-"""Metres: boxes of one class in two agents' labels with centres nearer than this belong to the same
-untracked actor."""
+SAME_ACTOR_DISTANCE = 0.5
+"""Untracked boxes of one class whose centres are closer than this, metres, are one actor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CooperativeView(FrozenArrays):
-    """The actors that several agents see at one moment, one box each; arrays are read-only.
+    """The actors that several agents see at one time, with one box each; arrays are read-only.
 
     Attributes:
-        boxes: N boxes in one coordinate frame, tracked actors by ascending id, then untracked ones
-            (−1). An agent's own row has the agent's id. `num_lidar_pts` is the sum over the agents,
-            and `camera_visible` is true if any of their cameras sees it (own rows do not count, and
-            of rows that a label repeats only the first counts); `row` is the row in the label of
-            `source`.
+        boxes: N boxes in one coordinate frame: tracked actors by ascending id, then untracked ones
+            (−1). An agent's own row has the agent's CARLA id. `num_lidar_pts` is the sum over the
+            agents, and `camera_visible` is true if a camera of any agent sees the actor. For these
+            two, agents' own rows do not count, nor do repetitions of an actor in one label. `row`
+            is the row in the label of `source`.
         source: Indices into `taxonomy.AGENTS`, shape (N,), int8: the agent that the box comes from.
         seen_by: Bit masks over `taxonomy.AGENTS`, shape (N,), uint8: the agents that have a box of
-            the actor; for an untracked actor only the source, because its rows in other labels are
-            known only by their position.
+            the actor; for an untracked actor only `source`, because rows of other labels are
+            matched with it only by position.
     """
 
     boxes: Boxes
@@ -68,10 +64,10 @@ class SeenActors(FrozenArrays):
     Attributes:
         boxes: N boxes, one for each actor; the ego's own box is first and has the id −100, as in
             its label.
-        seen_by: Bit masks over `taxonomy.AGENTS`, shape (N,), uint8: the agents that see the actor;
-            for the ego's box, the ego.
-        own_actor_id: Actor id of the ego; None for the infrastructure, or if the meta file does not
-            name it.
+        seen_by: Bit masks over `taxonomy.AGENTS`, shape (N,), uint8: the agents that see the actor
+            (for the ego's own box, the ego).
+        own_actor_id: Actor id of the ego; None if the ego is the infrastructure, or the meta file
+            does not name it.
     """
 
     boxes: Boxes
@@ -80,33 +76,35 @@ class SeenActors(FrozenArrays):
 
     @property
     def has_own(self) -> bool:
-        """Whether the ego has a box of its own; the infrastructure has none."""
-        return bool((self.boxes.actor_id == OWN_ACTOR_ID).any())
+        """Whether the ego has its own box, which the infrastructure does not."""
+        is_own = self.boxes.actor_id == OWN_ACTOR_ID
+        return bool(is_own.any())
 
 
 def visible_instances(
     dataset: Dataset, sample: RowArgument, *, agents: Agents = None, link: Link | None = None
 ) -> list[str]:
-    """Return the instances that at least one of several agents sees, by the released rule.
+    """Return the instances that at least one of several agents sees under the released rule.
 
     With all five agents and no link, these are the actors that the released labels count as visible
-    (docs/released_code.md, Visibility and attributes). Own rows and untracked rows never count.
+    (docs/released_code.md, Visibility and attributes). Agents' own rows and untracked rows never
+    count.
 
     Args:
         dataset: The release.
-        sample: Token or record of a sample; its agent is the ego, its frame the present.
+        sample: Token or record of a sample; its agent is the ego, its frame the current one.
         agents: Names of agents, a configuration or its name relative to the ego, or None for all
             available agents.
         link: Effects of the link on the partners' data; None for a perfect link.
 
     Returns:
-        Instance tokens by ascending actor id; agents without labels add nothing.
+        Instance tokens by ascending actor id; agents without labels contribute nothing.
 
     Raises:
-        TokenError: There is no such sample.
-        ChoiceError: There is no such agent or configuration.
+        TokenError: The sample is unknown.
+        ChoiceError: An agent or the configuration is unknown.
         NotAvailableError: An agent is not in this (partial) release.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
+        ConfigError: `link` is not a Link, or its latency reaches back before the recording.
     """
     scenario = dataset.get("sample", sample)["scenario_token"]
     actor_ids = visible_actors(dataset, sample, agents=agents, link=link)
@@ -121,7 +119,7 @@ def visible_actors(
     actor_ids = []
     for message in messages(dataset, sample, agents, link):
         boxes = dataset.boxes(message.sample, "lidar")
-        masks.append(_released_mask(message, boxes))
+        masks.append(_mask_released(message, boxes))
         actor_ids.append(boxes.actor_id)
     return visible_ids(masks, actor_ids)
 
@@ -135,34 +133,34 @@ def cooperative_boxes(
     visible: Visible | None = None,
     link: Link | None = None,
 ) -> Boxes:
-    """Return the actors that several agents annotated at a sample's moment, one box each.
+    """Return the actors that several agents annotated at a sample's time, with one box each.
 
-    If several agents have an actor, the ego's box counts; without one, the box of the first other
-    agent. An agent's own row (which becomes the agent's actor) counts only if no other agent has
-    the actor, because it is wrong by up to 0.3 m. Untracked rows (−1) are retained once: a row
-    within 0.5 m of another agent's row of the same class, or of a tracked actor's retained box, is
-    left out. `cooperative_view` also returns which agents saw which actor.
+    If several agents annotated an actor, the ego's box is used; if the ego did not, the first other
+    agent's. An agent's own row (which gets the agent's id) is used only if no other agent annotated
+    that agent, because it is off by up to 0.3 m. Untracked rows (−1) are merged by position: a row
+    is left out if it is within 0.5 m of another agent's row of the same class, or of a tracked
+    actor's box. `cooperative_view` also returns which agents saw which actor.
 
     Args:
         dataset: The release.
-        sample: Token or record of a sample; its agent is the ego, its frame the present.
+        sample: Token or record of a sample; its agent is the ego, its frame the current one.
         agents: Names of agents, a configuration or its name relative to the ego, or None for all
             available agents.
-        frame: Coordinate frame of the result, at the sample: `world`, `ego`, `lidar` or a camera
-            channel (optical).
-        visible: None for all annotated actors, with own rows; `camera` for the actors that a camera
-            of the same agent sees; `released` for the actors that the same agent sees by the
-            released rule (docs/released_code.md, Visibility and attributes).
+        frame: Coordinate frame of the result, at the sample's time: `world`, `ego`, `lidar` or a
+            camera channel (optical).
+        visible: None for all annotated actors, including agents' own rows; `camera` for the boxes
+            that a camera of the annotating agent sees; `released` for the boxes that the annotating
+            agent sees under the released rule (docs/released_code.md, Visibility and attributes).
         link: Effects of the link on the partners' data; None for a perfect link.
 
     Returns:
-        Boxes as described for `CooperativeView.boxes`; actor ids are CARLA's, or −1 for untracked.
+        Boxes as described for `CooperativeView.boxes`; actor ids are CARLA's, or −1 if untracked.
 
     Raises:
-        TokenError: There is no such sample.
-        ChoiceError: There is no such agent, configuration, frame or visibility.
+        TokenError: The sample is unknown.
+        ChoiceError: An agent, the configuration, the frame or the visibility is unknown.
         NotAvailableError: An agent is not in this (partial) release.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
+        ConfigError: `link` is not a Link, or its latency reaches back before the recording.
     """
     view = cooperative_view(dataset, sample, agents=agents, frame=frame, visible=visible, link=link)
     return view.boxes
@@ -179,33 +177,35 @@ def cooperative_view(
 ) -> CooperativeView:
     """Return `cooperative_boxes` and the agents that saw each box.
 
-    It has the same arguments and errors.
+    The arguments and errors are as in `cooperative_boxes`.
     """
     frame = dataset.frame_name(frame)
     visible = choice("visible", visible, VISIBLE)
     target_from_world = dataset.world_from(sample, frame).inverse()
-    boxes_by_agent = []
-    ids_by_agent = []
-    codes_by_agent = []
+    agent_boxes = []
+    agent_actor_ids = []
+    agent_codes = []
     for message in messages(dataset, sample, agents, link):
         boxes = dataset.boxes(message.sample, "lidar")
         actor_ids = dataset.actor_ids(message.sample)
         if visible is not None:
-            mask = _visible_mask(message, boxes, visible)
+            mask = _mask_visible(message, boxes, visible)
             boxes = boxes.select(mask)
             actor_ids = actor_ids[mask]
         target_from_lidar = message.target_from(dataset, "lidar", target_from_world)
-        boxes_by_agent.append(boxes.transform(target_from_lidar, frame))
-        ids_by_agent.append(actor_ids)
-        agent_code = AGENTS.index(message.agent)
-        codes_by_agent.append(np.full(len(actor_ids), agent_code, dtype=np.int8))
-    if not boxes_by_agent:
-        empty = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame=frame)
+        agent_boxes.append(boxes.transform(target_from_lidar, frame))
+        agent_actor_ids.append(actor_ids)
+        code = AGENTS.index(message.agent)
+        agent_codes.append(np.full(len(actor_ids), code, dtype=np.int8))
+    if not agent_boxes:
+        no_boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame=frame)
         return CooperativeView(
-            boxes=empty, source=np.zeros(0, dtype=np.int8), seen_by=np.zeros(0, dtype=np.uint8)
+            boxes=no_boxes, source=np.zeros(0, dtype=np.int8), seen_by=np.zeros(0, dtype=np.uint8)
         )
-    all_boxes = concatenate(boxes_by_agent, frame)
-    return _merged_by_actor(all_boxes, np.concatenate(ids_by_agent), np.concatenate(codes_by_agent))
+    all_boxes = concatenate(agent_boxes, frame)
+    all_actor_ids = np.concatenate(agent_actor_ids)
+    all_codes = np.concatenate(agent_codes)
+    return _merge_by_actor(all_boxes, all_actor_ids, all_codes)
 
 
 def seen_actors(
@@ -216,31 +216,31 @@ def seen_actors(
     link: Link | None = None,
     frame: str = "ego",
 ) -> SeenActors:
-    """Return the actors that at least one of several agents sees, and the ego itself.
+    """Return the ego, and the actors that at least one of several agents sees.
 
-    A partner's box of itself does not count, as in the released rule: another agent has to see it.
+    As in the released rule, a partner's box of itself does not count: another agent has to see it.
     Untracked actors (−1) never count as seen.
 
     Args:
         dataset: The release.
-        sample: Token or record of a sample; its agent is the ego, its frame the present.
-        agents: Cooperating agents, as in `v2x.cooperating_agents`.
+        sample: Token or record of a sample; its agent is the ego, its frame the current one.
+        agents: Cooperating agents, as for `v2x.cooperating_agents`.
         link: Effects of the link on the partners' data; None for a perfect link. A delay is not
             compensated: moving actors are at their earlier positions.
         frame: Coordinate frame of the boxes: `ego`, `world`, `lidar` or a camera channel of the
             sample.
 
     Raises:
-        TokenError: There is no such sample.
-        NotAvailableError: The sample has no label, or an agent is not in this (partial) release.
-        ChoiceError: There is no such agent, configuration or frame.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
+        TokenError: The sample is unknown.
+        NotAvailableError: The sample is not labelled, or an agent is not in this (partial) release.
+        ChoiceError: An agent, the configuration or the frame is unknown.
+        ConfigError: `link` is not a Link, or its latency reaches back before the recording.
     """
     record = dataset.get("sample", sample)
     if not record["labelled"]:
         raise NotAvailableError(
-            f"{record['token']}: has no label (the test split ships without), so that an oracle "
-            "knows nothing; choose a labelled sample"
+            f"{record['token']}: has no label (the test split ships without labels), so an "
+            "oracle knows nothing; choose a labelled sample"
         )
     view = cooperative_view(
         dataset, sample, agents=agents, frame=frame, visible="released", link=link
@@ -260,69 +260,69 @@ def seen_actors(
     )
 
 
-def _merged_by_actor(boxes: Boxes, actor: IntArray, agent: AnyArray) -> CooperativeView:
+def _merge_by_actor(boxes: Boxes, actor_ids: IntArray, agents: AnyArray) -> CooperativeView:
     """Merge the boxes of all agents into one box for each actor.
 
     Args:
         boxes: N boxes of all agents, the preferred ones first.
-        actor: Actor ids, shape (N,).
-        agent: Indices into `taxonomy.AGENTS`, shape (N,): the agents that the boxes come from.
+        actor_ids: Actor ids, shape (N,).
+        agents: Indices into `taxonomy.AGENTS`, shape (N,): the agents that the boxes come from.
     """
-    own = boxes.actor_id == OWN_ACTOR_ID
-    tracked = np.flatnonzero(actor != UNTRACKED_ID)
-    order = tracked[np.lexsort((own[tracked], actor[tracked]))]
-    order = order[_unrepeated_rows(actor[order], agent[order])]
-    ids, first_rows, group = np.unique(actor[order], return_index=True, return_inverse=True)
+    is_own = boxes.actor_id == OWN_ACTOR_ID
+    tracked = np.flatnonzero(actor_ids != UNTRACKED_ID)
+    order = tracked[np.lexsort((is_own[tracked], actor_ids[tracked]))]
+    order = order[_unrepeated_rows(actor_ids[order], agents[order])]
+    ids, first_rows, actors = np.unique(actor_ids[order], return_index=True, return_inverse=True)
     tracked_rows = order[first_rows]
     count = len(ids)
-    by_others = ~own[order]
-    points_by_others = np.where(by_others, boxes.num_lidar_pts[order], 0)
-    points = np.bincount(group, points_by_others, count).astype(np.int64)
-    seen_by_camera = np.bincount(group, boxes.camera_visible[order] & by_others, count) > 0
+    is_other = ~is_own[order]
+    points_by_others = np.where(is_other, boxes.num_lidar_pts[order], 0)
+    points = np.bincount(actors, points_by_others, count).astype(np.int64)
+    seen_by_others = boxes.camera_visible[order] & is_other
+    seen_by_camera = np.bincount(actors, seen_by_others, count) > 0
     seen_by = np.zeros(count, dtype=np.uint8)
-    bits = np.left_shift(1, agent, dtype=np.uint8, casting="unsafe")
-    np.bitwise_or.at(seen_by, group, bits[order])
+    bits = np.left_shift(1, agents, dtype=np.uint8, casting="unsafe")
+    np.bitwise_or.at(seen_by, actors, bits[order])
 
-    untracked_rows = np.flatnonzero(actor == UNTRACKED_ID)
-    repeated = _repeated(boxes, agent, untracked_rows, tracked_rows)
-    untracked_rows = untracked_rows[~repeated]
+    untracked_rows = np.flatnonzero(actor_ids == UNTRACKED_ID)
+    is_repeated = _find_repetitions(boxes, agents, untracked_rows, tracked_rows)
+    untracked_rows = untracked_rows[~is_repeated]
     rows = np.concatenate([tracked_rows, untracked_rows])
     result = boxes.select(rows)
-    columns = {
-        name: getattr(result, name)
-        for name in ("center", "size", "rotation", "velocity", "category", "row")
-    }
-    columns["actor_id"] = actor[rows]
+    columns = {}
+    for name in ("center", "size", "rotation", "velocity", "category", "row"):
+        columns[name] = getattr(result, name)
+    columns["actor_id"] = actor_ids[rows]
     columns["num_lidar_pts"] = np.concatenate([points, boxes.num_lidar_pts[untracked_rows]])
     columns["camera_visible"] = np.concatenate(
         [seen_by_camera, boxes.camera_visible[untracked_rows]]
     )
     return CooperativeView(
         boxes=trusted_boxes(boxes.frame, columns),
-        source=agent[rows],
+        source=agents[rows],
         seen_by=np.concatenate([seen_by, bits[untracked_rows]]),
     )
 
 
-def _unrepeated_rows(actor: IntArray, agent: AnyArray) -> IntArray:
-    """Return the first row of each pair of an actor and an agent, ascending.
+def _unrepeated_rows(actor_ids: IntArray, agents: AnyArray) -> IntArray:
+    """Return the first row of each (actor, agent) pair, in ascending order.
 
     A label may repeat an actor.
     """
-    pair_codes = actor * len(AGENTS) + agent
-    rows: IntArray = np.unique(pair_codes, return_index=True)[1]
-    rows.sort()
-    return rows
+    pair_codes = actor_ids * len(AGENTS) + agents
+    _, rows = np.unique(pair_codes, return_index=True)
+    first_rows: IntArray = np.sort(rows)
+    return first_rows
 
 
-def _repeated(
-    boxes: Boxes, agent: AnyArray, untracked_rows: IntArray, tracked_rows: IntArray
+def _find_repetitions(
+    boxes: Boxes, agents: AnyArray, untracked_rows: IntArray, tracked_rows: IntArray
 ) -> BoolArray:
-    """Mark untracked rows that repeat a tracked actor, or an untracked row of an earlier agent.
+    """Mark the untracked rows that repeat a tracked actor or an earlier agent's untracked row.
 
     Args:
         boxes: Boxes of all agents.
-        agent: Indices into `taxonomy.AGENTS` of all boxes.
+        agents: Indices into `taxonomy.AGENTS` of all boxes.
         untracked_rows: Rows of untracked boxes, shape (U,).
         tracked_rows: Rows of the retained boxes of tracked actors.
 
@@ -330,26 +330,29 @@ def _repeated(
         Truth values, shape (U,).
     """
     candidates = np.concatenate([tracked_rows, untracked_rows])
-    offsets = boxes.center[untracked_rows][:, None] - boxes.center[candidates][None]
+    offsets = boxes.center[untracked_rows][:, None] - boxes.center[candidates]
     distances: FloatArray = np.linalg.norm(offsets, axis=-1)
-    same_category = boxes.category[untracked_rows][:, None] == boxes.category[candidates]
-    same_actor = (distances < SAME_ACTOR_DISTANCE) & same_category
-    other_agent = agent[untracked_rows][:, None] != agent[untracked_rows]
-    same_actor[:, len(tracked_rows) :] &= np.tril(other_agent, k=-1)
-    result: BoolArray = same_actor.any(axis=1)
-    return result
+    categories = boxes.category[untracked_rows]
+    is_same_category = categories[:, None] == boxes.category[candidates]
+    is_same_actor = (distances < SAME_ACTOR_DISTANCE) & is_same_category
+    untracked_agents = agents[untracked_rows]
+    is_other_agent = untracked_agents[:, None] != untracked_agents
+    is_same_actor[:, len(tracked_rows) :] &= np.tril(is_other_agent, k=-1)
+    is_repeated: BoolArray = is_same_actor.any(axis=1)
+    return is_repeated
 
 
-def _visible_mask(message: Message, boxes: Boxes, visible: Visible) -> BoolArray:
-    """Mark the boxes, in the LiDAR frame, that the sender sees by the rule `visible`."""
+def _mask_visible(message: Message, boxes: Boxes, visible: Visible) -> BoolArray:
+    """Mark the boxes, in the LiDAR frame, that the sender sees under the rule `visible`."""
     if visible == "camera":
         return boxes.camera_visible
-    tracked: BoolArray = (boxes.actor_id != OWN_ACTOR_ID) & (boxes.actor_id != UNTRACKED_ID)
-    return _released_mask(message, boxes) & tracked
+    is_other: BoolArray = boxes.actor_id != OWN_ACTOR_ID
+    is_tracked: BoolArray = boxes.actor_id != UNTRACKED_ID
+    return _mask_released(message, boxes) & is_other & is_tracked
 
 
-def _released_mask(message: Message, boxes: Boxes) -> BoolArray:
-    """Mark the boxes, in the LiDAR frame, that the sender sees by its own points and cameras."""
+def _mask_released(message: Message, boxes: Boxes) -> BoolArray:
+    """Mark the boxes, in the LiDAR frame, that the sender's LiDAR points and cameras show."""
     return visible_mask(
         boxes.center[:, :2],
         boxes.category,

@@ -1,13 +1,11 @@
-"""Messages between agents: their sizes, and the wrong poses, delay and loss of a real link."""
-
-from __future__ import annotations
+"""Messages between agents: their sizes, and a real link's pose errors, delay and loss."""
 
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Any, Final, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -27,36 +25,39 @@ from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError
 from deepaccident_devkit.v2x.agents import Agents, cooperating_agents
 
-POINT_BYTES: Final = 4 * 4
+POINT_BYTES = 4 * 4
 """Bytes of x, y, z and intensity in single precision."""
-BOX_BYTES: Final = 9 * 4 + 4 + 1 + 4
+BOX_BYTES = 9 * 4 + 4 + 1 + 4
 """Bytes of centre, size, yaw and horizontal velocity in single precision, an id, a class and a
 score."""
-POSE_BYTES: Final = 6 * 4
-"""Bytes of a 6-vector in single precision, which goes with every message."""
-_BEV_SHAPE: Final = (64, 200, 200)
+POSE_BYTES = 6 * 4
+"""Bytes of a 6-vector in single precision, which is part of every message."""
+# Default BEV features: channels, rows, columns.
+_BEV_SHAPE = (64, 200, 200)
 Payload = Literal["images", "cloud", "boxes", "bev"]
-"""The kinds of data that a message can have; `MessageSize` describes them."""
-_NORMAL_DISTRIBUTION: Final = NormalDist()
-_MAX_BYTES: Final = 2**50
+"""The kinds of data that a message can contain; `MessageSize` describes them."""
+_NORMAL_DISTRIBUTION = NormalDist()
+# Largest budget and largest message, bytes.
+_MAX_BYTES = 2**50
 # No scenario is longer, so a longer latency must be in milliseconds.
-_MAX_LATENCY_S: Final = 20.0
+_MAX_LATENCY_S = 20.0
 # Largest difference between a latency and a whole number of frames, in frames.
-_FRAME_TOLERANCE: Final = 1e-6
+_FRAME_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseNoise:
-    """The error of a partner's own pose: one draw for each partner and frame.
+    """The error of a partner's pose estimate, drawn once for each partner and frame.
 
-    The error of the position is a distance from a normal distribution of `mean` and `std`. The
-    paper studies means of 0.1 to 0.5 m with σ = 0.02 m and does not name the direction; here it is
-    horizontal and uniform over all directions.
+    The length of the position error is normally distributed with `mean` and `std`. The paper
+    studies means of 0.1 to 0.5 m with σ = 0.02 m, and does not state the direction; here it is
+    horizontal and uniformly distributed.
 
     Attributes:
         mean: Mean of the distance, metres.
         std: Standard deviation of the distance, metres.
-        heading_std: Standard deviation of the heading about the vertical, radians; its mean is 0.
+        heading_std: Standard deviation of the heading error about the vertical, radians; its mean
+            is 0.
     """
 
     mean: float = 0.0
@@ -64,16 +65,20 @@ class PoseNoise:
     heading_std: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the numbers; raises ConfigError."""
+        """Check the numbers.
+
+        Raises:
+            ConfigError: A number is out of range.
+        """
         for name in ("mean", "std", "heading_std"):
-            value = checked_number(
-                f"pose noise: {name}", getattr(self, name), "a number from 0", ConfigError
-            )
-            if not 0 <= value < math.inf:
+            field_name = f"pose noise: {name}"
+            value = getattr(self, name)
+            number = checked_number(field_name, value, "a number from 0", ConfigError)
+            if not 0 <= number < math.inf:
                 raise ConfigError(
-                    f"pose noise: {name} is {value:g}; choose a finite number of at least 0"
+                    f"{field_name} is {number:g}; choose a finite number of at least 0"
                 )
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, number)
         if self.heading_std > math.pi:
             radians = math.radians(self.heading_std)
             raise ConfigError(
@@ -85,10 +90,10 @@ class PoseNoise:
         """Draw the error of one partner at one frame.
 
         Args:
-            key: Text that decides the draw.
+            key: Text that seeds the draw.
 
         Returns:
-            Errors of x and y in world, metres, and of the heading, radians.
+            Errors of x and y in world, metres, and error of the heading, radians.
         """
         direction_draw, distance_draw, _, heading_draw = uniforms(f"{key}/pose")
         distance = self.mean + self.std * _NORMAL_DISTRIBUTION.inv_cdf(distance_draw)
@@ -101,24 +106,25 @@ class PoseNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Link:
-    """The effects of a link on partners' data; the ego's own data are never changed.
+    """The effects of a radio link on partners' data; the ego's own data never change.
 
-    Every draw depends only on the seed, the scenario, the partner and the frame at which the ego
-    receives: not on the order of calls, on other agents or on the other effects.
+    Every draw depends only on the seed, the scenario, the partner and the frame in which the ego
+    receives the data. It does not depend on the order of calls, other agents or other effects.
 
     Attributes:
         latency: Delay of partners' data, seconds, a multiple of 0.1 (the paper: 0.1 to 0.5). The
-            data of an earlier frame arrive, placed by the pose at that time: standing actors are
-            right, moving ones are at their earlier positions.
+            ego receives the data of an earlier frame, placed with the partner's pose at that time.
+            So stationary actors are correct, and moving ones are at their earlier positions.
         pose_noise: Mean position error of partners' poses, metres. A number is `PoseNoise(mean=…)`;
             None for exact poses.
-        packet_loss: Probability in [0, 1] that a partner's data do not arrive at a frame.
+        packet_loss: Probability in [0, 1] that a partner's data do not arrive in a frame.
         seed: Seed of all draws.
-        budget: Bytes a frame that all partners together can send to the ego. None is no limit. In
-            the order of `cooperating_agents`, each partner sends if its message still fits; a
-            message that is lost on its way takes no bytes.
-        payload: Data that a partner sends, for the budget: a kind of `MessageSize`, or the bytes of
-            every message, such as of features that all have one size; None without a budget.
+        budget: Bytes per frame that all partners together can send to the ego. None means no limit.
+            In the order of `cooperating_agents`, each partner sends its message if it still fits.
+            Lost messages use no bytes.
+        payload: Data that a partner sends, which the budget counts: a kind of data from
+            `MessageSize`, or the bytes of every message (for example, features of constant size);
+            None without a budget.
     """
 
     latency: float = 0.0
@@ -132,24 +138,26 @@ class Link:
         """Check the numbers and convert them to Python's types.
 
         Raises:
-            ConfigError: A number is out of its range.
-            ChoiceError: There is no such payload.
+            ConfigError: A number is out of range.
+            ChoiceError: The payload is unknown.
         """
         packet_loss = checked_number(
             "packet_loss", self.packet_loss, "a probability from 0 to 1", ConfigError
         )
         if not 0 <= packet_loss <= 1:
             raise ConfigError(
-                f"packet_loss: {packet_loss:g} is no probability; choose a number from 0 to 1"
+                f"packet_loss: {packet_loss:g} is not a probability; choose a number from 0 to 1"
             )
-        checked_values = {
-            "latency": _whole_frames(self.latency),
-            "pose_noise": _pose_noise(self.pose_noise),
+        checked_values: dict[str, object] = {
+            "latency": _check_latency(self.latency),
+            "pose_noise": _check_pose_noise(self.pose_noise),
             "packet_loss": packet_loss,
             "seed": checked_whole("seed", self.seed, "a whole number", ConfigError),
-            "budget": _checked_budget(self.budget),
-            "payload": _checked_payload(self.payload),
         }
+        if self.budget is not None:
+            budget = checked_count("budget", self.budget, "bytes per frame", _MAX_BYTES)
+            checked_values["budget"] = budget
+        checked_values["payload"] = _check_payload(self.payload)
         if self.budget is not None and self.payload is None:
             raise ConfigError(
                 "budget: needs the kind of data that partners send; give payload='boxes' or "
@@ -164,52 +172,55 @@ class Link:
         return round(self.latency / FRAME_PERIOD)
 
     def frame_sent(self, scenario: str, index: int) -> int:
-        """Return the number of the frame from which the data at frame `index` of a scenario come.
+        """Return the number of the frame whose data arrive in frame `index` of a scenario.
 
         Raises:
-            ConfigError: That frame would be before the recording began.
+            ConfigError: That frame is before the start of the recording.
         """
         sent_index = index - self.latency_frames
         if sent_index < 1:
             raise ConfigError(
-                f"latency: {self.latency} s reaches back before the first frame of {scenario} "
-                f"from frame {index:03d}; the longest possible is {(index - 1) / 10} s; "
-                f"choose a shorter latency, or a frame that has {self.latency_frames} others "
-                "before it"
+                f"latency: {self.latency} s reaches back from frame {index:03d} to before the "
+                f"first frame of {scenario}; the longest possible latency is {(index - 1) / 10} "
+                f"s; choose a shorter latency, or frame {self.latency_frames + 1:03d} or a later "
+                "one"
             )
         return sent_index
 
     def loses(self, scenario: str, partner: str, index: int) -> bool:
-        """Return whether a partner's data are lost at frame number `index`."""
+        """Return whether a partner's data for frame number `index` are lost."""
         if self.packet_loss <= 0:
             return False
-        loss_draw = uniforms(f"{self._key(scenario, partner, index)}/loss")[0]
+        key = self._draw_key(scenario, partner, index)
+        loss_draw = uniforms(f"{key}/loss")[0]
         return loss_draw < self.packet_loss
 
     def pose_error(
         self, scenario: str, partner: str, index: int, position: FloatArray
     ) -> SE3 | None:
-        """Return `claimed_from_world`, from true to claimed positions of a partner's data.
+        """Return `claimed_from_world`, which maps true positions of partner data to claimed ones.
 
         Args:
             scenario: Token of the scenario.
             partner: Name of the agent.
-            index: Number of the frame at which the ego receives.
-            position: True position (3,) of the partner, world, metres: the error of the heading
-                turns about this point.
+            index: Number of the frame in which the ego receives the data.
+            position: True position (3,) of the partner in world, metres; the heading error rotates
+                about this point.
 
         Returns:
             None without pose noise.
         """
         if not isinstance(self.pose_noise, PoseNoise):
             return None
-        x, y, heading = self.pose_noise.draw(self._key(scenario, partner, index))
+        key = self._draw_key(scenario, partner, index)
+        x, y, heading = self.pose_noise.draw(key)
         turn = SE3.from_yaw(heading)
-        translation = position + np.array([x, y, 0.0]) - turn.rotate(position)
+        shift = np.array([x, y, 0.0])
+        translation = position + shift - turn.rotate(position)
         return SE3.from_rotation(turn.rotation, translation)
 
-    def _key(self, scenario: str, partner: str, index: int) -> str:
-        """Return the text that decides the draws for one partner at one frame."""
+    def _draw_key(self, scenario: str, partner: str, index: int) -> str:
+        """Return the text that seeds the draws for one partner in one frame."""
         return f"{self.seed}/{scenario}/{partner}/{index}"
 
 
@@ -217,7 +228,7 @@ def checked_link(link: object) -> Link | None:
     """Check a `link=` argument.
 
     Raises:
-        ConfigError: It is neither a Link nor None.
+        ConfigError: The argument is neither a Link nor None.
     """
     if link is None or isinstance(link, Link):
         return link
@@ -226,8 +237,12 @@ def checked_link(link: object) -> Link | None:
     )
 
 
-def _whole_frames(latency: object) -> float:
-    """Return a latency in seconds as exactly a whole number of frames; raises ConfigError."""
+def _check_latency(latency: object) -> float:
+    """Return a latency in seconds, rounded to a whole number of frames.
+
+    Raises:
+        ConfigError: The latency is out of range, or not a multiple of the frame period.
+    """
     seconds = checked_number("latency", latency, "seconds from 0", ConfigError)
     if not 0 <= seconds < math.inf:
         raise ConfigError(
@@ -238,34 +253,27 @@ def _whole_frames(latency: object) -> float:
             f"latency: {seconds:g} s is longer than any scenario; "
             f"if these are milliseconds, give {seconds / 1000:g}"
         )
-    frames = seconds / FRAME_PERIOD
-    if abs(frames - round(frames)) > _FRAME_TOLERANCE:
-        shorter = math.floor(frames) / 10
-        longer = math.ceil(frames) / 10
+    num_frames = seconds / FRAME_PERIOD
+    if abs(num_frames - round(num_frames)) > _FRAME_TOLERANCE:
+        shorter = math.floor(num_frames) / 10
+        longer = math.ceil(num_frames) / 10
         raise ConfigError(
-            f"latency: {seconds} s is no multiple of a frame ({FRAME_PERIOD} s); "
+            f"latency: {seconds} s is not a multiple of a frame ({FRAME_PERIOD} s); "
             f"the nearest are {shorter} s and {longer} s"
         )
-    return round(frames) / 10
+    return round(num_frames) / 10
 
 
-def _pose_noise(noise: object) -> PoseNoise | None:
-    """Return the pose noise of a link, a number as its mean in metres; raises ConfigError."""
+def _check_pose_noise(noise: object) -> PoseNoise | None:
+    """Return a link's pose noise (a number is its mean in metres); raise ConfigError if invalid."""
     if noise is None or isinstance(noise, PoseNoise):
         return noise
     mean = checked_number("pose_noise", noise, "metres or a PoseNoise", ConfigError)
     return PoseNoise(mean=mean)
 
 
-def _checked_budget(budget: int | None) -> int | None:
-    """Check the budget of a link, bytes a frame; raises ConfigError."""
-    if budget is None:
-        return None
-    return checked_count("budget", budget, "bytes a frame", _MAX_BYTES)
-
-
-def _checked_payload(payload: Payload | int | None) -> Payload | int | None:
-    """Check the payload of a link; raises ConfigError or ChoiceError."""
+def _check_payload(payload: Payload | int | None) -> Payload | int | None:
+    """Return the payload; raise ConfigError (number of bytes) or ChoiceError (name) if invalid."""
     if payload is None or isinstance(payload, str):
         kind: Payload | None = choice("payload", payload, (None, *get_args(Payload)))
         return kind
@@ -273,28 +281,30 @@ def _checked_payload(payload: Payload | int | None) -> Payload | int | None:
 
 
 def uniforms(key: str) -> tuple[float, float, float, float]:
-    """Draw four numbers between 0 and 1 (both excluded) from a text.
+    """Draw four numbers between 0 and 1 (both exclusive), seeded by a text.
 
-    They are the same on every machine and with every version of numpy.
+    The numbers are the same on every machine and with every version of numpy.
     """
     digest = hashlib.sha256(key.encode()).digest()
-    numbers = [int.from_bytes(digest[start : start + 8], "big") >> 12 for start in range(0, 32, 8)]
-    draw_1, draw_2, draw_3, draw_4 = ((number + 0.5) / 2**52 for number in numbers)
-    return draw_1, draw_2, draw_3, draw_4
+    draws = []
+    for start in range(0, 32, 8):
+        number = int.from_bytes(digest[start : start + 8], "big") >> 12
+        draws.append((number + 0.5) / 2**52)
+    return draws[0], draws[1], draws[2], draws[3]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageSize:
-    """The bytes of one agent's message at one moment, uncompressed, for each kind of data.
+    """The uncompressed bytes of one agent's message in one frame, for each kind of data.
 
     Each number includes a pose (24 bytes).
 
     Attributes:
-        images: Bytes of the six cameras' pixels, 3 bytes each, in the size that calib gives.
-        cloud: Bytes of the LiDAR's points, 16 bytes each; None if points were not counted, or the
+        images: Bytes of the six cameras' pixels, 3 bytes each, at the image size in the calib file.
+        cloud: Bytes of the LiDAR points, 16 bytes each; None if points were not counted, or the
             file is missing.
-        boxes: Bytes of the boxes that the agent annotated, its own included, 45 bytes each.
-        bev: Bytes of a BEV feature map of the given shape and type.
+        boxes: Bytes of the boxes that the agent annotated, including its own, 45 bytes each.
+        bev: Bytes of a BEV feature map of the requested shape and type.
     """
 
     images: int
@@ -314,96 +324,99 @@ def message_sizes(
     link: Link | None = None,
     on_missing: OnError = "raise",
 ) -> dict[str, MessageSize]:
-    """Return the bytes that each agent sends for a sample's moment, for each kind of data.
+    """Return the bytes that each agent sends in a sample's frame, for each kind of data.
 
     Args:
         dataset: The release.
-        sample: Token or record of a sample; its frame is the moment.
+        sample: Token or record of a sample; its agent is the ego, its frame the current one.
         agents: Names of agents, a configuration or its name relative to the ego, or None for all
             available agents.
         bev_shape: Shape of the BEV features: channels, rows, columns.
         bev_dtype: Type of the BEV features.
         clouds: Whether to read the point clouds, to count their points.
         link: Effects of the link on the partners' data; None for a perfect link. With latency,
-            sizes are of the earlier frame that arrives; pose noise does not change the size
-            of a message.
-        on_missing: Treatment of point clouds that were not downloaded: `raise`, or `skip`, which
-            leaves their size out (`cloud` is None) and logs how many.
+            sizes come from the earlier frame that arrives; pose noise does not change sizes.
+        on_missing: What to do about point clouds that were not downloaded: `raise`, or `skip` their
+            sizes (`cloud` is None) and log how many.
 
     Returns:
-        Sizes of the arriving messages by agent. The sample's own agent (which sends nothing to
-        itself) is first, if it is among them. A partner is left out if its message is lost or does
-        not fit into the budget; a call without `link` returns the size of that message.
+        Agent → size of its message. The sample's agent (which sends nothing to itself) comes first
+            if it is one of `agents`. A partner is left out if its message is lost or does not fit
+            into the budget; to get its size nevertheless, call the function without `link`.
 
     Raises:
-        TokenError: There is no such sample.
-        ChoiceError: There is no such agent, configuration or `on_missing`, or `bev_shape` is no
-            shape or `bev_dtype` no type.
+        TokenError: The sample is unknown.
+        ChoiceError: An agent, the configuration or `on_missing` is unknown, or `bev_shape` is not a
+            shape, or `bev_dtype` is not a type.
         NotAvailableError: An agent is not in this (partial) release.
-        ConfigError: `link` is no Link, or its latency is longer than the scenario's past.
+        ConfigError: `link` is not a Link, or its latency reaches back before the recording.
         MissingFileError: `clouds` is true, `on_missing` is `raise`, and a point cloud was not
             downloaded.
         SensorFileError: `clouds` is true and a point cloud cannot be read.
     """
-    bev = POSE_BYTES + _bev_bytes(bev_shape, bev_dtype)
+    bev = POSE_BYTES + _count_bev_bytes(bev_shape, bev_dtype)
     files = MissingFiles(dataset.dataroot, on_missing)
     sizes: dict[str, MessageSize] = {}
     for message in messages(dataset, sample, agents, link):
-        sender = message.sample
-        readable = clouds and files.has(dataset.sensor_path(f"{sender}/{LIDAR}"), LIDAR)
-        sizes[message.agent] = MessageSize(
-            images=message_bytes(dataset, sender, "images"),
-            cloud=message_bytes(dataset, sender, "cloud") if readable else None,
-            boxes=message_bytes(dataset, sender, "boxes"),
-            bev=bev,
-        )
+        sent_sample = message.sample
+        has_cloud = False
+        if clouds:
+            has_cloud = files.has(dataset.sensor_path(f"{sent_sample}/{LIDAR}"), LIDAR)
+        images = message_bytes(dataset, sent_sample, "images")
+        cloud = None
+        if has_cloud:
+            cloud = message_bytes(dataset, sent_sample, "cloud")
+        boxes = message_bytes(dataset, sent_sample, "boxes")
+        sizes[message.agent] = MessageSize(images=images, cloud=cloud, boxes=boxes, bev=bev)
     files.tell()
     return sizes
 
 
 def message_bytes(dataset: Dataset, sample: str, payload: Payload | int | None) -> int:
-    """Return the bytes of the message that a sample's own agent sends at its frame.
+    """Return the bytes of the message that a sample's agent sends in the sample's frame.
 
-    The sizes are described in `MessageSize`; the size is 0 for None. Only for `cloud` a file is
-    read. `bev` has the default shape and type of `message_sizes`; for other features give their
-    bytes.
+    `MessageSize` describes the kinds of data; the result is 0 for None. Only `cloud` reads a file.
+    `bev` has the default shape and type of `message_sizes`; for other features, pass their bytes.
 
     Raises:
-        TokenError: There is no such sample.
+        TokenError: The sample is unknown.
         MissingFileError: A point cloud was not downloaded.
         SensorFileError: A point cloud cannot be read.
     """
     if not isinstance(payload, str):
         return payload or 0
     if payload == "images":
-        images = [dataset.get("sample_data", f"{sample}/{camera}") for camera in CAMERAS]
-        pixel_bytes = [3 * int(image["width"]) * int(image["height"]) for image in images]
-        return POSE_BYTES + sum(pixel_bytes)
+        num_pixels = 0
+        for camera in CAMERAS:
+            image = dataset.get("sample_data", f"{sample}/{camera}")
+            num_pixels += int(image["width"]) * int(image["height"])
+        return POSE_BYTES + 3 * num_pixels
     if payload == "cloud":
-        return POSE_BYTES + POINT_BYTES * len(dataset.load_point_cloud(sample, "lidar"))
-    boxes = dataset.columns("sample")["num_annotations"].item(dataset.getind("sample", sample))
+        cloud = dataset.load_point_cloud(sample, "lidar")
+        return POSE_BYTES + POINT_BYTES * len(cloud)
+    row = dataset.getind("sample", sample)
     if payload == "boxes":
-        return POSE_BYTES + BOX_BYTES * int(boxes)
-    return POSE_BYTES + _bev_bytes(_BEV_SHAPE, np.float32)
+        num_boxes = dataset.columns("sample")["num_annotations"].item(row)
+        return POSE_BYTES + BOX_BYTES * int(num_boxes)
+    return POSE_BYTES + _count_bev_bytes(_BEV_SHAPE, np.float32)
 
 
 def traffic(
     dataset: Dataset, sample: RowArgument, agents: Agents, link: Link | None, payload: Payload | int
 ) -> tuple[int, int]:
-    """Return the bytes that arrive from all partners at a sample's frame, and their number.
+    """Return how many bytes arrive in a sample's frame, and from how many partners.
 
-    It raises the errors of `messages` and `message_bytes`.
+    The errors are as in `messages` and `message_bytes`.
     """
     own_sample = dataset.get("sample", sample)["token"]
     exact_link = None
     if link is not None:
-        # Pose noise changes no size, and takes time.
+        # Pose noise does not affect sizes, and takes time.
         exact_link = replace(link, pose_noise=None)
-    sizes = [
-        message_bytes(dataset, message.sample, payload)
-        for message in messages(dataset, own_sample, agents, exact_link)
-        if message.sample != own_sample
-    ]
+    sizes = []
+    for message in messages(dataset, own_sample, agents, exact_link):
+        if message.sample != own_sample:
+            sizes.append(message_bytes(dataset, message.sample, payload))
     return sum(sizes), len(sizes)
 
 
@@ -413,30 +426,30 @@ def traffic_note(
     payload: Payload | int,
     **more: Any,
 ) -> dict[str, Any]:
-    """Return the note about the bytes that partners send, for results.
+    """Return the results' metadata about the bytes that partners send.
 
     Args:
-        traffic_by_sample: The `traffic` of each sample: bytes and number of partners.
+        traffic_by_sample: `traffic` of each sample: bytes and number of partners.
         link: The link.
         payload: Data that a partner sends, as in `Link.payload`.
-        **more: Further entries of the note.
+        **more: Further entries of the metadata.
     """
-    samples = len(traffic_by_sample)
-    total = sum(size for size, _ in traffic_by_sample)
-    partners = sum(count for _, count in traffic_by_sample)
+    num_samples = len(traffic_by_sample)
+    total_bytes = sum(size for size, _ in traffic_by_sample)
+    num_partners = sum(count for _, count in traffic_by_sample)
     return {
         "payload": payload,
         **more,
-        "samples": samples,
-        "mean": total / max(samples, 1),
-        "link": total / max(partners, 1),
-        "partners": partners / max(samples, 1),
+        "samples": num_samples,
+        "mean": total_bytes / max(num_samples, 1),
+        "link": total_bytes / max(num_partners, 1),
+        "partners": num_partners / max(num_samples, 1),
         "budget": None if link is None else link.budget,
     }
 
 
-def _bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
-    """Return the bytes of BEV features; raises ChoiceError."""
+def _count_bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
+    """Return the bytes of BEV features; raise ChoiceError if the shape or the type is invalid."""
     expected = "(channels, rows, columns), whole numbers from 1"
     if np.shape(shape) != (3,):
         raise ChoiceError(f"bev_shape: expected {expected}, found {shape!r}")
@@ -453,11 +466,11 @@ def _bev_bytes(shape: Sequence[int], dtype: DTypeLike) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Message:
-    """The data of one agent as the ego receives them.
+    """One agent's data as the ego receives them.
 
     Attributes:
         agent: Name of the sender.
-        sample: Token of the sample of the data: with latency an earlier one.
+        sample: Token of the sample that the data come from; with latency, an earlier one.
         pose_error: Transform `claimed_from_world`; None without pose noise.
     """
 
@@ -466,9 +479,9 @@ class Message:
     pose_error: SE3 | None
 
     def target_from(self, dataset: Dataset, frame: str, target_from_world: SE3) -> SE3:
-        """Return `target_from_frame` for the sender's `frame`, as the ego computes it.
+        """Return the transform from the sender's `frame` to the target, as the ego computes it.
 
-        The pose noise is included.
+        The result includes the pose noise.
         """
         world_from_frame = dataset.world_from(self.sample, frame)
         if self.pose_error is not None:
@@ -484,20 +497,20 @@ def messages(
     *,
     sweeps: int = 1,
 ) -> Iterator[Message]:
-    """Yield the messages that arrive at a sample and at the `sweeps` − 1 frames before it.
+    """Yield the messages that arrive in a sample's frame and in the `sweeps` − 1 frames before it.
 
-    Nothing is yielded for a lost message or, with a budget, for a message that does not fit.
-
-    Messages are ordered by frame, the present first and then backwards, and for each frame by
-    agent, the sample's own first. Raises the errors of `cooperating_agents`, ConfigError of the
-    link, and with a budget the errors of `message_bytes`.
+    Messages that are lost or exceed the budget are left out. The order is by frame, the current one
+    first and then backwards; within a frame by agent, the sample's own agent first. The errors are
+    as in `cooperating_agents`, `Link.frame_sent` and, with a budget, `message_bytes`.
     """
     link = checked_link(link)
     names = cooperating_agents(dataset, sample, agents)
     scenario, ego, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
     present = int(number)
     for index in range(present, max(present - sweeps, 0), -1):
-        budget_left = math.inf if link is None or link.budget is None else link.budget
+        budget_left = math.inf
+        if link is not None and link.budget is not None:
+            budget_left = link.budget
         for agent in names:
             if link is None or agent == ego:
                 token = sample_token(scenario, agent, index)
@@ -505,7 +518,7 @@ def messages(
                 continue
             if index != present and index <= link.latency_frames:
                 continue
-            message = _received(dataset, scenario, agent, index, link)
+            message = _receive_message(dataset, scenario, agent, index, link)
             if message is None:
                 continue
             size = 0
@@ -516,10 +529,10 @@ def messages(
                 yield message
 
 
-def _received(
+def _receive_message(
     dataset: Dataset, scenario: str, agent: AgentName, index: int, link: Link
 ) -> Message | None:
-    """Return a partner's message that the ego receives at frame `index`; None if it is lost."""
+    """Return the partner's message that the ego receives in frame `index`; None if it is lost."""
     sent_sample = sample_token(scenario, agent, link.frame_sent(scenario, index))
     if link.loses(scenario, agent, index):
         return None

@@ -1,11 +1,9 @@
-"""Poses of agents, transforms between them, and points of any agent in the images of any.
+"""Poses of agents, transforms between them, and one agent's points in another one's images.
 
-See docs/released_code.md, Poses. Every function works for both kinds of handedness: right-handed
-poses (the devkit's) give right-handed 6-vectors, CARLA's raw poses give the 6-vectors of the
-released code; `geometry.conventions.flip_six_vector` converts one into the other.
+See docs/released_code.md, Poses. Every function works with either handedness: the devkit's
+right-handed poses yield right-handed 6-vectors, and CARLA's raw poses yield the released code's
+6-vectors. `geometry.conventions.flip_six_vector` converts between them.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -28,7 +26,7 @@ from deepaccident_devkit.support.arrays import (
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 
 Poses = Sequence[SE3] | ArrayLike
-"""Poses of several agents or moments: SE3 objects, or an array (K, 4, 4)."""
+"""Poses of several agents or times: SE3 objects, or an array (K, 4, 4)."""
 
 
 def transform(
@@ -38,19 +36,19 @@ def transform(
     target: str = "ego",
     source: str = "ego",
 ) -> SE3:
-    """Return `target_from_source` between frames of any two agents and moments of one scenario.
+    """Return `target_from_source` between the frames of two samples of one scenario.
 
     Args:
         dataset: The release.
-        target_sample: Token or record of the sample to which the target frame belongs.
-        source_sample: Token or record of the sample to which the source frame belongs.
+        target_sample: Token or record of the sample that the target frame belongs to.
+        source_sample: Token or record of the sample that the source frame belongs to.
         target: `world`, `ego`, `lidar` or a channel (cameras: the optical frame).
-        source: The same choice as for `target`.
+        source: The source frame, with the same choices as `target`.
 
     Raises:
-        TokenError: There is no such sample.
-        ChoiceError: There is no such frame, or the samples are of two scenarios, which take place
-            in unrelated worlds.
+        TokenError: The sample is unknown.
+        ChoiceError: A frame is unknown, or the samples are from two scenarios, which take place in
+            unrelated worlds.
     """
     target_scenario = dataset.get("sample", target_sample)["scenario_token"]
     source_scenario = dataset.get("sample", source_sample)["scenario_token"]
@@ -59,86 +57,91 @@ def transform(
             f"transform: expected two samples of one scenario, found {target_scenario} and "
             f"{source_scenario}; scenarios take place in different worlds"
         )
-    world_from_target = dataset.world_from(target_sample, target)
-    return world_from_target.inverse() @ dataset.world_from(source_sample, source)
+    target_from_world = dataset.world_from(target_sample, target).inverse()
+    return target_from_world @ dataset.world_from(source_sample, source)
 
 
 def relative_pose_to_ego(world_from_agent: Poses) -> FloatArray:
-    """Return agents' poses in the ego's frame: `ego_from_agent` of each as a 6-vector.
+    """Return each agent's pose in the ego's frame, `ego_from_agent`, as a 6-vector.
 
     See docs/released_code.md, Poses.
 
     Args:
-        world_from_agent: Poses of one moment, shape (K, 4, 4), or K SE3, the ego's first.
+        world_from_agent: Poses at one time, the ego's first: shape (K, 4, 4), or K SE3 objects.
 
     Returns:
         6-vectors, shape (K, 6), metres and radians, in the ego's frame and the poses' handedness;
-        row 0 is zero up to rounding.
+        row 0 is zero, up to rounding errors.
 
     Raises:
-        GeometryError: The poses have another shape, or there is none.
+        GeometryError: The poses have the wrong shape, or there is none.
     """
-    poses = _stacked("world_from_agent", world_from_agent)
+    poses = _stack_matrices("world_from_agent", world_from_agent)
     if not len(poses):
         raise GeometryError(
             "world_from_agent: expected the ego's pose and its partners', found none"
         )
-    return conventions.six_vectors_of(inverses(poses[:1]) @ poses)
+    ego_from_world = inverses(poses[:1])
+    return conventions.six_vectors_of(ego_from_world @ poses)
 
 
 def future_egomotion(world_from_ego: Poses, valid: ArrayLike | None = None) -> FloatArray:
-    """Return an agent's motion from each moment to the next: `next_from_this` as 6-vectors.
+    """Return an agent's motion from each time to the next, `next_from_this`, as 6-vectors.
 
-    See docs/released_code.md, Poses. A row maps points of a moment's ego frame into the next
-    moment's ego frame. For the seven rows of the released code give eight poses: 1 s before the
-    present to 2.5 s after it, in steps of 0.5 s.
+    See docs/released_code.md, Poses. Each row transforms points from the ego frame at one time to
+    the ego frame at the next time. To get the released code's seven rows, pass eight poses, from
+    1 s before the current frame to 2.5 s after it, in steps of 0.5 s.
 
     Args:
-        world_from_ego: Poses of one agent in the order of time, shape (T + 1, 4, 4), or T + 1 SE3.
-        valid: Truth values, shape (T + 1,): whether each moment is in the recording; the poses of
-            other moments do not matter. None if all are.
+        world_from_ego: Poses of one agent, earliest first, shape (T + 1, 4, 4), or T + 1 SE3
+            objects.
+        valid: Truth values, shape (T + 1,): whether each time is in the recording; the other poses
+            do not matter. None if all are.
 
     Returns:
         6-vectors, shape (T, 6), metres and radians, in the poses' handedness; a row is zero (no
-        motion) if its moment or the next is not valid.
+            motion) if its time or the next is not valid.
 
     Raises:
-        GeometryError: The shapes do not fit, or there is no pose.
+        GeometryError: The shapes do not match, or there is no pose.
     """
-    poses = _stacked("world_from_ego", world_from_ego)
+    poses = _stack_matrices("world_from_ego", world_from_ego)
     if not len(poses):
         raise GeometryError("world_from_ego: expected at least one pose, found none")
     if valid is None:
         valid = np.ones(len(poses))
-    recorded: BoolArray = checked("valid", valid, (len(poses),), np.bool_)
-    known_steps = recorded[:-1] & recorded[1:]
-    world_from_this = poses[:-1][known_steps]
-    world_from_next = poses[1:][known_steps]
+    is_recorded: BoolArray = checked("valid", valid, (len(poses),), np.bool_)
+    is_known = is_recorded[:-1] & is_recorded[1:]
+    world_from_this = poses[:-1][is_known]
+    next_from_world = inverses(poses[1:][is_known])
     motion = np.zeros((len(poses) - 1, 6))
-    motion[known_steps] = conventions.six_vectors_of(inverses(world_from_next) @ world_from_this)
+    motion[is_known] = conventions.six_vectors_of(next_from_world @ world_from_this)
     return motion
 
 
-def _stacked(name: str, poses: Poses) -> FloatArray:
+def _stack_matrices(name: str, poses: Poses) -> FloatArray:
     """Return poses as an array (K, 4, 4)."""
     matrices: Any = poses
     if isinstance(poses, Iterable) and not isinstance(poses, np.ndarray):
-        matrices = [pose.matrix if isinstance(pose, SE3) else pose for pose in poses]
+        matrices = []
+        for pose in poses:
+            matrix = pose.matrix if isinstance(pose, SE3) else pose
+            matrices.append(matrix)
     return checked(name, matrices, (None, 4, 4))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImagePoints(FrozenArrays):
-    """N points projected into an image; arrays are read-only.
+    """N points projected into an image, with read-only arrays.
 
     Attributes:
         pixels: Image coordinates (u, v), shape (N, 2), float64; pixel centres are at 0.5, 1.5, …;
-            NaN behind the camera.
+            NaN for points behind the camera.
         depth: Distances along the optical axis, shape (N,), float64, metres.
         color: RGB colours of the pixels, shape (N, 3), uint8, black outside the image; None if no
             colours were requested.
         mask: Truth values, shape (N,): whether a point is in front of the camera and in the image
-            (other things may hide it).
+            (other objects may hide it).
     """
 
     pixels: FloatArray
@@ -156,24 +159,25 @@ def project_to_image(
     frame: str | None = None,
     colors: bool = True,
 ) -> ImagePoints:
-    """Project points of one agent into an image of any agent at any moment of the same scenario.
+    """Project an agent's points into an image of any agent and frame of the same scenario.
 
-    The points are assumed to stand still: points of another moment are wrong for things that moved.
+    The points are assumed to be stationary: if the image is from another time, the points of moving
+    objects are projected to the wrong pixels.
 
     Args:
         dataset: The release.
         points: A point cloud, or an array (N, 3), metres.
-        sample: Token or record of the sample to which the points' coordinate frame belongs.
+        sample: Token or record of the sample that the points' coordinate frame belongs to.
         camera: Token or record of the image (sample data).
         frame: Coordinate frame of the points: `world`, `ego`, `lidar` or a channel of `sample`;
-            None for the frame of a cloud, or for `world` with an array.
-        colors: Whether to load the image for its colours.
+            None for the cloud's own frame; for an array, `world`.
+        colors: Whether to load the image, for the points' colours.
 
     Raises:
-        TokenError: There is no such sample or sensor file, such as a camera that does not exist.
-        ChoiceError: The sensor is no camera, there is no such frame, or `sample` and `camera` are
-            of two scenarios.
-        GeometryError: The points are no array (N, 3).
+        TokenError: The sample or the sensor file is unknown.
+        ChoiceError: The sensor is not a camera, the frame is unknown, or `sample` and `camera` are
+            from two scenarios.
+        GeometryError: The points are not an array (N, 3).
         MissingFileError: `colors` is true and the image was not downloaded.
         SensorFileError: The image cannot be read.
     """
@@ -190,7 +194,10 @@ def project_to_image(
     )
     pixels, depth = pinhole.project(optical_from_source.apply(xyz))
     mask = pinhole.in_image(pixels)
-    color = colors_at(dataset.load_image(record), pinhole, pixels, mask) if colors else None
+    color = None
+    if colors:
+        image = dataset.load_image(record)
+        color = colors_at(image, pinhole, pixels, mask)
     return ImagePoints(pixels=pixels, depth=depth, color=color, mask=mask)
 
 
@@ -198,20 +205,20 @@ def project_to_image(
 def map_pointcloud_to_image(
     dataset: Dataset, camera: RowArgument, sample: RowArgument | None = None, *, colors: bool = True
 ) -> ImagePoints:
-    """Project a sample's LiDAR into an image, like the nuScenes explorer's function of this name.
+    """Project a sample's LiDAR points into an image, like the nuScenes function of this name.
 
     Args:
         dataset: The release.
         camera: Token or record of the image (sample data).
-        sample: Token or record of the sample with the LiDAR; None for the camera's own sample.
-        colors: Whether to load the image for its colours.
+        sample: Token or record of the sample with the point cloud; None for the image's sample.
+        colors: Whether to load the image, for the points' colours.
 
     Returns:
         One row for each point, in the cloud's order.
 
     Raises:
-        TokenError: There is no such sample or sensor file.
-        ChoiceError: The sensor is no camera, or `sample` and `camera` are of two scenarios.
+        TokenError: The sample or the sensor file is unknown.
+        ChoiceError: The sensor is not a camera, or `sample` and `camera` are from two scenarios.
         MissingFileError: The image or the cloud was not downloaded.
         SensorFileError: The image or the cloud cannot be read.
     """
@@ -222,11 +229,11 @@ def map_pointcloud_to_image(
 
 
 def camera_of(dataset: Dataset, camera: RowArgument) -> PinholeCamera:
-    """Return the pinhole camera of an image, with the image size that calib gives.
+    """Return the pinhole camera of an image, with the image size from the calib file.
 
     Raises:
-        TokenError: There is no such sensor file.
-        ChoiceError: The sensor is no camera.
+        TokenError: The sensor file is unknown.
+        ChoiceError: The sensor is not a camera.
     """
     return dataset.camera(camera)
 
@@ -238,8 +245,8 @@ def colors_at(
 
     Args:
         image: RGB image, shape (H, W, 3), uint8.
-        camera: Camera of the image; pixels are scaled if the image was stored smaller than calib
-            gives.
+        camera: Camera of the image; pixels are scaled if the stored image is smaller than the size
+            in the calib file.
         pixels: Image coordinates (u, v), shape (N, 2).
         mask: Truth values, shape (N,): the points in the image.
 
@@ -247,8 +254,11 @@ def colors_at(
         RGB colours, shape (N, 3), uint8, black for points outside the image.
     """
     height, width = image.shape[:2]
-    columns = (pixels[mask, 0] * (width / camera.width)).astype(np.intp)
-    rows = (pixels[mask, 1] * (height / camera.height)).astype(np.intp)
+    x, y = pixels[mask].T
+    columns = (x * (width / camera.width)).astype(np.intp)
+    rows = (y * (height / camera.height)).astype(np.intp)
+    columns = np.minimum(columns, width - 1)
+    rows = np.minimum(rows, height - 1)
     colors = np.zeros((len(pixels), 3), dtype=np.uint8)
-    colors[mask] = image[np.minimum(rows, height - 1), np.minimum(columns, width - 1)]
+    colors[mask] = image[rows, columns]
     return colors

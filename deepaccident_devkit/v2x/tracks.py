@@ -1,6 +1,4 @@
-"""Past and future of actors, from the labels of all agents."""
-
-from __future__ import annotations
+"""Past and future positions of actors, from the labels of all agents."""
 
 from dataclasses import dataclass
 
@@ -15,20 +13,22 @@ from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trajectory(FrozenArrays):
-    """An actor at the T labelled moments, in one right-handed frame; arrays are read-only.
+    """An actor in the T frames that label it, in one coordinate frame; arrays are read-only.
 
     Attributes:
         instance: Token of the actor.
-        frame: `world`, or a coordinate frame of the given sample.
-        index: Frame numbers from 1, shape (T,), int64, ascending; gaps where nobody annotated the
-            actor.
+        frame: `world`, or a coordinate frame of the sample passed to `trajectory`.
+        index: Frame numbers from 1, shape (T,), int64, ascending; frames in which no agent
+            annotated the actor are missing.
         timestamp: Seconds since the scenario's first frame, shape (T,), float64.
         center: Centres, shape (T, 3), float64, metres.
         rotation: Unit quaternions w, x, y, z, shape (T, 4), float64.
         size: Length, width, height, shape (T, 3), float64, metres.
         velocity: Velocities over the ground, shape (T, 3), float64, m/s; NaN if unknown.
-        agents: Bit masks over `taxonomy.AGENTS`, shape (T,), uint8: the agents that annotated it.
-        present: Frame number of the given sample, before which is the past; None without one.
+        agents: Bit masks over `taxonomy.AGENTS`, shape (T,), uint8: the agents that annotated the
+            actor.
+        present: Frame number of the sample passed to `trajectory`, which separates past and future;
+            None without one.
     """
 
     instance: str
@@ -43,7 +43,7 @@ class Trajectory(FrozenArrays):
     present: int | None = None
 
     def __len__(self) -> int:
-        """Return the number of moments."""
+        """Return the number of frames."""
         return len(self.index)
 
     @property
@@ -55,18 +55,20 @@ class Trajectory(FrozenArrays):
 def trajectory(
     dataset: Dataset, instance: RowArgument, sample: RowArgument | None = None, frame: str = "world"
 ) -> Trajectory:
-    """Return an actor's past and future from the labels of all agents: rows of the track table.
+    """Return an actor's past and future from the track table, which merges all agents' labels.
 
     Args:
         dataset: The release.
         instance: Token or record of the actor.
-        sample: Token or record of the present; `frame` is one of its coordinate frames.
-        frame: `world`, or `ego`, `lidar` or a channel of `sample`, always as it is at that sample.
+        sample: Token or record of the sample whose coordinate frame `frame` is, and whose frame
+            number becomes `present`; None if `frame` is `world`.
+        frame: `world`, or `ego`, `lidar` or a channel of `sample`; the frame does not move with the
+            agent.
 
     Raises:
-        TokenError: There is no such instance or sample.
-        ChoiceError: There is no such frame, it is another frame than `world` without a sample, or
-            the sample is of another scenario.
+        TokenError: The instance or the sample is unknown.
+        ChoiceError: The frame is unknown, needs a sample and none was passed, or the sample is from
+            another scenario.
     """
     record = dataset.get("instance", instance)
     scenario = record["scenario_token"]
@@ -85,7 +87,9 @@ def trajectory(
         frame_from_world = dataset.world_from(present_sample, frame).inverse()
         present = int(present_sample["token"].rsplit("/", 1)[1])
     elif frame != "world":
-        raise ChoiceError(f"trajectory: frame {frame!r} is one of a sample; name it with sample=")
+        raise ChoiceError(
+            f"trajectory: frame {frame!r} belongs to one agent; name the sample with sample="
+        )
     boxes = tracks.boxes.select(rows).transform(frame_from_world, frame)
     first_frame = dataset.get("scenario", scenario)["first_frame_token"]
     frame_rows = dataset.getind("frame", first_frame) + tracks.index[rows] - 1
@@ -105,14 +109,15 @@ def trajectory(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScenarioTracks(FrozenArrays):
-    """All actors of a scenario at all moments, in world; arrays are read-only.
+    """All actors of a scenario in all frames, in world coordinates; arrays are read-only.
 
-    There is one row for each actor and moment, ordered by frame and actor.
+    There is one row for each actor and frame, sorted by frame, then by actor.
 
     Attributes:
-        boxes: M boxes in world; points and cameras are not known (0, False).
+        boxes: M boxes in world; the columns for LiDAR points and cameras are unknown (0, False).
         index: Frame numbers from 1, shape (M,), int64.
-        agents: Bit masks over `taxonomy.AGENTS`, shape (M,), uint8: the agents that annotated it.
+        agents: Bit masks over `taxonomy.AGENTS`, shape (M,), uint8: the agents that annotated the
+            actor.
     """
 
     boxes: Boxes
@@ -125,13 +130,15 @@ class ScenarioTracks(FrozenArrays):
         return self.boxes.actor_id
 
     def at(self, index: int) -> Boxes:
-        """Return the actors at frame number `index`, by ascending id."""
-        start, stop = self.index.searchsorted((index, index + 1))
-        return self.boxes.select(np.arange(start, stop))
+        """Return the boxes of the actors in frame number `index`, by ascending actor id."""
+        bounds = (index, index + 1)
+        start, stop = self.index.searchsorted(bounds)
+        rows = np.arange(start, stop)
+        return self.boxes.select(rows)
 
 
 def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
-    """Return a scenario's rows of the track table as arrays; raises TokenError."""
+    """Return a scenario's rows of the track table; raise TokenError if it is unknown."""
     tracks = dataset.columns("track")
     scenario_row = dataset.getind("scenario", scenario)
     scenarios = dataset.columns("scenario")
@@ -156,4 +163,5 @@ def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
         },
     )
     index = frame_rows[rows].astype(np.int64) - first_frame + 1
-    return ScenarioTracks(boxes=boxes, index=index, agents=tracks["agents"][rows])
+    agents = tracks["agents"][rows]
+    return ScenarioTracks(boxes=boxes, index=index, agents=agents)

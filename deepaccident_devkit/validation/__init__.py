@@ -1,4 +1,4 @@
-"""What is wrong, odd or missing in a release, checked across agents and files."""
+"""Checks for what is wrong, odd or missing in a release, across agents and files."""
 
 from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.boxes import VelocityFit

@@ -1,4 +1,4 @@
-"""Every kind of finding with its severity, meaning and remedy (docs/validation.md)."""
+"""The kinds of findings, with severity, meaning and remedy (docs/validation.md)."""
 
 import json
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ class Code:
     """A kind of finding.
 
     Attributes:
-        severity: Severity.
+        severity: How serious such findings are.
         meaning: One sentence for the docs.
         remedy: What the user should do.
-        known: Why the real release itself has it; empty if it does not.
+        known: Why the real release itself contains such findings; empty if it does not.
         deep: Whether only `--deep` finds it.
     """
 
@@ -28,10 +28,10 @@ class Code:
 
 
 _DATA = json.loads(Path(__file__).with_suffix(".json").read_bytes())
-# Name of a remedy that several kinds share → its text; other kinds have their own text.
+# Name of a remedy that several kinds share → its text; other kinds state their text directly.
 _REMEDIES = {**_DATA["remedies"], "update the index": INDEX_REMEDY}
-CODES: dict[str, Code] = {
-    name: Code(**{**fields, "remedy": _REMEDIES.get(fields["remedy"], fields["remedy"])})
-    for name, fields in _DATA["codes"].items()
-}
-"""Name of a kind of finding → its entry in `codes.json`."""
+CODES: dict[str, Code] = {}
+"""Name of a kind of finding → its entry, read from `codes.json`."""
+for _name, _fields in _DATA["codes"].items():
+    _remedy = _fields["remedy"]
+    CODES[_name] = Code(**{**_fields, "remedy": _REMEDIES.get(_remedy, _remedy)})

@@ -1,4 +1,4 @@
-"""Present and missing files of a release, by listing folders; only split files are opened."""
+"""Present and missing files of a release, from folder listings; only split files are opened."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, islice
-from typing import TYPE_CHECKING, Final
+from itertools import islice
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.support.parallel import Engine
 
-_META: Final = "meta"
-# Kinds that the test split ships without.
-_NOT_IN_TEST: Final = ("label", BEV_CAMERA, _META)
-_UNKNOWN_SPLIT: Final = "unknown"
-# Scenarios that the text lists.
-_MAX_LISTED_SCENARIOS: Final = 10
+_META = "meta"
+# Kinds of files that the test split is shipped without.
+_NOT_IN_TEST = ("label", BEV_CAMERA, _META)
+_UNKNOWN_SPLIT = "unknown"
+# Number of incomplete scenarios that the text lists.
+_MAX_LISTED_SCENARIOS = 10
 # Heading of a column in the text's tables → its kinds of files.
-_COLUMNS: Final = {
+_COLUMNS = {
     "calib": ("calib",),
     "label": ("label",),
     f"{len(CAMERAS)} cameras": CAMERAS,
@@ -53,14 +53,14 @@ _COLUMNS: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileCount:
-    """Files of one kind of one agent, or `meta` files, in one or several scenarios.
+    """Counts of one agent's files of one kind (or of `meta` files), in one or more scenarios.
 
     Attributes:
-        agent: Name of the agent; None for `meta`, one file for each scenario.
+        agent: Name of the agent; None for `meta`, which has one file per scenario.
         channel: `calib`, `label`, a sensor's channel, or `meta`.
-        expected: Number of expected files, one a frame of every scenario.
+        expected: Number of expected files: one per frame of each scenario.
         missing: Number of expected files that are absent or empty.
-        bytes: Size of the present files.
+        bytes: Total size of the present files.
     """
 
     agent: str | None
@@ -72,14 +72,14 @@ class FileCount:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplitFiles(ShortRepr):
-    """Present files of the scenarios of a split.
+    """Present files of the scenarios in one split.
 
     Attributes:
-        scenarios: Number of scenarios that are present, in part or completely.
-        whole: Number of them that lack nothing.
-        expected: Scenarios of the split in the complete release; None for a selection, and for
-            unknown splits.
-        files: Counts for every agent and kind of file, then for `meta`.
+        scenarios: Number of scenarios that are present, partly or completely.
+        whole: Number of scenarios without missing files.
+        expected: Number of the split's scenarios in the complete release; None for a selection, and
+            for unknown splits.
+        files: Counts for each agent and kind of file, then for `meta`.
     """
 
     scenarios: int
@@ -95,15 +95,15 @@ class Completeness(Report):
     Attributes:
         dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        scenarios: Number of scenarios that are present, in part or completely, with a calib or
-            label file, which number their frames.
-        whole: Number of them that lack nothing.
-        total: Sum of all files; its agent is None, its channel `all`.
+        scenarios: Number of scenarios that are present, partly or completely, and have a calib or
+            label file, from which their frames are known.
+        whole: Number of scenarios without missing files.
+        total: Sum over all files; its agent is None, its channel `all`.
         splits: Split → its present files; `unknown` for scenarios of no known split. The mini
-            release is one split.
-        lacking: Incomplete scenario → kind of file → number of missing files, of all agents.
-        unreadable_archives: A sentence for each unreadable archive, with its fault and remedy.
-            Files that it may hold count as missing.
+            release counts as one split.
+        lacking: Incomplete scenario → kind of file → number of missing files, over all agents.
+        unreadable_archives: A sentence per unreadable archive, with the fault and the remedy. Files
+            that it may contain count as missing.
     """
 
     dataroot: str
@@ -116,29 +116,31 @@ class Completeness(Report):
     unreadable_archives: Sequence[str]
 
     def to_text(self) -> str:
-        """Return blocks for a terminal: unreadable archives, splits, then incomplete scenarios."""
+        """Return text for a terminal: unreadable archives, splits, then incomplete scenarios."""
         refused = [f"cannot be read: {sentence}" for sentence in self.unreadable_archives]
         head = f"DeepAccident {self.version} at {self.dataroot}"
         return "\n".join([head, *refused, self.section()])
 
     def section(self) -> str:
-        """Return the text without the release's name, as a part of another report."""
+        """Return the text without the release's name, for use in another report."""
         total = self.total
         present = total.expected - total.missing
         head = (
-            f"{counted(self.scenarios, 'scenario')} here, {self.whole:,} whole\n"
-            f"files here: {present:,} of {total.expected:,} ({size_text(total.bytes)})"
+            f"{counted(self.scenarios, 'scenario')} in the release, {self.whole:,} complete\n"
+            f"files present: {present:,} of {total.expected:,} ({size_text(total.bytes)})"
             f", missing: {total.missing:,}"
         )
-        blocks = [head, *(_split_text(name, split) for name, split in self.splits.items())]
+        blocks = [head]
+        for name, split in self.splits.items():
+            blocks.append(_split_text(name, split))
         if self.lacking:
             blocks.append(self._lacking_text())
         return "\n\n".join(blocks)
 
     def _lacking_text(self) -> str:
-        """Return a line for each of the first incomplete scenarios."""
+        """Return a line per incomplete scenario, up to a maximum number."""
         number = len(self.lacking)
-        lines = [f"scenarios that lack files, and how many ({number:,}):"]
+        lines = [f"missing files by scenario ({counted(number, 'scenario')}):"]
         for token, kinds in islice(self.lacking.items(), _MAX_LISTED_SCENARIOS):
             lines.append(f"  {token}: {sum(kinds.values()):,}")
         if number > _MAX_LISTED_SCENARIOS:
@@ -155,10 +157,10 @@ def release_completeness(
 ) -> Completeness:
     """Count present and missing files by split, agent and channel.
 
-    Every agent is expected to have a file of every kind for each frame of a scenario, which its
-    calib and label files number; the test split has no label, BEV camera and meta files. Broken
-    scenarios count, too. A folder that cannot be listed counts as empty; `validate_release` names
-    it.
+    For each frame of a scenario, every agent is expected to have a file of every kind. The frames
+    are known from the calib and label files. In the test split, label, BEV camera and meta files
+    are not expected. Broken scenarios count, too. A folder that cannot be listed counts as empty;
+    `validate_release` reports it.
 
     Args:
         root: Dataroot of the release, as for `DeepAccident`: a folder, archives, or a URL.
@@ -167,16 +169,16 @@ def release_completeness(
         **engine: `workers`, `executor` and `progress` (`parallel.Engine`).
 
     Raises:
-        DatarootError: The folder is missing, holds no release, or a part of it that is no archive
-            cannot be listed.
-        VersionError: The version is unknown or not under this folder.
-        SplitFileError: A split file cannot be read.
-        TokenError: A token of `scenarios` is not in the release.
+        DatarootError: If the folder is missing or contains no release, or a part that is not an
+            archive cannot be listed.
+        VersionError: If the version is unknown, or not in this folder.
+        SplitFileError: If a split file cannot be read.
+        TokenError: If a token of `scenarios` is not in the release.
     """
     layout = readable_release(root, version)
     folders = chosen_scenarios(layout, scenarios)
     places = Places(reads=places_of(layout.root))
-    files = run_batch(files_of, folders, label="listing files", places=places, **engine)
+    files = run_batch(files_of, folders, label="Listing files", places=places, **engine)
     tokens = [folder.token for folder in folders]
     return completeness(
         layout, zip(tokens, files, strict=True), str(root), selected=scenarios is not None
@@ -184,12 +186,12 @@ def release_completeness(
 
 
 def readable_release(root: Dataroot, version: str) -> ReleaseLayout:
-    """Return the release under a dataroot, without archives that cannot be listed.
+    """Find the release under a dataroot, ignoring archives that cannot be listed.
 
-    It may then have no scenario at all.
+    The result may have no scenario.
 
     Raises:
-        DatarootError, VersionError: As in `find_release`, if all archives can be listed.
+        DatarootError, VersionError: For the reasons in `find_release`, if all archives are listed.
     """
     dataroot = open_dataroot(root, on_error="skip")
     try:
@@ -203,34 +205,36 @@ def readable_release(root: Dataroot, version: str) -> ReleaseLayout:
 def chosen_scenarios(
     layout: ReleaseLayout, scenarios: Collection[str] | None
 ) -> list[ScenarioFolder]:
-    """Return the scenarios of tokens, None for all; raises TokenError."""
+    """Return the scenarios with these tokens (all if None); raise TokenError for unknown ones."""
     if scenarios is None:
         return list(layout.scenarios)
     tokens = set(members_of("scenarios", scenarios, "tokens of scenarios"))
     folders = [folder for folder in layout.scenarios if folder.token in tokens]
-    unknown = sorted(tokens - {folder.token for folder in folders})
-    if unknown:
-        message = f"{layout.root}: has no scenario {unknown[0]!r}"
-        raise TokenError(f"{message}; its folders name {len(layout.scenarios)} others")
+    known_tokens = {folder.token for folder in folders}
+    unknown_tokens = sorted(tokens - known_tokens)
+    if unknown_tokens:
+        message = f"{layout.root}: has no scenario {unknown_tokens[0]!r}"
+        scenarios_text = counted(len(layout.scenarios), "scenario")
+        raise TokenError(f"{message}; its folders contain {scenarios_text}")
     return folders
 
 
 def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
-    """Return the file counts of a scenario, agent by agent, then of `meta`.
+    """Count the files of a scenario, agent by agent, then `meta`.
 
-    They are empty if neither calib nor label files number a frame.
+    The result is empty if neither calib nor label files show which frames exist.
     """
     sizes_by_kind: dict[tuple[str, str], Mapping[int, int]] = {}
+    num_frames = 0
     for agent in AGENTS:
         for kind, ending in {**SMALL_FILE_ENDINGS, **CHANNEL_FORMAT}.items():
-            sizes_by_kind[agent, kind] = {}
-            # `validate_release` reports a folder that cannot be listed.
+            sizes: Mapping[int, int] = {}
+            # `validate_release` reports folders that cannot be listed.
             with suppress(ReleaseError):
-                sizes_by_kind[agent, kind] = frame_sizes(scenario.kind_folder(agent, kind), ending)
-    num_frames = 0
-    for (_, kind), sizes in sizes_by_kind.items():
-        if kind in SMALL_FILE_ENDINGS:
-            num_frames = max([num_frames, *sizes])
+                sizes = frame_sizes(scenario.kind_folder(agent, kind), ending)
+            sizes_by_kind[agent, kind] = sizes
+            if kind in SMALL_FILE_ENDINGS:
+                num_frames = max([num_frames, *sizes])
     if not num_frames:
         return ()
     counts = []
@@ -260,21 +264,32 @@ def completeness(
     *,
     selected: bool,
 ) -> Completeness:
-    """Return the sum of the file counts of scenarios, by token.
+    """Sum up the file counts of scenarios.
 
-    `selected` means that they are a selection of the release's scenarios.
+    Args:
+        layout: The release.
+        counts_by_token: Token of each scenario, with its file counts.
+        dataroot: Folder of the release.
+        selected: Whether these are only a selection of the release's scenarios.
     """
     split_of = assign_splits(layout).split_of
     is_mini = layout.version == "v1-mini"
-    by_split: dict[str, dict[str, list[FileCount]]] = {}
+    counts_by_split: dict[str, dict[str, list[FileCount]]] = {}
+    all_counts: list[FileCount] = []
     lacking: dict[str, dict[str, int]] = {}
     for token, scenario_counts in counts_by_token:
         if not scenario_counts:
             continue
-        split = layout.version if is_mini else split_of.get(token, _UNKNOWN_SPLIT)
+        split = layout.version
+        if not is_mini:
+            split = split_of.get(token, _UNKNOWN_SPLIT)
         counts = [_expect_in_split(split, count) for count in scenario_counts]
-        by_split.setdefault(split, {})[token] = counts
-        missing = _missing_kinds(counts)
+        counts_by_split.setdefault(split, {})[token] = counts
+        all_counts += counts
+        missing_kinds = Counter[str]()
+        for count in counts:
+            missing_kinds[count.channel] += count.missing
+        missing = dict(+missing_kinds)
         if missing:
             lacking[token] = missing
     expected: Mapping[str, int] = EXPECTED_SCENARIOS
@@ -284,13 +299,10 @@ def completeness(
         expected = {}
     splits = {}
     for split in (*SPLITS, layout.version, _UNKNOWN_SPLIT):
-        if split in by_split or split in expected:
-            scenarios = by_split.get(split, {})
+        if split in counts_by_split or split in expected:
+            scenarios = counts_by_split.get(split, {})
             splits[split] = _split_files(scenarios, lacking, expected.get(split))
-    num_scenarios = sum(map(len, by_split.values()))
-    all_counts = chain.from_iterable(
-        counts for scenarios in by_split.values() for counts in scenarios.values()
-    )
+    num_scenarios = sum(map(len, counts_by_split.values()))
     return Completeness(
         dataroot=dataroot,
         version=layout.version,
@@ -303,9 +315,8 @@ def completeness(
     )
 
 
-def _sum_counts(counts: Iterable[FileCount], channel: str, agent: str | None = None) -> FileCount:
-    """Return the sum of counts, under a name."""
-    counts = list(counts)
+def _sum_counts(counts: Sequence[FileCount], channel: str, agent: str | None = None) -> FileCount:
+    """Return the sum of counts as a count with this channel and agent."""
     return FileCount(
         agent=agent,
         channel=channel,
@@ -316,17 +327,14 @@ def _sum_counts(counts: Iterable[FileCount], channel: str, agent: str | None = N
 
 
 def _expect_in_split(split: str, count: FileCount) -> FileCount:
-    """Return a scenario's count of a kind; the test split may lack all files of some kinds."""
-    if split == "test" and count.missing == count.expected and count.channel in _NOT_IN_TEST:
+    """Adapt a scenario's count of one kind of file to what its split expects.
+
+    In the test split, some kinds of files may be missing completely.
+    """
+    is_optional = split == "test" and count.channel in _NOT_IN_TEST
+    if is_optional and count.missing == count.expected:
         return replace(count, expected=0, missing=0)
     return count
-
-
-def _missing_kinds(counts: Iterable[FileCount]) -> dict[str, int]:
-    kinds: Counter[str] = Counter()
-    for count in counts:
-        kinds[count.channel] += count.missing
-    return dict(+kinds)
 
 
 def _split_files(
@@ -344,9 +352,11 @@ def _split_files(
 
 
 def _split_text(name: str, split: SplitFiles) -> str:
-    of_release = "" if split.expected is None else f" of the release's {split.expected}"
+    of_release = ""
+    if split.expected is not None:
+        of_release = f" of {split.expected} in the full release"
     scenarios = counted(split.scenarios, "scenario")
-    head = f"split {name}: {scenarios}{of_release} here, {split.whole:,} whole"
+    head = f"split {name}: {scenarios}{of_release}, {split.whole:,} complete"
     if split.whole == split.scenarios:
         return head
     rows: list[Sequence[str]] = [("missing files", *_COLUMNS)]
@@ -355,12 +365,12 @@ def _split_text(name: str, split: SplitFiles) -> str:
     lines = [head, columns_text(rows)]
     missing_meta = next(count.missing for count in split.files if count.channel == _META)
     if missing_meta:
-        lines.append(f"meta is missing of {missing_meta:,}")
+        lines.append(f"missing meta files: {missing_meta:,}")
     return "\n".join(lines)
 
 
 def _missing_texts(files: Sequence[FileCount], agent: str) -> Iterator[str]:
-    """Yield an agent's missing files for each of `_COLUMNS`: `-` for none, or `all`."""
+    """Yield how many files an agent lacks in each of `_COLUMNS`: `-` for none, or `all`."""
     for kinds in _COLUMNS.values():
         counts = [count for count in files if count.agent == agent and count.channel in kinds]
         total = _sum_counts(counts, "")

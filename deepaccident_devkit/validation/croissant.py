@@ -1,15 +1,13 @@
-"""The data card of a release as Croissant metadata (JSON-LD): content, known faults, comparisons.
+"""A release's data card as Croissant metadata (JSON-LD): content, known faults, comparisons.
 
 Croissant 1.0, with the fields of its extension for responsible AI, RAI 1.0. Paths are relative to
 the dataroot.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
@@ -18,14 +16,15 @@ from deepaccident_devkit.release.store.members import SPLIT_FILE_FOLDER, SPLIT_F
 from deepaccident_devkit.statistics import FACTS, GROUPS, DatasetStatistics, dataset_statistics
 from deepaccident_devkit.statistics.overview import Overview, overview
 from deepaccident_devkit.statistics.results import TOTAL, UNKNOWN_SPLIT
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, CATEGORIES, LIDAR, SPLITS
 from deepaccident_devkit.validation.codes import CODES
 
 JsonLd = dict[str, Any]
 
-# The standard's own context, which readers expect completely.
-_CONTEXT_PATH: Final = Path(__file__).with_name("croissant_context.json")
-_CITATION: Final = """\
+# The standard JSON-LD context; readers expect all of it.
+_CONTEXT_PATH = Path(__file__).with_name("croissant_context.json")
+_CITATION = """\
 @inproceedings{wang2024deepaccident,
   title = {DeepAccident: A Motion and Accident Prediction Benchmark for V2X Autonomous Driving},
   author = {Wang, Tianqi and Kim, Sukmin and Ji, Wenxuan and Xie, Enze and Ge, Chongjian and \
@@ -34,88 +33,90 @@ Chen, Junsong and Li, Zhenguo and Luo, Ping},
   year = {2024},
   url = {https://arxiv.org/abs/2304.01168}
 }"""
-# Keys of the facts that detectors can take shortcuts by.
-_SHORTCUT_FACTS: Final = {
+# Keys of the facts that give detectors shortcuts.
+_SHORTCUT_FACTS = {
     "length",
     "folder_right",
     "accident_frames",
     "normal_frames",
     "short",
 }
-# Property → its paragraphs.
-_RAI_TEXTS: Final = {
+# Property of RAI → its paragraphs.
+_RAI_TEXTS = {
     "rai:dataCollection": """
-Simulated with CARLA: designed situations at junctions, each recorded at 10 Hz by four vehicles
-and a roadside pole, with six cameras, a LiDAR and a camera from above each.
+The data were simulated with CARLA. Designed situations at junctions were recorded at 10 Hz by four
+vehicles and a roadside pole, each with six cameras, a LiDAR and a camera from above.
 """,
     "rai:dataAnnotationProtocol": """
-No person annotated: boxes, ids, velocities and visibility are the simulator's own.
+There was no human annotation: boxes, ids, velocities and visibility come from the simulator.
 """,
     "rai:personalSensitiveInformation": """
 None: all persons, vehicles and streets are simulated.
 """,
     "rai:dataLimitations": """
-What the accidents are: collisions at junctions, staged by twelve designs (1 to 6 with traffic
-lights, 7 to 12 without); now and then another pair meets than was planned. Meta names the pair.
-The recording ends at the impact: at most 0.1 s before it, or some tenths of a second after
-contact began.
+The accidents are collisions at junctions, staged by twelve designs (1 to 6 with traffic lights, 7
+to 12 without). Sometimes a different pair collides than was planned; meta names the pair. The
+recording ends at the impact, from 0.1 s before it to a few tenths of a second after the contact
+began.
 
-What they are not: real accidents, or a sample of them. How often they happen, why, and how hard
-they are says nothing of real traffic. Nothing is recorded after the impact, and neither fault nor
-injuries are labelled.
+The accidents are neither real nor a sample of real accidents. Their frequency, causes and severity
+say nothing about real traffic. Nothing is recorded after the impact, and neither fault nor injuries
+are labelled.
 
-A folder's name says what was designed, not what happened: ask meta's first line whether there was
-a collision.
+The name of a folder says what was designed, not what happened. The first line of meta says whether
+there was a collision.
 
-Velocities of boxes are the world's, turned once more by the box's yaw. Matrices jitter in the
-seventh digit. In one real scenario, some 15 % of the boxes with points count other points than
-the cloud has, and sizes of pedestrians change along a track.
+Velocities of boxes are world velocities, rotated once more by the yaw of the box. Matrices jitter
+in the seventh digit. In one real scenario, about 15 % of the boxes with points have labels that
+count a different number of points than the cloud contains, and sizes of pedestrians change along a
+track.
 
 Known exceptions of the real release:
 """,
     "rai:dataBiases": """
-Shortcuts: a clip of an accident is short, since it ends at the impact, and its folder's name says
-accident. A detector can learn either, and know nothing of accidents. Cut normal clips to the
-length of their accidents; `deepaccident audit scores` finds detectors of short clips.
+There are shortcuts: the clip of an accident is short, as it ends at the impact, and its folder's
+name says accident. A detector can learn either shortcut without learning anything about accidents.
+Cut normal clips to the length of their accidents; `deepaccident check scores` finds detectors of
+short clips.
 
-Frames and agents of a scenario, and twins (an accident and the normal scenario of its name), are
-much alike: keep them on one side of a split; `deepaccident check splits` finds those that are
-not. The mini release has names of the whole one, with other recordings.
+Frames and agents of a scenario, and twins (an accident and the normal scenario of the same name),
+are very similar. Keep them on one side of a split; `deepaccident check splits` finds those that are
+on two sides. The mini release uses the names of the full release for other recordings.
 
-Measured on the real release, in brackets on what and on how many cases:
+Measured on the real release (the brackets say on what, and on how many cases):
 """,
     "rai:dataUseCases": """
-Prediction of motion and of accidents, warnings, detection, perception by several agents (V2X),
-planning, forecasting.
+The data are for the prediction of motion and of accidents, warnings, detection, cooperative
+perception (V2X), planning and forecasting.
 
-Which numbers compare: those of one protocol, split, list of samples and set of agents.
-docs/protocols.md of the devkit defines the protocols; never put two into one column. People
-report on val, as test has no labels.
+Numbers can be compared only within one protocol, split, list of samples and set of agents.
+docs/protocols.md of the devkit defines the protocols; never put two protocols into one column.
+Publications report results on val, as test has no labels.
 
-Published numbers compare with those of the protocol `released`, of predictions given as heads:
-IoU, minADE, minFDE, miss rate and APA do, VPQ probably. The time error does not: it is 0 for
-every model with hits. Detection by `opencood` compares with papers that use OpenCOOD with the
-same sorting.
+Published numbers can be compared with the protocol `released` on predictions given as heads: IoU,
+minADE, minFDE, miss rate and APA for certain, VPQ probably. The time error cannot be compared, as
+it is 0 for every model with hits. Detection by `opencood` can be compared with papers that use
+OpenCOOD with the same sorting.
 
-Published rates of planners' collisions compare with nothing, as nobody says how they are counted.
-By four public definitions a plan that repeats the recorded accident has 0 % collisions.
+Published collision rates of planners cannot be compared, as no publication says how collisions are
+counted. By four public definitions, a plan that repeats the recorded accident has 0 % collisions.
 """,
 }
-_TEXT_FORMAT: Final = "text/plain"
-_BINARY_FORMAT: Final = "application/octet-stream"
-_LABEL_PATTERN: Final = "type*/*/label/*/*.txt"
-# Kind of file → its path in a split's folder or the dataroot, its format, its content.
-_FILE_SETS: Final[Mapping[str, tuple[str, str, str]]] = {
+_TEXT_FORMAT = "text/plain"
+_BINARY_FORMAT = "application/octet-stream"
+_LABEL_PATTERN = "type*/*/label/*/*.txt"
+# Kind of file → its path in a split's folder or in the dataroot, its format, its content.
+_FILE_SETS: Mapping[str, tuple[str, str, str]] = {
     "label": (
         _LABEL_PATTERN,
         _TEXT_FORMAT,
-        "What one agent annotated at one frame: its own velocity (m/s, world), then a box a line.",
+        "Labels of one agent in one frame: its own velocity (m/s, world), then one box per line.",
     ),
     "label_lines": (_LABEL_PATTERN, _TEXT_FORMAT, "The same files, read line by line."),
     "calib": (
         "type*/*/calib/*/*.pkl",
         _BINARY_FORMAT,
-        "Where an agent and its sensors are: a pickle, which can run any code.",
+        "Poses of an agent and its sensors, as a pickle, which can run any code.",
     ),
     "meta": ("type*/meta/*.txt", _TEXT_FORMAT, "How a scenario was set up, and how it ended."),
     **{
@@ -133,23 +134,23 @@ _FILE_SETS: Final[Mapping[str, tuple[str, str, str]]] = {
         "±60 m from above: instances, and in channel 2 classes. NumPy.",
     ),
 }
-# Field → its type and meaning; of fields that are read from files, also the property of the file
-# and the pattern, with the value as its group.
-_SPLIT_FIELDS: Final = {
-    "name": ("sc:Text", "Of the split; unknown where neither lists nor folders say it."),
+# Field → its type and meaning. Fields that are read from files also have the property of the file
+# and the pattern whose group is the value.
+_SPLIT_FIELDS = {
+    "name": ("sc:Text", "Name of the split; unknown if neither lists nor folders say it."),
     "url": ("sc:URL", "Croissant's name of it."),
     **{
         name: ("sc:Integer", f"{name} of it here.")
         for name in ("scenarios", "frames", "samples", "annotations")
     },
 }
-_COUNT_FIELDS: Final = {
+_COUNT_FIELDS = {
     "table": ("sc:Text", "What the value is of."),
-    "value": ("sc:Text", "Such as a town or a class."),
+    "value": ("sc:Text", "Value, such as a town or a class."),
     "counted": ("sc:Text", "What is counted."),
     **{group: ("sc:Integer", f"How many: {group}.") for group in GROUPS},
 }
-_PATH_FIELDS: Final = {
+_PATH_FIELDS = {
     "scenario_type": (
         "sc:Text",
         "Such as type1_subtype1_accident.",
@@ -164,13 +165,13 @@ _PATH_FIELDS: Final = {
     ),
     "agent": (
         "sc:Text",
-        f"Who recorded: {', '.join(AGENTS)}.",
+        f"Agent that recorded: {', '.join(AGENTS)}.",
         "fullpath",
         r"(?:.*/)?([^/]+)/label/",
     ),
     "frame": (
         "sc:Integer",
-        "From 1, at 10 Hz: 0.1 s · (frame − 1) since the first.",
+        "Number of the frame, from 1, at 10 Hz; its time is 0.1 s · (frame − 1).",
         "fullpath",
         r".*_(\d+)\.txt",
     ),
@@ -181,7 +182,7 @@ _PATH_FIELDS: Final = {
         r".*_(accident|normal)/",
     ),
 }
-_LINE_FIELDS: Final = (
+_LINE_FIELDS = (
     ("sc:Text", f"Class: {', '.join(CATEGORIES)}."),
     ("sc:Float", "Centre of the box, forward. m, LiDAR frame of the sample."),
     ("sc:Float", "Centre of the box, to the right. m, LiDAR frame."),
@@ -189,14 +190,17 @@ _LINE_FIELDS: Final = (
     *(("sc:Float", f"Full {size} of the box. m.") for size in ("length", "width", "height")),
     ("sc:Float", "Heading about z, clockwise seen from above. rad, LiDAR frame."),
     *(
-        ("sc:Float", f"Velocity in {axis}: the world's, turned once more by yaw. m/s; may be NaN.")
+        (
+            "sc:Float",
+            f"Velocity in {axis}: the world's, rotated once more by yaw. m/s; may be NaN.",
+        )
         for axis in "xy"
     ),
     (
         "sc:Integer",
         (
-            "Actor, the same for all agents and frames; −100 the agent, −1 untracked, "
-            "from 20000 on parked."
+            "Id of the actor, the same for all agents and frames; −100 is the agent itself, −1 "
+            "is untracked, and ids from 20000 are parked vehicles."
         ),
     ),
     ("sc:Integer", "Points of this agent's LiDAR in the box."),
@@ -205,27 +209,27 @@ _LINE_FIELDS: Final = (
 
 
 def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
-    """Return the data card of a release as Croissant metadata.
+    """Describe a release as a data card in Croissant metadata.
 
-    The same files give the same card, wherever they lie.
+    Identical files yield identical cards, wherever they are stored.
 
     Args:
-        dataset: A release of DeepAccident. A synthetic one is described like the real release,
-            except for its counts.
-        licence: Terms that you have the data under, preferably a URL. The devkit knows none:
-            without it the card has no licence, and refers to the dataset's authors.
+        dataset: A DeepAccident release. A synthetic one is described like the real release, except
+            for its counts.
+        licence: Terms under which you have the data, preferably as a URL. The devkit does not know
+            them: if None, the card has no licence, and refers to the dataset's authors.
 
     Returns:
-        JSON-LD. The record sets `splits` and `counts` hold their data, for the present files;
-        `samples` and `annotations` are read from the label files, and are left-handed like these.
+        JSON-LD. The record sets `splits` and `counts` contain their data, for the present files.
+        `samples` and `annotations` are read from the label files, and left-handed like these.
 
     Raises:
-        NotAvailableError: The release is a dataroot of nuScenes.
-        ChoiceError: `licence` is blank.
+        NotAvailableError: If the release is a nuScenes dataroot.
+        ChoiceError: If `licence` is blank.
     """
     if dataset.layout not in ("A", "B", "A+B"):
         raise NotAvailableError(
-            f"{dataset.dataroot}: is no release of DeepAccident; only such have a data card here"
+            f"{dataset.dataroot}: is not a DeepAccident release, and only these have a data card"
         )
     if licence is not None and not licence.strip():
         raise ChoiceError(f"licence: expected a text such as a URL, found {licence!r}")
@@ -235,7 +239,7 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
         "@context": json.loads(_CONTEXT_PATH.read_bytes()),
         "@type": "sc:Dataset",
         "name": "DeepAccident" + dataset.version.removeprefix("v1"),
-        "description": _describe(counts, statistics, with_licence=bool(licence)),
+        "description": _describe_release(counts, statistics, with_licence=bool(licence)),
         "conformsTo": [
             "http://mlcommons.org/croissant/1.0",
             "http://mlcommons.org/croissant/RAI/1.0",
@@ -244,9 +248,9 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
     if licence:
         card["license"] = licence
     missing_data = (
-        "The test split was published without labels and cameras from above. Here, "
-        f"{statistics.unlabelled[TOTAL]} scenarios have no labels, and "
-        f"{len(counts.left_out)} are left out as broken."
+        "The test split was published without labels and cameras from above. In this "
+        f"copy, {counted(statistics.unlabelled[TOTAL], 'scenario')} without labels; "
+        f"{counted(len(counts.left_out), 'broken scenario')} excluded."
     )
     return card | {
         "citeAs": _CITATION,
@@ -260,10 +264,10 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
         ],
         "url": "https://deepaccident.github.io/",
         "version": dataset.version.replace("v1", "1.0.0"),
-        **_responsible_ai(),
+        **_rai_properties(),
         "rai:dataCollectionType": "Software Collection",
         "rai:dataCollectionMissingData": missing_data,
-        "distribution": _distribution(dataset, counts),
+        "distribution": _make_file_sets(dataset, counts),
         "recordSet": [
             _split_records(statistics),
             _count_records(dataset, statistics),
@@ -272,23 +276,25 @@ def data_card(dataset: Dataset, *, licence: str | None = None) -> JsonLd:
     }
 
 
-def _describe(counts: Overview, statistics: DatasetStatistics, *, with_licence: bool) -> str:
+def _describe_release(
+    counts: Overview, statistics: DatasetStatistics, *, with_licence: bool
+) -> str:
     collisions = statistics.counts["collisions"].counts["yes"][TOTAL]
     text = (
         "Accidents and normal traffic at junctions in the simulator CARLA, seen by up to five "
         "agents that can cooperate. "
-        f"Here are {statistics.scenarios[TOTAL]} scenarios, of which {collisions:,} end in a "
-        f"collision, with {counts.recordings:,} recordings of one agent each, "
-        f"{statistics.samples[TOTAL]:,} samples and {counts.tables['annotation']:,} annotated "
-        "boxes."
+        f"This copy contains {counted(statistics.scenarios[TOTAL], 'scenario')} "
+        f"({collisions:,} with a collision), {counted(counts.recordings, 'recording')} of one "
+        f"agent each, {counted(statistics.samples[TOTAL], 'sample')} and "
+        f"{counted(counts.tables['annotation'], 'annotation')}."
     )
     if not with_licence:
-        text += " The licence is not stated here; ask the dataset's authors for it."
+        text += " The licence is not stated here; ask the authors of the dataset."
     return text
 
 
-def _responsible_ai() -> dict[str, str | list[str]]:
-    """Return the properties of RAI 1.0, a text or a list of paragraphs each."""
+def _rai_properties() -> dict[str, str | list[str]]:
+    """Return the RAI 1.0 properties, each as a text or a list of paragraphs."""
     paragraphs = {}
     for name, text in _RAI_TEXTS.items():
         paragraphs[name] = [" ".join(paragraph.split()) for paragraph in text.split("\n\n")]
@@ -298,12 +304,17 @@ def _responsible_ai() -> dict[str, str | list[str]]:
     for fact in FACTS:
         if fact.key in _SHORTCUT_FACTS:
             paragraphs["rai:dataBiases"].append(f"{fact.name}: {fact.texts()[2]}")
-    return {name: texts if len(texts) > 1 else texts[0] for name, texts in paragraphs.items()}
+    properties: dict[str, str | list[str]] = {}
+    for name, texts in paragraphs.items():
+        properties[name] = texts
+        if len(texts) == 1:
+            properties[name] = texts[0]
+    return properties
 
 
-def _distribution(dataset: Dataset, counts: Overview) -> list[JsonLd]:
-    """Return a file set for each kind of file that the release has."""
-    folders = sorted({f"{scenario['folder']}/".lstrip("/") for scenario in dataset.scenario[:]})
+def _make_file_sets(dataset: Dataset, counts: Overview) -> list[JsonLd]:
+    """Return a file set for each kind of file in the release."""
+    folders = {f"{scenario['folder']}/".lstrip("/") for scenario in dataset.scenario[:]}
     file_sets = []
     for name, (pattern, file_format, content) in _FILE_SETS.items():
         if not counts.files.get(name, 1):
@@ -311,20 +322,23 @@ def _distribution(dataset: Dataset, counts: Overview) -> list[JsonLd]:
         text = content
         if name in counts.files:
             text += f" {counts.files[name]:,} of {counts.samples:,} are here."
-        includes = [folder + pattern for folder in folders]
-        file_sets.append(
-            _make_node("FileSet", name, text, encodingFormat=file_format, includes=includes)
-        )
-    paths = [f"{folder}{name}" for folder in ("", f"{SPLIT_FILE_FOLDER}/") for name in SPLIT_FILES]
-    includes = [path for path in paths if (dataset.dataroot / path).is_file()]
+        includes = [folder + pattern for folder in sorted(folders)]
+        file_sets.append(_make_file_set(name, text, file_format, includes))
+    includes = []
+    for folder in ("", f"{SPLIT_FILE_FOLDER}/"):
+        for name in SPLIT_FILES:
+            path = f"{folder}{name}"
+            if (dataset.dataroot / path).is_file():
+                includes.append(path)
     if includes:
         text = "The scenarios of a split: <scenario_type> <scenario>."
-        file_sets.append(
-            _make_node(
-                "FileSet", "split_lists", text, encodingFormat=_TEXT_FORMAT, includes=includes
-            )
-        )
+        file_sets.append(_make_file_set("split_lists", text, _TEXT_FORMAT, includes))
     return file_sets
+
+
+def _make_file_set(name: str, text: str, file_format: str, includes: list[str]) -> JsonLd:
+    """Return a file set with the path patterns of its files."""
+    return _make_node("FileSet", name, text, encodingFormat=file_format, includes=includes)
 
 
 def _split_records(statistics: DatasetStatistics) -> JsonLd:
@@ -348,49 +362,52 @@ def _split_records(statistics: DatasetStatistics) -> JsonLd:
 
 
 def _count_records(dataset: Dataset, statistics: DatasetStatistics) -> JsonLd:
-    split_of = {
-        scenario["token"]: scenario["split"] or UNKNOWN_SPLIT for scenario in dataset.scenario[:]
-    }
+    split_of = {}
+    for scenario in dataset.scenario[:]:
+        split_of[scenario["token"]] = scenario["split"] or UNKNOWN_SPLIT
     agent_counts: dict[str, dict[str, int]] = {name: dict.fromkeys(GROUPS, 0) for name in AGENTS}
     for agent in dataset.agent[:]:
-        agent_counts[agent["name"]][TOTAL] += 1
-        agent_counts[agent["name"]][split_of[agent["scenario_token"]]] += 1
+        counts_by_group = agent_counts[agent["name"]]
+        counts_by_group[TOTAL] += 1
+        counts_by_group[split_of[agent["scenario_token"]]] += 1
     tables: dict[str, tuple[str, Mapping[str, Mapping[str, int]]]]
     tables = {"agents": ("scenarios", agent_counts)}
-    tables |= {table.name: (table.counted, table.counts) for table in statistics.counts.values()}
+    for table in statistics.counts.values():
+        tables[table.name] = (table.counted, table.counts)
     rows = []
-    for table_name, (counted, counts) in tables.items():
+    for table_name, (subject, counts) in tables.items():
         for value, numbers in counts.items():
             if numbers[TOTAL]:
-                rows.append((table_name, value, counted, *numbers.values()))
-    text = "What is here, by split; `deepaccident info --statistics` has more."
+                rows.append((table_name, value, subject, *numbers.values()))
+    text = "Contents of this copy by split; `deepaccident info --statistics` prints more."
     return _make_records("counts", text, _COUNT_FIELDS, rows)
 
 
 def _label_records(dataset: Dataset) -> list[JsonLd]:
-    """Return samples by the paths of their label files, and annotations by the lines of these."""
+    """Return the record sets of samples (one per label file) and annotations (one per line)."""
     path_fields = dict(_PATH_FIELDS)
     if all(scenario["folder"] in SPLITS for scenario in dataset.scenario[:]):
         path_fields["split"] = ("sc:Text", "By the folder.", "fullpath", f"({'|'.join(SPLITS)})/")
     line_fields = {}
-    for index, (name, kind_and_meaning) in enumerate(zip(LABEL_FIELDS, _LINE_FIELDS, strict=True)):
-        fields_after = len(LABEL_FIELDS) - index - 1
-        pattern = rf"(?:\S+ ){{{index}}}(\S+)(?: \S+){{{fields_after}}}$"
+    fields = zip(LABEL_FIELDS, _LINE_FIELDS, strict=True)
+    for fields_before, (name, kind_and_meaning) in enumerate(fields):
+        fields_after = len(LABEL_FIELDS) - fields_before - 1
+        pattern = rf"(?:\S+ ){{{fields_before}}}(\S+)(?: \S+){{{fields_after}}}$"
         line_fields[name] = (*kind_and_meaning, "lines", pattern)
     return [
         _make_records(
             "samples",
-            "One agent at one moment, where it has a label. Its split is that of the scenario's "
-            "list, or folder.",
+            "One agent at one moment that has a label. The split comes from the scenario's list "
+            "or folder.",
             path_fields,
             files="label",
         ),
         _make_records(
             "annotations",
-            "A box as one agent annotated it, left-handed as in the file. A file's first line is "
-            "no box, and fits no pattern: mlcroissant, which cannot leave out a line, stops there. "
-            "In Python, deepaccident_devkit.release.read_label reads a file, and DeepAccident all "
-            "of them, right-handed.",
+            "A box as one agent annotated it, left-handed as in the file. A file's first line "
+            "is not a box and fits no pattern, so mlcroissant, which cannot skip a line, stops "
+            "there. In Python, deepaccident_devkit.release.read_label reads one file, and "
+            "DeepAccident reads all files, right-handed.",
             {**path_fields, **line_fields},
             files="label_lines",
         ),
@@ -404,7 +421,7 @@ def _make_records(
     rows: Iterable[tuple[Any, ...]] = (),
     files: str = "",
 ) -> JsonLd:
-    """Return a record set with rows of its fields, or with fields that are read from files."""
+    """Return a record set; its values are either `rows`, or read from `files`."""
     nodes = []
     for field, (kind, meaning, *source) in fields.items():
         node = _make_node("Field", f"{name}/{field}", meaning, dataType=kind)

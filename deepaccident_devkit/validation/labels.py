@@ -1,22 +1,25 @@
 """Checks within one agent's labels: ids, sizes, own rows, tracks (docs/format.md, Label)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
 from deepaccident_devkit.release.labels import read_lone_words
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from deepaccident_devkit.tables import Finding
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
+from deepaccident_devkit.validation.agreement import wrap_angle
 from deepaccident_devkit.validation.subject import (
+    CAR_CODES,
     MAX_LABEL_BOXES,
+    Findings,
     Subject,
     frames_text,
     near_pairs,
 )
 
 ACTOR_ID_LIMIT = 2_000_000
-"""Lowest of the ids that the released code drops."""
+"""Smallest id that the released code drops."""
 CLASS_LENGTHS_M: dict[str, tuple[float, float]] = {
     "car": (1.8, 7.5),
     "truck": (3.0, 20.0),
@@ -25,216 +28,225 @@ CLASS_LENGTHS_M: dict[str, tuple[float, float]] = {
     "motorcycle": (0.5, 3.5),
     "pedestrian": (0.1, 1.6),
 }
-"""Shortest and longest of each class."""
+"""Shortest and longest box length of each class in metres."""
 MAX_WIDTH_M = 5.0
-"""Width and height of the largest road users."""
+"""Largest width and largest height of a road user."""
 MAX_COORDINATE_M = 1000.0
-"""Distance from the LiDAR along each axis within which labels annotate."""
+"""Largest distance of an annotated box from the LiDAR, along each axis."""
 OWN_OFFSET_TOLERANCE_M = 0.6
-"""Distance of the own row's box from the agent's origin; real ones reach 0.3."""
+"""Largest distance of the agent's own row from its origin; it reaches 0.3 in real data."""
 OWN_TURN_TOLERANCE_RAD = np.radians(15.0)
-"""Difference of the own row's heading from the agent's."""
+"""Largest difference between the heading of the agent's own row and the agent's heading."""
 OWN_VELOCITY_TOLERANCE_MPS = 0.05
-"""Difference of the own row from the first line, which print one number with different digits."""
-# Distance within which two boxes of a class are the same box.
+"""Largest difference between the velocities in the agent's own row and in the first line.
+
+The two print the same number with a different number of digits.
+"""
+# Distance within which two boxes of the same class count as the same box.
 _DUPLICATE_RADIUS_M = 0.05
 SIZE_TOLERANCE_M = 0.02
+"""Largest change of a box's size between frames."""
 WALKER_SIZE_TOLERANCE_M = 1.0
-"""Change of a pedestrian's box from frame to frame: real ones stretch by 0.62."""
+"""Largest change of a pedestrian's box size between frames; it reaches 0.62 in real data."""
 MAX_JUMP_M = 0.6
-"""Distance of an actor from the middle of its neighbours in time: 120 m/s²."""
+"""Largest distance of an actor from the midpoint of its positions one frame before and after.
+
+It corresponds to 120 m/s².
+"""
 MAX_TURN_RAD = np.radians(40.0)
-"""Turn of a car from the middle of its neighbours in time."""
+"""Largest change of a car's heading between frames."""
 IMPACT_FRAMES = 2
-"""Frames at the end in which a collision may throw its pair about."""
-_FOUR_WHEELED = [CATEGORIES.index(name) for name in ("car", "truck", "van")]
+"""Number of frames at the end in which a collision may throw the two colliders about."""
 
 
-def check_labels(subject: Subject) -> Iterator[Finding]:
-    """Yield all findings within one label, or within one agent's labels."""
+def check_labels(subject: Subject) -> Findings:
+    """Yield all findings within single labels, and within one agent's labels."""
     for check in _LABEL_CHECKS:
         yield from check(subject)
 
 
-def _check_lone_words(subject: Subject) -> Iterator[Finding]:
-    """Find lines of one word, which readers skip.
+def _check_lone_words(subject: Subject) -> Findings:
+    """Find lines that consist of one word, which readers skip.
 
-    Only they show that a label ends within a class name.
+    Nothing else shows that a label file was cut off within a class name.
     """
-    for agent in subject.files.scan.labelled:
+    for agent in subject.labelled:
         for frame in range(1, subject.num_frames + 1):
             path = subject.files.scenario.label_path(agent, frame)
-            skipped = read_lone_words(path)
-            if not skipped:
+            skipped_lines = read_lone_words(path)
+            if not skipped_lines:
                 continue
-            _, word, ends_file = skipped[-1]
-            if ends_file and any(name.startswith(word) for name in CATEGORIES):
-                message = f"its last line is cut off after '{word}'"
+            _, word, ends_file = skipped_lines[-1]
+            begins_category = any(name.startswith(word) for name in CATEGORIES)
+            if ends_file and begins_category:
+                message = f"the last line is cut off after '{word}'"
                 yield subject.finding("label-cut", str(path), message)
-                skipped.pop()
-            if skipped:
-                number, word, _ = skipped[0]
-                message = f"skipped are {len(skipped)} lines of one word, the first is {word!r}"
+                skipped_lines.pop()
+            if skipped_lines:
+                number, word, _ = skipped_lines[0]
+                count = len(skipped_lines)
+                message = f"skipped {counted(count, 'line')} of one word, such as {word!r}"
                 yield subject.finding("label-line-skipped", f"{path}:{number}", message)
 
 
-def _check_crowds(subject: Subject) -> Iterator[Finding]:
+def _check_crowds(subject: Subject) -> Findings:
     counts = np.bincount(subject.boxes.sample, minlength=subject.files.num_samples)
     for agent, frame_counts in enumerate(counts.reshape(len(subject.agents), -1)):
         frames = np.flatnonzero(frame_counts > MAX_LABEL_BOXES) + 1
         if len(frames):
             message = f"up to {frame_counts.max():,} boxes in a label"
             message += f", more than {MAX_LABEL_BOXES:,}, {frames_text(frames)}"
-            yield subject.finding("label-crowded", subject.label_folder(agent), message)
+            yield subject.label_finding("label-crowded", agent, message)
 
 
-def _check_ids(subject: Subject) -> Iterator[Finding]:
+def _check_ids(subject: Subject) -> Findings:
     label_id = subject.label_id
-    too_low = (label_id < UNTRACKED_ID) & (label_id != OWN_ACTOR_ID)
-    odd = too_low | (label_id >= ACTOR_ID_LIMIT)
-    yield from subject.label_findings("odd-id", odd, "ids that the format does not know")
-    repeated = _find_repeated(np.column_stack([subject.boxes.sample, label_id]))
-    duplicate = repeated & (label_id != UNTRACKED_ID) & ~subject.own
-    yield from subject.label_findings("duplicate-id", duplicate, "an id occurs twice in one label")
+    is_low = (label_id < UNTRACKED_ID) & (label_id != OWN_ACTOR_ID)
+    is_odd = is_low | (label_id >= ACTOR_ID_LIMIT)
+    yield from subject.box_findings("odd-id", is_odd, "ids that the format does not define")
+    is_repeated = _find_repeated(np.column_stack([subject.boxes.sample, label_id]))
+    is_duplicate = is_repeated & subject.tracked
+    yield from subject.box_findings("duplicate-id", is_duplicate, "an id occurs twice in one label")
 
 
-def _check_duplicates(subject: Subject) -> Iterator[Finding]:
+def _check_duplicates(subject: Subject) -> Findings:
     labels = subject.boxes.labels
     groups = subject.boxes.sample * len(CATEGORIES) + labels.category
-    pairs, duplicate = near_pairs(labels.center, groups, _DUPLICATE_RADIUS_M)
-    duplicate[pairs.ravel()] = True
-    yield from subject.label_findings(
-        "duplicate-box", duplicate, "two boxes stand in the same place"
-    )
+    pairs, is_duplicate = near_pairs(labels.center, groups, _DUPLICATE_RADIUS_M)
+    is_duplicate[pairs.ravel()] = True
+    message = "two boxes are in the same place"
+    yield from subject.box_findings("duplicate-box", is_duplicate, message)
 
 
-def _check_sizes_and_points(subject: Subject) -> Iterator[Finding]:
+def _check_sizes_and_points(subject: Subject) -> Findings:
     labels = subject.boxes.labels
     length = labels.size[:, 0]
     width = labels.size[:, 1]
     class_lengths = np.array([CLASS_LENGTHS_M[name] for name in CATEGORIES])
     min_length, max_length = class_lengths[labels.category].T
-    too_small = np.any(labels.size <= 0, axis=1)
-    odd: BoolArray = too_small | np.any(labels.size[:, 1:] > MAX_WIDTH_M, axis=1)
+    is_small = np.any(labels.size <= 0, axis=1)
+    is_large = np.any(labels.size[:, 1:] > MAX_WIDTH_M, axis=1)
+    is_odd: BoolArray = is_small | is_large | (length > class_lengths.max())
     is_crosswise = _is_four_wheeled(subject) & (length < width)
-    unlike = (length < min_length) | (length > max_length) | is_crosswise
-    # Real untracked rows have sizes of another class.
-    odd |= unlike & (subject.label_id != UNTRACKED_ID)
-    odd |= length > class_lengths.max()
-    yield from subject.label_findings("odd-size", odd, "sizes that their classes do not have")
-    negative = labels.num_lidar_pts < 0
-    yield from subject.label_findings("odd-points", negative, "less than 0 LiDAR points")
-    distant: BoolArray = np.any(np.abs(labels.center) > MAX_COORDINATE_M, axis=1)
-    message = f"over {MAX_COORDINATE_M:.0f} m from the LiDAR"
-    yield from subject.label_findings("odd-position", distant, message)
-    unknown: BoolArray = np.any(np.isnan(labels.velocity), axis=1)
-    yield from subject.label_findings("velocity-unknown", unknown, "velocities that are no numbers")
+    is_unlike_class = (length < min_length) | (length > max_length) | is_crosswise
+    # In real data, untracked rows have sizes of another class.
+    is_odd |= is_unlike_class & (subject.label_id != UNTRACKED_ID)
+    yield from subject.box_findings("odd-size", is_odd, "sizes that do not fit their classes")
+    is_negative = labels.num_lidar_pts < 0
+    yield from subject.box_findings("odd-points", is_negative, "a negative number of LiDAR points")
+    is_distant: BoolArray = np.any(np.abs(labels.center) > MAX_COORDINATE_M, axis=1)
+    message = f"more than {MAX_COORDINATE_M:.0f} m from the LiDAR"
+    yield from subject.box_findings("odd-position", is_distant, message)
+    is_unknown: BoolArray = np.any(np.isnan(labels.velocity), axis=1)
+    message = "velocities that are not numbers"
+    yield from subject.box_findings("velocity-unknown", is_unknown, message)
 
 
-def _check_own_row_counts(subject: Subject) -> Iterator[Finding]:
+def _check_own_row_counts(subject: Subject) -> Findings:
     own_samples = subject.boxes.sample[subject.own]
     counts = np.bincount(own_samples, minlength=subject.files.num_samples)
     for agent, frame_counts in enumerate(counts.reshape(len(subject.agents), -1)):
-        if subject.agents[agent] not in subject.files.scan.labelled:
+        if subject.agents[agent] not in subject.labelled:
             continue
-        expected = 0 if subject.is_pole(agent) else 1
+        if subject.is_pole(agent):
+            expected = 0
+        else:
+            expected = 1
         for code, mask in (
             ("own-row-missing", frame_counts < expected),
             ("own-row-odd", frame_counts > expected),
         ):
             if mask.any():
-                message = f"expected {expected} rows of id {OWN_ACTOR_ID}, found another number"
-                message += f" in {frames_text(np.flatnonzero(mask) + 1)}"
-                yield subject.finding(code, subject.label_folder(agent), message)
+                message = f"expected {counted(expected, 'row')} of id {OWN_ACTOR_ID}"
+                message += f", found another number in {frames_text(np.flatnonzero(mask) + 1)}"
+                yield subject.label_finding(code, agent, message)
 
 
-def _check_own_boxes(subject: Subject) -> Iterator[Finding]:
+def _check_own_boxes(subject: Subject) -> Findings:
     boxes = subject.boxes
     rows = np.flatnonzero(subject.own)
-    pose = subject.files.calibs.world_from_ego[boxes.sample[rows]]
-    # The agent stands upright on the road.
-    expected_center = pose[:, :3, 3] + pose[:, :3, 2] * boxes.labels.size[rows, 2:] / 2
+    samples = boxes.sample[rows]
+    pose = subject.files.calibs.world_from_ego[samples]
+    up = pose[:, :3, 2]
+    # The agent is assumed to stand upright on the road.
+    expected_center = pose[:, :3, 3] + up * boxes.labels.size[rows, 2:] / 2
     offset = np.linalg.norm(subject.centers[rows] - expected_center, axis=1)
-    turn = subject.yaw[rows] - np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
-    misplaced = np.zeros(len(subject.own), dtype=bool)
-    misplaced[rows] = offset > OWN_OFFSET_TOLERANCE_M
-    misplaced[rows] |= np.abs(np.arctan2(np.sin(turn), np.cos(turn))) > OWN_TURN_TOLERANCE_RAD
-    message = f"the own box is turned, or over {OWN_OFFSET_TOLERANCE_M} m off standing on the"
-    message += " agent's origin"
-    yield from subject.label_findings("own-box-off", misplaced, message)
+    turn = np.abs(wrap_angle(subject.yaw[rows] - np.arctan2(pose[:, 1, 0], pose[:, 0, 0])))
+    is_misplaced = (offset > OWN_OFFSET_TOLERANCE_M) | (turn > OWN_TURN_TOLERANCE_RAD)
+    message = "the agent's own box is turned, or does not stand within "
+    message += f"{OWN_OFFSET_TOLERANCE_M} m of the agent's origin"
+    yield from subject.box_findings("own-box-off", subject.mask(rows[is_misplaced]), message)
     first_line = np.full((subject.files.num_samples, 2), np.nan)
-    labelled = [agent in subject.files.scan.labelled for agent in subject.agents]
-    first_line[np.repeat(labelled, subject.num_frames)] = subject.files.labels.agent_velocity
-    difference = np.abs(boxes.labels.velocity[rows] - first_line[boxes.sample[rows]]).max(axis=1)
-    differs = np.zeros(len(subject.own), dtype=bool)
-    differs[rows] = difference > OWN_VELOCITY_TOLERANCE_MPS
-    yield from subject.label_findings(
-        "own-velocity", differs, "the agent's own velocity differs from the first line"
-    )
+    is_labelled = [agent in subject.labelled for agent in subject.agents]
+    first_line[np.repeat(is_labelled, subject.num_frames)] = subject.files.labels.agent_velocity
+    difference = np.abs(boxes.labels.velocity[rows] - first_line[samples])
+    differs = difference.max(axis=1) > OWN_VELOCITY_TOLERANCE_MPS
+    message = "the velocity of the agent's own box differs from the first line"
+    yield from subject.box_findings("own-velocity", subject.mask(rows[differs]), message)
 
 
-def _check_tracks(subject: Subject) -> Iterator[Finding]:
-    """Check changes along each track: one agent's rows of one id."""
-    rows = np.flatnonzero(subject.tracked)
+def _check_tracks(subject: Subject) -> Findings:
+    """Check the changes along each track, which is one agent's rows with the same id."""
     boxes = subject.boxes
-    rows = rows[np.lexsort((boxes.frame[rows], subject.label_id[rows], boxes.agent[rows]))]
-    ids = subject.label_id[rows]
-    agents = boxes.agent[rows]
-    same_track = (ids[1:] == ids[:-1]) & (agents[1:] == agents[:-1])
-    categories = boxes.labels.category[rows]
-    is_walker = boxes.labels.category == CATEGORIES.index("pedestrian")
+    rows = np.flatnonzero(subject.tracked)
+    order = np.lexsort((boxes.frame[rows], subject.label_id[rows], boxes.agent[rows]))
+    rows = rows[order]
+    same_id = np.diff(subject.label_id[rows]) == 0
+    same_agent = np.diff(boxes.agent[rows]) == 0
+    same_track: BoolArray = same_id & same_agent
+    class_changes = np.diff(boxes.labels.category[rows]) != 0
+    is_walker = boxes.labels.category[rows] == CATEGORIES.index("pedestrian")
     tolerance = np.where(is_walker, WALKER_SIZE_TOLERANCE_M, SIZE_TOLERANCE_M)
     growth = np.abs(np.diff(boxes.labels.size[rows], axis=0)).max(axis=1)
-    for code, changed in (
-        ("class-changes", categories[1:] != categories[:-1]),
-        ("size-changes", growth > tolerance[rows[1:]]),
-    ):
-        changed_rows = subject.mask(rows[1:][same_track & changed])
-        yield from subject.label_findings(code, changed_rows, "changes along the track")
+    size_changes = growth > tolerance[1:]
+    for code, changes in (("class-changes", class_changes), ("size-changes", size_changes)):
+        changed_boxes = subject.mask(rows[1:][same_track & changes])
+        yield from subject.box_findings(code, changed_boxes, "changes along the track")
     yield from _check_motion(subject, rows, same_track)
     yield from _check_track_gaps(subject, rows, same_track)
 
 
-def _check_motion(subject: Subject, rows: IntArray, same_track: BoolArray) -> Iterator[Finding]:
-    """Find jumps and sudden turns between successive rows of a track."""
+def _check_motion(subject: Subject, rows: IntArray, same_track: BoolArray) -> Findings:
+    """Find jumps and sudden turns between successive rows of each track."""
+    middle_rows = rows[1:-1]
     frame = subject.boxes.frame[rows]
-    step = np.diff(frame)
-    successive = same_track[1:] & same_track[:-1] & (step[1:] == 1) & (step[:-1] == 1)
+    follows = same_track & (np.diff(frame) == 1)
     in_impact = frame[2:] > subject.num_frames - IMPACT_FRAMES
-    checked = successive & ~(subject.in_collision[rows[1:-1]] & in_impact)
+    is_thrown = subject.in_collision[middle_rows] & in_impact
+    is_checked = follows[1:] & follows[:-1] & ~is_thrown
     bend = np.linalg.norm(_second_difference(subject.centers[rows]), axis=1) / 2
-    jumps = subject.mask(rows[1:-1][checked & (bend > MAX_JUMP_M)])
-    message = f"over {MAX_JUMP_M} m off the middle of the frames around"
-    yield from subject.label_findings("track-jump", jumps, message)
-    change = np.diff(subject.yaw[rows])
-    turns = np.abs(np.arctan2(np.sin(change), np.cos(change))) > MAX_TURN_RAD
-    is_turned = checked & _is_four_wheeled(subject)[rows[1:-1]] & turns[1:] & turns[:-1]
-    turned_rows = subject.mask(rows[1:-1][is_turned])
-    yield from subject.label_findings("track-turn", turned_rows, "turned to and fro")
+    jumps = is_checked & (bend > MAX_JUMP_M)
+    message = f"more than {MAX_JUMP_M} m from the middle of the neighbouring frames"
+    yield from subject.box_findings("track-jump", subject.mask(middle_rows[jumps]), message)
+    change = np.abs(wrap_angle(np.diff(subject.yaw[rows])))
+    turns = change > MAX_TURN_RAD
+    is_turned = is_checked & _is_four_wheeled(subject)[middle_rows] & turns[1:] & turns[:-1]
+    turned_boxes = subject.mask(middle_rows[is_turned])
+    yield from subject.box_findings("track-turn", turned_boxes, "the heading flips back and forth")
 
 
-def _check_track_gaps(subject: Subject, rows: IntArray, same_track: BoolArray) -> Iterator[Finding]:
-    """Find frames that a track near its agent lacks."""
+def _check_track_gaps(subject: Subject, rows: IntArray, same_track: BoolArray) -> Findings:
+    """Find frames that are missing from a track near its agent."""
     boxes = subject.boxes
     distance = np.linalg.norm(boxes.labels.center[rows, :2], axis=1)
-    near = distance < subject.reach[boxes.agent[rows]]
+    is_near = distance < subject.reach[boxes.agent[rows]]
     skips = np.diff(boxes.frame[rows]) > 1
-    gap = np.flatnonzero(same_track & skips & near[1:] & near[:-1])
-    before = rows[gap]
-    after = rows[gap + 1]
+    gaps = np.flatnonzero(same_track & skips & is_near[1:] & is_near[:-1])
+    before = rows[gaps]
+    after = rows[gaps + 1]
     center = (subject.centers[before] + subject.centers[after]) / 2
+    middle_frame = (boxes.frame[before] + boxes.frame[after]) // 2
+    message = "near the agent, but missing in earlier frames"
     for agent in range(len(subject.agents)):
         is_gap = boxes.agent[before] == agent
-        frames = (boxes.frame[before] + boxes.frame[after])[is_gap] // 2
-        is_gap[is_gap] = ~subject.has_untracked(agent, frames, center[is_gap])
-        yield from subject.label_findings(
-            "track-gap", subject.mask(after[is_gap]), "near, and missing in the frames before"
-        )
+        is_gap[is_gap] = ~subject.has_untracked(agent, middle_frame[is_gap], center[is_gap])
+        yield from subject.box_findings("track-gap", subject.mask(after[is_gap]), message)
 
 
 def _is_four_wheeled(subject: Subject) -> BoolArray:
-    """Return a mask of boxes of four-wheeled vehicles, shape (N,)."""
-    return np.isin(subject.boxes.labels.category, _FOUR_WHEELED)
+    """Return which boxes are four-wheeled vehicles, shape (N,)."""
+    categories = subject.boxes.labels.category
+    return np.isin(categories, CAR_CODES)
 
 
 def _second_difference(values: FloatArray) -> FloatArray:
@@ -244,14 +256,15 @@ def _second_difference(values: FloatArray) -> FloatArray:
 
 
 def _find_repeated(keys: AnyArray) -> BoolArray:
-    """Return a mask of keys (N, K) that occur more than once."""
+    """Return which keys (N, K) occur more than once, shape (N,)."""
     if not len(keys):
         return np.zeros(0, dtype=bool)
-    _, inverse, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(count[inverse.reshape(-1)] > 1)
+    _, group, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    return counts[group.reshape(-1)] > 1
 
 
-_LABEL_CHECKS: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
+# The checks of labels, in the order in which findings are listed.
+_LABEL_CHECKS: tuple[Callable[[Subject], Findings], ...] = (
     _check_lone_words,
     _check_crowds,
     _check_ids,

@@ -1,14 +1,14 @@
-"""Checks of the sensors' files, and of JPEGs with lost data.
+"""Checks of sensor files, including JPEGs with lost data.
 
-Pillow only reports a file that is cut.
+Pillow only reports a JPEG that is truncated.
 """
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import FileKind, read_bytes
-from deepaccident_devkit.tables import Finding
 from deepaccident_devkit.tables.scan import finding_of
 from deepaccident_devkit.taxonomy import (
     BEV_CAMERA,
@@ -32,108 +31,124 @@ from deepaccident_devkit.taxonomy import (
     OWN_ACTOR_ID,
 )
 from deepaccident_devkit.validation.inventory import Inventory
-from deepaccident_devkit.validation.subject import MAX_LABEL_BOXES, Subject, frames_text
+from deepaccident_devkit.validation.subject import (
+    CAR_CODES,
+    MAX_LABEL_BOXES,
+    Findings,
+    Subject,
+    frames_text,
+)
 
-MIN_ZERO_BYTES: Final = 64
-"""Zero bytes in a row that are a fault."""
-# Markers of a scan's header and of the picture's end; coded data hold neither.
-_SCAN_MARKER: Final = b"\xff\xda"
-_END_MARKER: Final = b"\xff\xd9"
-# In a JPEG's header, the number of codes of each length for grey's AC coefficients; nearly all
-# encoders write these.
-_STANDARD_CODES: Final = bytes.fromhex("100002010303020403050504040000017d")
-# The brightness that decoders give to blocks with missing data, 128, within rounding.
-_MISSING_BRIGHTNESS: Final = (126.0, 130.0)
-# Shares of red, green and blue in the brightness.
-_BRIGHTNESS_SHARES: Final = (0.299, 0.587, 0.114)
-# Data that a decoder of a complete picture does not read.
-_SURPLUS_DATA: Final = bytes(range(1, 251)) * 40
+MIN_ZERO_BYTES = 64
+"""Number of consecutive zero bytes that counts as a fault."""
+# Markers of a scan's header and of the image's end; neither occurs in coded data.
+_SCAN_MARKER = b"\xff\xda"
+_END_MARKER = b"\xff\xd9"
+# Number of codes of each length for the AC coefficients of luminance, as in a JPEG's header. Nearly
+# all encoders write these.
+_STANDARD_CODES = bytes.fromhex("100002010303020403050504040000017d")
+# Luminance that decoders give to blocks with missing data: 128, up to rounding.
+_MISSING_BRIGHTNESS = (126.0, 130.0)
+# Weights of red, green and blue in the luminance.
+_BRIGHTNESS_SHARES = (0.299, 0.587, 0.114)
+# Data that a decoder ignores after a complete image.
+_SURPLUS_DATA = bytes(range(1, 251)) * 40
+# Channel → kind of its files; camera channels have images.
 _KINDS: dict[str, FileKind] = {LIDAR: "lidar", BEV_CAMERA: "bev"}
 LIDAR_RANGE_M = 75.0
-"""Range of coordinates in a cloud; the real LiDAR ends at 70."""
+"""Largest coordinate in a point cloud; it reaches 70 in real data."""
 POINT_COUNT_TOLERANCE = (5, 0.25)
-"""Difference of a box's count from its cloud, in points and as a share of them.
+"""Largest error of a box's point count against its cloud: in points, and as a share of them.
 
-Label and cloud are not of exactly one instant, and real cars are off by up to 12 points, or 24 % of
-a few.
+Label and cloud are not from exactly the same time: counts of real cars are off by up to 12 points,
+or by 24 % of a few points.
 """
 WALKER_POINT_COUNT_TOLERANCE = (30, 0.25)
-"""The same for pedestrians; real boxes change their size between the count and the label."""
-# Points by which a single box may be off, and a pedestrian's: the release has 77 for 55, and 486
-# for 260.
+"""Largest error for pedestrians, whose real boxes change size between the count and the label."""
+# Error in points above which a single box counts as wrong, for other classes and for pedestrians.
+# The worst in the release are 77 instead of 55, and 486 instead of 260.
 _BOX_POINT_TOLERANCE = (25, 300)
-# Boxes of one label, and their share of its boxes with points, that are off if the cloud belongs to
-# another label.
+# Fewest wrong boxes in a label, and smallest share of its boxes with points, that show that the
+# cloud belongs to another label.
 _FRAME_MISCOUNTS = (2, 0.25)
-# The same for all labels of an agent; in the release up to 7.5 % of an agent's boxes are off.
+# Limits over all labels of an agent; in the release, up to 7.5 % of an agent's boxes are wrong.
 _AGENT_MISCOUNTS = (3, 0.15)
 _BEV_HALF_WIDTH_M = 55.0
-_VEHICLES = tuple(CATEGORIES.index(name) for name in ("car", "truck", "van"))
+
+# Smallest share of vehicles that have the vehicle tag at their centre.
 _MIN_BEV_SHARE = 0.5
+# Width and height in pixels.
 _THUMBNAIL_SIZE = (32, 18)
-# Ratio of an image's distance from its neighbours in time to their distance from each other.
+# Largest ratio between an image's distance from its neighbours in time and their distance from each
+# other.
 _MAX_DISTANCE_RATIO = 3.0
-# Grey levels; images with a smaller difference look the same.
+# Difference in grey levels below which two images look the same.
 _MIN_DIFFERENCE = 6.0
-# Grey levels between the darkest and the lightest spot of a picture with content.
+# Smallest difference in grey levels between the darkest and lightest spot of an image with content.
 _MIN_CONTRAST = 40.0
-# Distance that an agent may move while its pictures stay the same.
+# Distance that an agent may move while its images stay the same.
 _STANDSTILL_TOLERANCE_M = 0.02
+# Agent, channel and frame of a file.
+_Recording = tuple[str, str, int]
 PICTURE_ORIENTATIONS: dict[str, str] = {
-    "forward-up": "as the format says",
-    "mirrored": "left and right exchanged",
-    "backward-up": "turned by half",
-    "mirrored-backward": "front and rear exchanged",
-    "left-up": "turned by a quarter, left up",
-    "right-up": "turned by a quarter, right up",
-    "transposed": "rows and columns exchanged",
-    "anti-transposed": "rows and columns exchanged, and turned by half",
+    "forward-up": "as the format defines",
+    "mirrored": "left and right swapped",
+    "backward-up": "rotated by 180°",
+    "mirrored-backward": "front and rear swapped",
+    "left-up": "rotated by 90°, left up",
+    "right-up": "rotated by 90°, right up",
+    "transposed": "rows and columns swapped",
+    "anti-transposed": "rows and columns swapped, and rotated by 180°",
 }
-"""The eight possible orientations of the BEV camera's picture."""
+"""The eight possible orientations of the BEV camera's image."""
 
 
 def zero_stretch(content: bytes) -> tuple[int, int] | None:
-    """Return offset and length of zero bytes in a JPEG's picture data that no encoder writes.
+    """Find a run of zero bytes in a JPEG's data that no encoder writes; return offset and length.
 
-    None is returned without any. With the standard codes, zero bits are coefficients that are
-    negative one after the other up to a block's end. `MIN_ZERO_BYTES` bytes hold several such
-    blocks, which no picture has. In codes made for one picture they can be an even surface, and
-    count as correct.
+    Return None if there is none. With the standard codes, zero bits mean coefficients that are all
+    negative up to the end of a block. `MIN_ZERO_BYTES` bytes contain several such blocks, which do
+    not occur in images. With codes made for one image, they may be a uniform area, and are
+    accepted.
     """
     start, stop = _last_scan(content)
     if content.find(_STANDARD_CODES, 0, start) < 0:
         return None
-    zeros = content.find(bytes(MIN_ZERO_BYTES), start, stop)
-    if zeros < 0:
+    offset = content.find(bytes(MIN_ZERO_BYTES), start, stop)
+    if offset < 0:
         return None
-    data = content[zeros:stop]
-    return zeros, len(data) - len(data.lstrip(b"\0"))
+    data = content[offset:stop]
+    data_after_zeros = data.lstrip(b"\0")
+    return offset, len(data) - len(data_after_zeros)
 
 
 def ends_early(content: bytes, image: ByteArray) -> bool:
-    """Return whether the coded data of a JPEG end before its picture (H, W, 3), which ends grey.
+    """Return whether a JPEG's coded data end before its decoded image (H, W, 3) is complete.
 
-    More data before the end then change the picture, which needs them.
+    The image then ends in grey, and changes if data are inserted before the end.
     """
     low, high = _MISSING_BRIGHTNESS
-    if not low < image[-1, -1] @ _BRIGHTNESS_SHARES < high:
+    brightness = image[-1, -1] @ _BRIGHTNESS_SHARES
+    if not low < brightness < high:
         return False
     start, stop = _last_scan(content)
-    # A 0xff at the end of the data would turn the bytes after it into a marker.
+    # A 0xff at the end of the data would turn the following bytes into a marker.
     data = content[:stop].rstrip(b"\xff")
-    longer = data + _SURPLUS_DATA + content[stop:]
-    return start > 0 and not np.array_equal(_decode_jpeg(longer), image)
+    longer_picture = _decode_jpeg(data + _SURPLUS_DATA + content[stop:])
+    return start > 0 and not np.array_equal(longer_picture, image)
 
 
 def _last_scan(content: bytes) -> tuple[int, int]:
-    """Return start and end of a JPEG's last scan; without a scan, 0 and the file's end."""
+    """Return the start and end of a JPEG's last scan; 0 and the file's end if it has none."""
     start = max(content.rfind(_SCAN_MARKER), 0)
     stop = content.find(_END_MARKER, start)
-    return start, stop if stop >= 0 else len(content)
+    if stop < 0:
+        stop = len(content)
+    return start, stop
 
 
 def _decode_jpeg(content: bytes) -> Any:
-    """Return the picture in a file's bytes, shape (H, W, 3); None if it is damaged."""
+    """Decode a file's bytes to an image (H, W, 3); None if they are damaged."""
     from PIL import Image
 
     try:
@@ -145,12 +160,12 @@ def _decode_jpeg(content: bytes) -> Any:
 
 @dataclass(slots=True)
 class _BevHits:
-    """Vehicles of one recording with the vehicle tag at their centre.
+    """How many vehicles in one recording have the vehicle tag at their centre.
 
     Attributes:
         boxes: Number of all vehicles.
-        hits: Orientation → vehicles with the tag.
-        poor_frames: Frames in which less than half of the vehicles have it.
+        hits: Orientation → number of vehicles with the tag.
+        poor_frames: Frames in which fewer than half of the vehicles have it.
     """
 
     boxes: int = 0
@@ -158,9 +173,9 @@ class _BevHits:
     poor_frames: list[int] = field(default_factory=list)
 
 
-def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
-    """Decode all sensor files of a scenario and compare them with its labels and calib files."""
-    checksums: dict[str, list[tuple[str, str, int]]] = defaultdict(list)
+def check_sensors(subject: Subject, inventory: Inventory) -> Findings:
+    """Decode a scenario's sensor files, and compare them with its labels and calib files."""
+    recordings: dict[str, list[_Recording]] = defaultdict(list)
     for (agent, channel), frames in inventory.items():
         paths = {}
         for frame in frames:
@@ -177,8 +192,8 @@ def check_sensors(subject: Subject, inventory: Inventory) -> Iterator[Finding]:
         for frame in usable_frames:
             content = read_bytes(paths[frame], _KINDS.get(channel, "image"))
             checksum = hashlib.blake2b(content, digest_size=16).hexdigest()
-            checksums[checksum].append((agent, channel, frame))
-    yield from _repeated_files(subject, checksums)
+            recordings[checksum].append((agent, channel, frame))
+    yield from _repeated_files(subject, recordings)
 
 
 def _check_images(
@@ -187,8 +202,11 @@ def _check_images(
     channel: str,
     paths: Mapping[int, ReleasePath],
     usable_frames: list[int],
-) -> Iterator[Finding]:
-    """Decode a camera's images; frames that show more than a wall or fog join `usable_frames`."""
+) -> Findings:
+    """Decode and check a camera's images.
+
+    Frames that show more than a wall or fog are appended to `usable_frames`.
+    """
     import cv2
 
     thumbnails: dict[int, FloatArray] = {}
@@ -211,100 +229,105 @@ def _check_images(
     for frame, thumbnail in thumbnails.items():
         if _has_content(thumbnail):
             usable_frames.append(frame)
-    odd = out_of_sequence(thumbnails)
-    # At the impact another car may suddenly fill the view.
-    if subject.num_frames in odd and _collides(subject, agent):
-        odd.remove(subject.num_frames)
-    if odd:
-        folder = subject.files.scenario.kind_folder(subject.agents[agent], channel)
-        message = f"does not fit between its neighbours, {frames_text(odd)}"
-        yield subject.finding("image-out-of-sequence", str(folder), message)
+    odd_frames = out_of_sequence(thumbnails)
+    # At the impact, another car may suddenly fill the image.
+    if subject.num_frames in odd_frames and _collides(subject, agent):
+        odd_frames.remove(subject.num_frames)
+    if odd_frames:
+        folder = subject.kind_folder(agent, channel)
+        message = f"does not fit between its neighbours, {frames_text(odd_frames)}"
+        yield subject.finding("image-out-of-sequence", folder, message)
 
 
 def _has_content(picture: FloatArray) -> bool:
-    """Return whether a picture (h, w, 3) shows more than an even surface."""
+    """Return whether an image (h, w, 3) shows more than a uniform surface."""
     contrast = np.ptp(picture, axis=(0, 1)).max()
     return bool(contrast >= _MIN_CONTRAST)
 
 
 def _lost_data_text(content: bytes, image: ByteArray) -> str | None:
-    """Return a sign that a picture lost data, though it can be decoded; None without any."""
+    """Describe how an image that can be decoded shows lost data; None if it does not."""
     zeros = zero_stretch(content)
     if zeros is not None:
         offset, length = zeros
-        text = f"holds {length} zero bytes in a row from byte {offset} on"
-        return f"{text}: part of the picture is lost"
+        text = f"contains {length:,} zero bytes in a row from byte {offset:,} on"
+        return f"{text}: part of the image is lost"
     if ends_early(content, image):
-        return "its data end early: the rest of the picture is lost"
+        return "the data end early: the rest of the image is lost"
     return None
 
 
 def _collides(subject: Subject, agent: int) -> bool:
-    """Return whether the agent belongs to the pair that meta names."""
-    own = subject.own & (subject.boxes.agent == agent)
-    return bool(subject.in_collision[own].any())
+    """Return whether meta names the agent as one of the colliders."""
+    is_own = subject.own & (subject.boxes.agent == agent)
+    return bool(subject.in_collision[is_own].any())
 
 
 def _check_image_sizes(
     subject: Subject, agent: int, channel: str, sizes: Mapping[int, tuple[int, int]]
-) -> Iterator[Finding]:
-    """Compare the size of every image with its K: it is twice the principal point."""
+) -> Findings:
+    """Compare the size of each image with K: it should be twice the principal point."""
     camera = CAMERAS.index(channel)
-    for frame, (width, height) in sizes.items():
-        intrinsic = subject.files.calibs.intrinsic[agent * subject.num_frames + frame - 1, camera]
-        expected = 2 * intrinsic[:2, 2]
-        if np.abs(expected - (width, height)).max() > 1:
+    for frame, size in sizes.items():
+        row = agent * subject.num_frames + frame - 1
+        principal_point = subject.files.calibs.intrinsic[row, camera, :2, 2]
+        expected = 2 * principal_point
+        difference = np.abs(expected - size)
+        if difference.max() > 1:
             path = subject.files.scenario.channel_path(subject.agents[agent], channel, frame)
-            message = f"is {width}x{height}, K says {expected[0]:.0f}x{expected[1]:.0f}"
+            message = f"is {size[0]}x{size[1]}, but K says {expected[0]:.0f}x{expected[1]:.0f}"
             yield subject.finding("image-size", str(path), message)
 
 
 def out_of_sequence(thumbnails: Mapping[int, FloatArray]) -> list[int]:
-    """Return frames with pictures (h, w, 3) that do not fit between their neighbours.
+    """Return the frames whose images (h, w, 3) do not fit between their neighbours.
 
-    They are much further from both neighbours than these are from each other. Neighbours are 0.1 s
-    apart: where frames are missing, a sequence ends. At an end, the distance of its one neighbour
-    is compared with that of the next step, unless the neighbour has no content: the obstacle in
-    view may just have gone.
+    Such an image is much farther from both neighbours than these are from each other. Neighbours
+    are 0.1 s apart; a missing frame ends a sequence. At its ends, the distance from the only
+    neighbour is compared with the distance of the next step. It is ignored if the neighbour has no
+    content: an obstacle may just have left the view.
     """
     frames = np.array(sorted(thumbnails), dtype=np.int64)
+    gaps = np.flatnonzero(np.diff(frames) != 1) + 1
     odd_frames = []
-    for sequence in np.split(frames, np.flatnonzero(np.diff(frames) != 1) + 1):
+    for sequence in np.split(frames, gaps):
         odd_frames += _odd_frames(sequence.tolist(), thumbnails)
     return odd_frames
 
 
 def _odd_frames(frames: Sequence[int], thumbnails: Mapping[int, FloatArray]) -> list[int]:
-    """Return the frames of one sequence without gaps that do not fit into it."""
+    """Return the frames of one unbroken sequence that do not fit into it."""
     if len(frames) < 3:
         return []
     pictures = np.stack([thumbnails[frame] for frame in frames])
     step = _picture_distance(pictures[1:], pictures[:-1])
     neighbour_distance = _picture_distance(pictures[2:], pictures[:-2])
-    odd = np.zeros(len(frames), dtype=bool)
     limit = np.maximum(_MAX_DISTANCE_RATIO * neighbour_distance, _MIN_DIFFERENCE)
-    odd[1:-1] = np.minimum(step[1:], step[:-1]) > limit
+    is_odd = np.zeros(len(frames), dtype=bool)
+    is_odd[1:-1] = np.minimum(step[1:], step[:-1]) > limit
     median_step = np.median(step)
     for end, neighbour, end_step, next_step in (
         (0, 1, step[0], step[1]),
         (-1, -2, step[-1], step[-2]),
     ):
-        comparable = not odd[neighbour] and _has_content(pictures[neighbour])
-        end_limit = max(_MAX_DISTANCE_RATIO * max(next_step, median_step), _MIN_DIFFERENCE)
-        odd[end] = comparable and end_step > end_limit
-    return [frame for frame, is_odd in zip(frames, odd.tolist(), strict=True) if is_odd]
+        is_comparable = not is_odd[neighbour] and _has_content(pictures[neighbour])
+        usual_step = max(next_step, median_step)
+        end_limit = max(_MAX_DISTANCE_RATIO * usual_step, _MIN_DIFFERENCE)
+        is_odd[end] = is_comparable and end_step > end_limit
+    return [frames[position] for position in np.flatnonzero(is_odd).tolist()]
 
 
-def _picture_distance(pictures: FloatArray, others: FloatArray) -> FloatArray:
-    difference = np.abs(pictures - others)
-    return np.asarray(difference.mean(axis=(1, 2, 3)))
+def _picture_distance(pictures: FloatArray, other_pictures: FloatArray) -> FloatArray:
+    difference = np.abs(pictures - other_pictures)
+    distance: FloatArray = difference.mean(axis=(1, 2, 3))
+    return distance
 
 
 def _check_clouds(
     subject: Subject, agent: int, paths: Mapping[int, ReleasePath], usable_frames: list[int]
-) -> Iterator[Finding]:
-    """Decode an agent's point clouds; readable frames join `usable_frames`."""
-    odd = []
+) -> Findings:
+    """Decode and check an agent's clouds; readable frames are appended to `usable_frames`."""
+    odd_frames = []
     miscounts = np.zeros((subject.num_frames + 1, 3), dtype=np.int64)
     for frame, path in paths.items():
         try:
@@ -314,69 +337,69 @@ def _check_clouds(
             yield finding_of(error, "sensor-unreadable", subject.token)
             continue
         usable_frames.append(frame)
-        finite = np.isfinite(points).all() and np.isfinite(cloud.intensity).all()
-        if not finite or (len(points) and np.abs(points).max() > LIDAR_RANGE_M):
-            odd.append(frame)
-        boxes = _sample_boxes(subject, agent, frame)
-        if 0 < len(boxes) <= MAX_LABEL_BOXES:
+        is_finite = np.isfinite(points).all() and np.isfinite(cloud.intensity).all()
+        if not is_finite or (len(points) and np.abs(points).max() > LIDAR_RANGE_M):
+            odd_frames.append(frame)
+        sample = agent * subject.num_frames + frame - 1
+        rows = np.flatnonzero(subject.boxes.sample == sample)
+        if 0 < len(rows) <= MAX_LABEL_BOXES:
+            boxes = subject.lidar_boxes.select(rows)
             miscounts[frame] = _count_miscounts(boxes, points)
-    folder = str(subject.files.scenario.kind_folder(subject.agents[agent], LIDAR))
-    if odd:
-        message = f"points that are no numbers, or beyond {LIDAR_RANGE_M:.0f} m"
-        yield subject.finding("points-odd", folder, f"{message}, {frames_text(odd)}")
-    foreign = _exceeds(miscounts, _FRAME_MISCOUNTS) | (miscounts[:, 2] > 0)
-    foreign |= _exceeds(miscounts.sum(axis=0), _AGENT_MISCOUNTS)
+    folder = subject.kind_folder(agent, LIDAR)
+    if odd_frames:
+        message = f"points that are not numbers, or beyond {LIDAR_RANGE_M:.0f} m"
+        yield subject.finding("points-odd", folder, f"{message}, {frames_text(odd_frames)}")
+    is_foreign = _exceeds(miscounts, _FRAME_MISCOUNTS) | (miscounts[:, 2] > 0)
+    is_foreign |= _exceeds(miscounts.sum(axis=0), _AGENT_MISCOUNTS)
     differs = miscounts[:, 0] > 0
     for code, mask in (
-        ("points-differ", foreign & differs),
-        ("box-points-differ", ~foreign & differs),
+        ("points-differ", is_foreign & differs),
+        ("box-points-differ", ~is_foreign & differs),
     ):
         if mask.any():
-            message = "boxes with other points than their labels count"
+            message = "boxes whose points differ from the count in their labels"
             message += f": {miscounts[mask, 0].sum()}, {frames_text(np.flatnonzero(mask))}"
             yield subject.finding(code, folder, message)
 
 
 def _count_miscounts(boxes: Boxes, points: FloatArray) -> tuple[int, int, int]:
-    """Return how many boxes of a label hold other points than it counts.
+    """Count the boxes of a label that contain other numbers of points than it states.
 
-    A cloud of another frame, agent or location changes the counts of many boxes; the release is off
-    in single boxes.
+    In a cloud of another frame, agent or place, many counts differ. In the release, the counts of
+    single boxes are wrong.
 
     Returns:
-        Boxes that are off, boxes that could show it, and boxes that are off enough to show it on
-        their own.
+        Numbers of boxes with a wrong count, of boxes that could show it, and of boxes so wrong that
+        one is enough.
     """
-    counted = boxes.count_points(points)
-    max_count = np.maximum(counted, boxes.num_lidar_pts)
+    counted_points = boxes.count_points(points)
+    max_count = np.maximum(counted_points, boxes.num_lidar_pts)
     is_walker = boxes.category == CATEGORIES.index("pedestrian")
     tolerances = np.where(is_walker[:, None], WALKER_POINT_COUNT_TOLERANCE, POINT_COUNT_TOLERANCE)
     min_points, share = tolerances.T
-    difference = np.abs(counted - boxes.num_lidar_pts)
-    wrong = difference > np.maximum(min_points, share * max_count)
+    difference = np.abs(counted_points - boxes.num_lidar_pts)
+    is_wrong = difference > np.maximum(min_points, share * max_count)
+    is_judged = max_count > min_points
     box_tolerance, walker_tolerance = _BOX_POINT_TOLERANCE
-    large = difference > np.where(is_walker, walker_tolerance, box_tolerance)
-    return int(wrong.sum()), int((max_count > min_points).sum()), int((wrong & large).sum())
+    is_large = difference > np.where(is_walker, walker_tolerance, box_tolerance)
+    is_decisive = is_wrong & is_large
+    return int(is_wrong.sum()), int(is_judged.sum()), int(is_decisive.sum())
 
 
 def _exceeds(miscounts: IntArray, limit: tuple[int, float]) -> BoolArray:
-    """Return whether counts (…, 3) of `_count_miscounts` reach a number and a share, shape (…)."""
-    number, share = limit
-    wrong = miscounts[..., 0]
-    return np.asarray((wrong >= number) & (wrong >= share * miscounts[..., 1]))
-
-
-def _sample_boxes(subject: Subject, agent: int, frame: int) -> Boxes:
-    """Return the boxes of one label in its LiDAR frame."""
-    sample = agent * subject.num_frames + frame - 1
-    rows = np.flatnonzero(subject.boxes.sample == sample)
-    return subject.lidar_boxes.select(rows)
+    """Return whether `_count_miscounts` (…, 3) reaches both a number and a share, shape (…)."""
+    min_number, min_share = limit
+    wrong_counts = miscounts[..., 0]
+    judged_counts = miscounts[..., 1]
+    has_number = wrong_counts >= min_number
+    has_share = wrong_counts >= min_share * judged_counts
+    return has_number & has_share
 
 
 def _check_bevs(
     subject: Subject, agent: int, paths: Mapping[int, ReleasePath], usable_frames: list[int]
-) -> Iterator[Finding]:
-    """Decode an agent's BEV arrays; readable frames join `usable_frames`."""
+) -> Findings:
+    """Decode and check an agent's BEV arrays; readable frames are appended to `usable_frames`."""
     total = _BevHits()
     for frame, path in paths.items():
         try:
@@ -386,45 +409,53 @@ def _check_bevs(
             continue
         usable_frames.append(frame)
         _count_bev_hits(total, semantic, _vehicle_centers(subject, agent, frame), frame)
-    folder = str(subject.files.scenario.kind_folder(subject.agents[agent], BEV_CAMERA))
-    best = max(total.hits, key=lambda name: total.hits[name])
-    best_hits = total.hits[best]
+    folder = subject.kind_folder(agent, BEV_CAMERA)
+    best_orientation = max(total.hits, key=lambda name: total.hits[name])
+    best_hits = total.hits[best_orientation]
     forward_hits = total.hits["forward-up"]
     if total.boxes and best_hits > forward_hits + max(2, 0.25 * total.boxes):
-        message = f"{best_hits} of {total.boxes} vehicles are where the labels have them if it is"
-        message += f" '{best}' ({PICTURE_ORIENTATIONS[best]}), {forward_hits} if forward is up"
+        message = (
+            f"{best_hits} of {total.boxes} vehicles are where the labels put them if the picture is"
+        )
+        meaning = PICTURE_ORIENTATIONS[best_orientation]
+        message += f" '{best_orientation}' ({meaning}), {forward_hits} if forward is up"
         yield subject.finding("bev-orientation", folder, message)
     elif total.poor_frames:
-        message = "fewer than half of the labels' vehicles are in the picture"
+        message = "fewer than half of the labelled vehicles are in the picture"
         yield subject.finding("bev-differs", folder, f"{message}, {frames_text(total.poor_frames)}")
 
 
 def _count_bev_hits(total: _BevHits, semantic: ByteArray, centers: FloatArray, frame: int) -> None:
-    """Add the vehicles of one frame to the hits of its recording."""
+    """Add the vehicles in one frame to the counts of its recording."""
     if not len(centers):
         return
     total.boxes += len(centers)
     for name in PICTURE_ORIENTATIONS:
-        hits = _find_hits(semantic, _turn_picture(centers, name))
+        hits = _find_hits(semantic, _turn_centers(centers, name))
         total.hits[name] += int(hits.sum())
         if name == "forward-up" and len(centers) > 2 and hits.mean() < _MIN_BEV_SHARE:
             total.poor_frames.append(frame)
 
 
 def _vehicle_centers(subject: Subject, agent: int, frame: int) -> FloatArray:
-    """Return centres (M, 2) of vehicles in the BEV camera's view, forward and left, metres."""
+    """Return the centres of other vehicles in the BEV camera's view in metres, shape (M, 2).
+
+    The columns are forward and left.
+    """
     sample = agent * subject.num_frames + frame - 1
     boxes = subject.boxes
-    is_vehicle = np.isin(boxes.labels.category, _VEHICLES) & (subject.label_id != OWN_ACTOR_ID)
-    rows = np.flatnonzero((boxes.sample == sample) & is_vehicle)
+    is_vehicle = np.isin(boxes.labels.category, CAR_CODES)
+    is_other = subject.label_id != OWN_ACTOR_ID
+    rows = np.flatnonzero((boxes.sample == sample) & is_vehicle & is_other)
     centers: FloatArray = boxes.labels.center[rows, :2]
-    return centers[(np.abs(centers) < _BEV_HALF_WIDTH_M).all(axis=1)]
+    is_in_view = (np.abs(centers) < _BEV_HALF_WIDTH_M).all(axis=1)
+    return centers[is_in_view]
 
 
-def _turn_picture(centers: FloatArray, orientation: str) -> FloatArray:
-    """Return where centres (M, 2), forward and left, lie in a picture of another orientation.
+def _turn_centers(centers: FloatArray, orientation: str) -> FloatArray:
+    """Turn centres (M, 2) so that `_find_hits` finds them in a BEV image with this orientation.
 
-    The result is forward and left as well, as if forward were up.
+    Centres are forward and left coordinates. `_find_hits` assumes that forward is up.
     """
     x, y = centers.T
     turned = {
@@ -441,31 +472,35 @@ def _turn_picture(centers: FloatArray, orientation: str) -> FloatArray:
 
 
 def _find_hits(semantic: ByteArray, centers: FloatArray) -> BoolArray:
-    """Return a mask (M,) of centres (M, 2) in cells with the vehicle tag."""
+    """Return which centres (M, 2) are in cells with the vehicle tag, shape (M,)."""
     middle = (BEV_SHAPE[0] - 1) / 2
     pixels: IntArray = np.rint(middle - centers / BEV_RESOLUTION).astype(np.int64)
     row, column = pixels.T
-    tags = semantic[row, column]
-    return np.asarray(tags == TAGS["vehicle"])
+    is_hit: BoolArray = semantic[row, column] == TAGS["vehicle"]
+    return is_hit
 
 
 def _repeated_files(
-    subject: Subject, checksums: Mapping[str, Sequence[tuple[str, str, int]]]
-) -> Iterator[Finding]:
-    """Yield files with the same bytes; an agent that stands still may record them repeatedly."""
-    for recordings in checksums.values():
+    subject: Subject, recordings_by_checksum: Mapping[str, Sequence[_Recording]]
+) -> Findings:
+    """Yield a finding for files with identical bytes.
+
+    An agent that stands still may record such files repeatedly.
+    """
+    for recordings in recordings_by_checksum.values():
         if len(recordings) < 2 or _stood_still(subject, recordings):
             continue
         names = [f"{agent}/{channel}/{frame:03d}" for agent, channel, frame in recordings]
-        listed = ", ".join(names[:4])
+        listed_files = ", ".join(names[:4])
         if len(names) > 4:
-            listed += f" and {len(names) - 4} more"
-        yield subject.finding("file-repeated", subject.token, f"the same bytes: {listed}")
+            listed_files += f" and {len(names) - 4} more"
+        yield subject.finding("file-repeated", subject.token, f"identical files: {listed_files}")
 
 
-def _stood_still(subject: Subject, recordings: Sequence[tuple[str, str, int]]) -> bool:
-    """Return whether they are one channel of an agent that did not move between the frames."""
-    if len({(agent, channel) for agent, channel, _ in recordings}) > 1:
+def _stood_still(subject: Subject, recordings: Sequence[_Recording]) -> bool:
+    """Return whether all files are from one channel of an agent that did not move in between."""
+    channels = {(agent, channel) for agent, channel, _ in recordings}
+    if len(channels) > 1:
         return False
     frames: AnyArray = np.array([frame for _, _, frame in recordings])
     agent = subject.agents.index(recordings[0][0])

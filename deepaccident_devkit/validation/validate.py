@@ -1,4 +1,4 @@
-"""`validate`: all checks of a release, and the report of their findings."""
+"""`validate`: runs all checks on a release, and reports their findings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, IndexStoreError, ReleaseError
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
-from deepaccident_devkit.release.layout import left_aside, names_without_calib
+from deepaccident_devkit.release.layout import find_ignored_paths, names_without_calib
 from deepaccident_devkit.release.store import (
     Dataroot,
     StorePath,
@@ -56,7 +56,7 @@ from deepaccident_devkit.validation.inventory import absences, check_split_files
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses, check_untracked, check_velocities
 from deepaccident_devkit.validation.sensors import check_sensors
-from deepaccident_devkit.validation.subject import make_finding, subject_of
+from deepaccident_devkit.validation.subject import Findings, make_finding, subject_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -64,9 +64,11 @@ if TYPE_CHECKING:
     from deepaccident_devkit.support.parallel import Engine
 
 NO_FIT = total_fit([])
+"""The velocity fit of a release without velocities."""
+# Largest number of findings per scenario that the text lists.
 _MAX_SCENARIO_LINES = 8
 _ALL_LISTED_HINT = "(--all lists all)"
-# Names during a download: with `.part`, `.partial`, `.download` or `.crdownload` at their end.
+# Names of unfinished downloads: they end with `.part`, `.partial`, `.download` or `.crdownload`.
 _UNFINISHED_PATTERN = "*.zip.[cdp]*[dlt]"
 # Kinds of files that are always read.
 _SMALL_KINDS = ("calib", "label", "meta")
@@ -74,15 +76,15 @@ _SMALL_KINDS = ("calib", "label", "meta")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioCheck:
-    """Findings of one scenario.
+    """The findings about one scenario.
 
     Attributes:
         token: Token of the scenario.
-        findings: Findings in the order of the checks.
-        samples: Number of agents times frames.
+        findings: Findings, in the order of the checks.
+        samples: Number of samples (agents × frames).
         files: Present and missing files.
         velocity: Fit of the labels' velocities.
-        hashes: Hashes of the files (`tables.scan.content_hashes`); empty if they cannot be read.
+        hashes: Hashes of the files (`tables.scan.content_hashes`); empty if they are unreadable.
     """
 
     token: str
@@ -93,20 +95,21 @@ class ScenarioCheck:
     hashes: str = ""
 
     def to_json(self) -> str:
-        """Return one JSON object that `of_json` turns into an equal check."""
+        """Return the check as a JSON object that `of_json` reads."""
         return json.dumps(asdict(self))
 
     @classmethod
     def of_json(cls, text: bytes) -> ScenarioCheck:
-        """Return the check that `to_json` wrote."""
-        # `json.loads` keeps lone surrogates, which names of files may have.
-        return as_record(json.loads(text), cls)
+        """Rebuild a check from what `to_json` wrote."""
+        # `json.loads` accepts lone surrogates, which file names may contain.
+        values = json.loads(text)
+        return as_record(values, cls)
 
 
 def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
-    """Return a digest of all that decides a scenario's check.
+    """Return a digest of everything that determines the check of a scenario.
 
-    These are the devkit, its settings, and names, sizes and times of the scenario's files.
+    This is the devkit, the settings, and the names, sizes and times of the scenario's files.
     """
     settings = (
         __version__,
@@ -121,18 +124,18 @@ def check_key(scenario: ScenarioFolder, *, deep: bool) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidationReport(CheckReport):
-    """Findings of a release.
+    """The findings about a release.
 
     Attributes:
         dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
         deep: Whether sensor files were decoded.
         scenarios: Number of scenarios examined.
-        samples: Number of their samples, agents times frames.
-        findings: Findings, worst scenario first, and worst first within it.
+        samples: Number of their samples (agents × frames).
+        findings: Findings, sorted by scenario (worst first), then by severity (worst first).
         files: Present and missing files.
-        velocity: Frame in which the labels' velocities fit the displacements.
-        velocity_frames: Scenario → frame of its labels' velocities; None where it is unknown.
+        velocity: Frame in which the labels' velocities best fit the displacements.
+        velocity_frames: Scenario → frame of its labels' velocities; None if unknown.
     """
 
     dataroot: str
@@ -147,20 +150,20 @@ class ValidationReport(CheckReport):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of findings by severity."""
+        """Number of findings of each severity."""
         counts = Counter(finding.severity for finding in self.findings)
         return {severity: counts[severity] for severity in SEVERITIES}
 
     @property
     def is_good(self) -> bool:
-        """Whether all findings are notes, or known of the real release."""
+        """Whether every finding is a note, or also known in the real release."""
         for finding in self.findings:
             if finding.severity != "note" and not finding.known:
                 return False
         return True
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
+        """Return the report as a dictionary for JSON."""
         # `super()` fails: a dataclass with slots is another class than its body refers to.
         content = Report.to_dict(self)
         content["counts"] = self.counts
@@ -168,20 +171,23 @@ class ValidationReport(CheckReport):
         return content
 
     def to_text(self, *, notes: bool = False, whole: bool = False) -> str:
-        """Return a table for a terminal, worst scenario first.
+        """Format the findings for a terminal, worst scenario first.
 
         Args:
-            notes: Whether to list findings of severity `note`, too.
+            notes: Whether to list findings of severity `note` as well.
             whole: Whether to list all findings of a scenario.
         """
-        max_lines = sys.maxsize if whole else _MAX_SCENARIO_LINES
-        blocks = [self._head(), *self._scenario_blocks(max_lines, notes=notes)]
-        return "\n\n".join([*blocks, *self._closing(notes=notes)])
+        max_lines = _MAX_SCENARIO_LINES
+        if whole:
+            max_lines = sys.maxsize
+        scenario_blocks = self._scenario_blocks(max_lines, notes=notes)
+        closing_blocks = self._closing_blocks(notes=notes)
+        return "\n\n".join([self._heading(), *scenario_blocks, *closing_blocks])
 
-    def _head(self) -> str:
-        depth = "labels, calib, meta and file names (--deep decodes the rest)"
+    def _heading(self) -> str:
+        depth = "checked labels, calib, meta and file names (--deep decodes all files)"
         if self.deep:
-            depth = "every file decoded"
+            depth = "decoded every file"
         return (
             f"DeepAccident {self.version} at {self.dataroot}\n"
             f"{counted(self.scenarios, 'scenario')}, {counted(self.samples, 'sample')}: {depth}"
@@ -194,15 +200,17 @@ class ValidationReport(CheckReport):
                 by_scenario.setdefault(finding.scenario, []).append(finding)
         for scenario, findings in by_scenario.items():
             counts = Counter(finding.severity for finding in findings)
-            present = [severity for severity in SEVERITIES if counts[severity]]
-            summary = ", ".join(counted(counts[severity], severity) for severity in present)
+            present_severities = [severity for severity in SEVERITIES if counts[severity]]
+            summary = ", ".join(
+                counted(counts[severity], severity) for severity in present_severities
+            )
             lines = [f"{scenario or 'the release'}  ({summary})"]
             lines += map(_finding_line, findings[:max_lines])
             if len(findings) > max_lines:
                 lines.append(f"  … and {len(findings) - max_lines} more {_ALL_LISTED_HINT}")
             yield "\n".join(lines)
 
-    def _closing(self, *, notes: bool) -> Iterator[str]:
+    def _closing_blocks(self, *, notes: bool) -> Iterator[str]:
         if self.findings:
             yield self._kinds_text()
         if self.velocity.boxes:
@@ -215,45 +223,55 @@ class ValidationReport(CheckReport):
         yield verdict
 
     def _kinds_text(self) -> str:
-        """Return a line a kind of finding: by severity, then the most frequent first."""
+        """Return a line per kind of finding, by severity, the most frequent first."""
         kinds = [(finding.severity, finding.code, finding.known) for finding in self.findings]
         counts = sorted(Counter(kinds).items(), key=lambda item: (-item[1], item[0][1]))
-        lines = [f"{'kind':<24} {'how bad':<8} {'findings':>8}"]
+        lines = [f"{'finding':<24} {'severity':<8} {'count':>8}"]
         for listed_severity in SEVERITIES:
-            for (severity, code, known), count in counts:
+            for (severity, code, is_known), count in counts:
                 if severity == listed_severity:
-                    note = "  known of the release" if known else ""
+                    note = "  known in the real release" if is_known else ""
                     lines.append(f"{code:<24} {severity:<8} {count:>8}{note}")
         return "\n".join(lines)
 
     def _velocity_text(self) -> str:
-        """Return the frame of the labels' velocities, and how many scenarios and boxes fit."""
+        """Describe the frame of the labels' velocities, and how many scenarios and boxes fit it."""
         fit = self.velocity
-        best = VELOCITY_FRAMES[fit.best] if fit.best else "in none of the known frames"
+        best_frame = "in none of the known frames"
+        if fit.best:
+            best_frame = VELOCITY_FRAMES[fit.best]
         counts = Counter(self.velocity_frames.values()).most_common()
-        scenarios = ", ".join(f"{name or 'unknown'} in {count}" for name, count in counts)
+        scenarios = ", ".join(
+            f"{name or 'unknown'} in {counted(count, 'scenario')}" for name, count in counts
+        )
         shares = ", ".join(f"{name} {count / fit.boxes:.0%}" for name, count in fit.fits.items())
         return (
-            f"label velocities: {best}\n"
-            f"  scenarios: {scenarios}; of {fit.boxes:,} moving boxes fit: {shares}"
+            f"label velocities: {best_frame}\n"
+            f"  {scenarios}; share of the {fit.boxes:,} moving boxes that fit: {shares}"
         )
 
 
 def worst_first(findings: Sequence[Finding]) -> list[Finding]:
-    """Return findings by scenario, most errors first, then most warnings; worst first within."""
+    """Sort findings by scenario; the ones with the most errors, then warnings, come first.
+
+    Within a scenario, the worst finding comes first.
+    """
     counts = Counter((finding.scenario, finding.severity) for finding in findings)
 
     def sort_key(finding: Finding) -> tuple[object, ...]:
-        badness = [-counts[finding.scenario, severity] for severity in SEVERITIES]
+        scenario = finding.scenario
+        badness = [-counts[scenario, severity] for severity in SEVERITIES]
         rank = SEVERITIES.index(finding.severity)
-        return (finding.scenario is not None, badness, finding.scenario or "", rank)
+        return (scenario is not None, badness, scenario or "", rank)
 
     return sorted(findings, key=sort_key)
 
 
 def _finding_line(finding: Finding) -> str:
-    known = " (known of the release)" if finding.known else ""
-    return f"  {finding.severity:<7} {finding.code}: {finding}{known}"
+    note = ""
+    if finding.known:
+        note = " (known in the real release)"
+    return f"  {finding.severity:<7} {finding.code}: {finding}{note}"
 
 
 def validate_release(
@@ -267,55 +285,60 @@ def validate_release(
 ) -> ValidationReport:
     """Find everything that is wrong, odd or missing in a release.
 
-    No index is needed; one that is out of date is reported.
+    No index is needed; if there is an outdated one, it is reported.
 
     Args:
         root: Dataroot of the release, as for `DeepAccident`: a folder, archives, or a URL.
         version: `v1` or `v1-mini`.
-        deep: Whether to decode every image, point cloud and BEV array, too, and compare it with the
-            labels.
+        deep: Whether to also decode every image, point cloud and BEV array, and to compare it with
+            the labels.
         scenarios: Tokens of the scenarios to examine; None for all.
-        parts: Folder that keeps the findings of each scenario. The same call then only does the
-            remaining work, and several processes with the same folder share the scenarios; one with
-            changed files is examined again. None writes nothing.
+        parts: Folder in which the findings of each scenario are stored. Repeating the call only
+            does the remaining work, and several processes can share it. Scenarios whose files have
+            changed are examined again. With None, nothing is stored.
         **engine: `workers`, `executor` and `progress` (`parallel.Engine`).
 
     Raises:
-        DatarootError: The folder is missing, holds no release, or a part of it cannot be listed.
-        VersionError: The version is unknown or not under this folder.
-        TokenError: A token of `scenarios` is not in the release.
-        ConfigError: `parts` cannot be written to.
+        DatarootError: If the folder is missing or contains no release, or part of it
+            cannot be listed.
+        VersionError: If the version is unknown, or not in this folder.
+        TokenError: If a token of `scenarios` is not in the release.
+        ConfigError: If `parts` cannot be written to.
     """
     layout = readable_release(root, version)
-    folder = None if parts is None else writable_folder(parts)
-    store = None if folder is None else Store(folder, folder, "validates scenarios", ConfigError)
-    checks = _Work(deep=deep, store=store).run(chosen_scenarios(layout, scenarios), **engine)
-    return _report(layout, checks, scenarios, root=root, deep=deep)
+    store = None
+    if parts is not None:
+        folder = writable_folder(parts)
+        store = Store(folder, folder, "is validating scenarios", ConfigError)
+    folders = chosen_scenarios(layout, scenarios)
+    checks = _ScenarioChecker(deep=deep, store=store).run(folders, **engine)
+    return _make_report(layout, checks, scenarios, root=root, deep=deep)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Work:
-    """Work on scenarios, cheap to pickle.
+class _ScenarioChecker:
+    """Checks scenarios; cheap to pickle.
 
     Attributes:
         deep: Whether sensor files are decoded.
-        store: Findings of earlier calls, and of this one.
+        store: Findings of this call and earlier ones; None to store nothing.
     """
 
     deep: bool
     store: Store | None
 
     def __call__(self, scenario: ScenarioFolder) -> ScenarioCheck:
-        """Check one scenario, unless its check is stored."""
+        """Check one scenario, unless its findings are stored."""
         if self.store is None:
             return check_scenario(scenario, deep=self.deep)
-        # The key is made before any file is read, so that a later edit changes it.
+        # The key is computed before any file is read, so that later edits change it.
         key = check_key(scenario, deep=self.deep)
-        stored = self.store.kept(_name(scenario), key)
+        name = _store_name(scenario)
+        stored = self.store.read_result(name, key)
         if stored is not None:
             return ScenarioCheck.of_json(stored)
         check = check_scenario(scenario, deep=self.deep)
-        self.store.keep(_name(scenario), key, check.to_json().encode())
+        self.store.write_result(name, key, check.to_json().encode())
         return check
 
     def run(
@@ -323,21 +346,22 @@ class _Work:
     ) -> list[ScenarioCheck]:
         """Check all scenarios."""
         reads = tuple({path for scenario in scenarios for path in places_of(scenario.root)})
-        label = "validating scenarios"
+        label = "Validating scenarios"
         if self.store is None:
             return run_batch(self, scenarios, label=label, places=Places(reads=reads), **engine)
         with self.store.shared():
             places = Places(reads=reads, writes=(self.store.folder,))
-            items = {_name(scenario): scenario for scenario in scenarios}
+            items = {_store_name(scenario): scenario for scenario in scenarios}
             checks = self.store.run(self, items, label=label, places=places, **engine)
             return list(checks.values())
 
 
-def _name(scenario: ScenarioFolder) -> str:
-    return Path(scenario.folder, scenario.token).as_posix()
+def _store_name(scenario: ScenarioFolder) -> str:
+    path = Path(scenario.folder, scenario.token)
+    return path.as_posix()
 
 
-def _report(
+def _make_report(
     layout: ReleaseLayout,
     checks: Sequence[ScenarioCheck],
     scenarios: Collection[str] | None,
@@ -345,7 +369,7 @@ def _report(
     root: Dataroot,
     deep: bool,
 ) -> ValidationReport:
-    """Return the report of the scenarios' checks, and of findings in the release itself."""
+    """Build the report from the scenarios' checks, and find faults of the release itself."""
     readable, split_findings = check_split_files(layout)
     tokens = {None, *(check.token for check in checks)}
     all_findings = [finding for finding in split_findings if finding.scenario in tokens]
@@ -378,12 +402,12 @@ def _report(
 
 
 def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> list[Finding]:
-    """Return what is wrong, odd or missing in one scenario's present files, worst first.
+    """Find what is wrong, odd or missing in one scenario's present files; worst first.
 
     Args:
-        dataset: Release with the scenario.
-        scenario: Token or record, also of a scenario that was left out as broken.
-        deep: Whether to decode its sensor files, too; see `validate_release`.
+        dataset: Release that contains the scenario.
+        scenario: Token or record; the scenario may have been left out as broken.
+        deep: Whether to decode its sensor files as well; see `validate_release`.
 
     Raises:
         TokenError: The release has no such scenario.
@@ -397,10 +421,10 @@ def findings(dataset: Dataset, scenario: RowArgument, *, deep: bool = False) -> 
 
 @checksums_compared()
 def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioCheck:
-    """Return all findings in one scenario's files.
+    """Find everything that is wrong in one scenario's files.
 
-    The functions that index a scenario find what keeps it from being indexed. The content of its
-    files is only checked if they find nothing.
+    First, the functions that index a scenario report what prevents indexing. The content of the
+    files is checked only if they report nothing.
     """
     scan = scan_scenario(scenario)
     inventory, sensor_findings = take_inventory(scenario, scan)
@@ -411,7 +435,7 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
         scenario_findings += faults
     velocity = NO_FIT
     if files is not None:
-        # Absurd numbers are what the checks look for.
+        # The checks look for absurd numbers, which may overflow here.
         with np.errstate(all="ignore"):
             subject = subject_of(files)
             velocity = fit_velocities(subject.boxes, subject.velocity)
@@ -433,35 +457,35 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
     )
 
 
-def _find_outdated(layout: ReleaseLayout, checks: Sequence[ScenarioCheck]) -> Iterator[Finding]:
-    """Yield scenarios with other files than the index was made from."""
+def _find_outdated(layout: ReleaseLayout, checks: Sequence[ScenarioCheck]) -> Findings:
+    """Yield a finding for each scenario whose files differ from the ones that were indexed."""
     index = current_index(layout)
     if index is None or not index.tables:
         return
-    # Opening the release reports a damaged index.
+    # A damaged index is reported when the release is opened.
     with suppress(IndexStoreError):
         indexed = Tables(index.tables_folder).hashes
         for check in checks:
-            before = indexed.get(check.token)
-            if check.hashes and before and before.as_dict() != json.loads(check.hashes):
-                message = "its label, calib or meta files have changed since the index was made"
+            hashes = indexed.get(check.token)
+            if check.hashes and hashes and hashes.as_dict() != json.loads(check.hashes):
+                message = "its label, calib or meta files have changed since it was indexed"
                 yield make_finding("index-outdated", check.token, check.token, message)
 
 
-def _find_strays(layout: ReleaseLayout) -> Iterator[Finding]:
-    """Yield files and folders that are not read, though they look like parts of a release."""
+def _find_strays(layout: ReleaseLayout) -> Findings:
+    """Yield findings about files and folders that look like parts of a release but are unused."""
     for folder, name in names_without_calib(layout):
         location = str(folder / "*" / "calib" / name)
-        message = "has labels, meta or sensor files, but no calib files of any agent"
-        yield make_finding("calib-missing", None, location, f"{message}, and is left out")
-    for path, likeness in left_aside(layout.root):
+        message = "has labels, meta or sensor files but no calib files, and is excluded"
+        yield make_finding("calib-missing", None, location, message)
+    for path, likeness in find_ignored_paths(layout.root):
         if likeness is None:
-            message = "its end is not there, or is a folder above it"
+            message = "the link leads to nothing, or to a folder above it"
             yield make_finding("link-leads-nowhere", None, str(path), message)
         else:
-            message = f"is not read; it looks like {likeness}"
+            message = f"is ignored; it looks like {likeness}"
             yield make_finding("folder-left-aside", None, str(path), message)
     if isinstance(layout.root, StorePath):
-        message = "is not read; it looks like half a download"
+        message = "is ignored; it looks like an unfinished download"
         for archive in Path(layout.root.store.place).rglob(_UNFINISHED_PATTERN):
             yield make_finding("archive-unfinished", None, str(archive), message)

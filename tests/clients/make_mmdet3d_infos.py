@@ -1,13 +1,15 @@
-"""Make what `mmdet3d_infos.py` opens: `python -m tests.clients.make_mmdet3d_infos FOLDER`.
+"""Make the input of `mmdet3d_infos.py`: `python -m tests.clients.make_mmdet3d_infos FOLDER`.
 
-FOLDER gets a small release, its exports with both axes of the LiDAR, and `expected.json`: our
-boxes, clouds and cameras at every keyframe, and the dataset class of docs/exports.md.
+FOLDER gets a small release, its exports with both conventions of the LiDAR's axes, and
+`expected.json`: our boxes, clouds and cameras at every keyframe, and the dataset class of
+docs/exports.md.
 """
 
 import json
 import re
 import sys
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -25,7 +27,8 @@ from deepaccident_devkit.release import read_calib, write_calib
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 AGENTS = ("ego_vehicle", "infrastructure")
-TURNS = {"ego": np.eye(3), "nuscenes": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}
+ROTATIONS = {"ego": np.eye(3), "nuscenes": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])}
+"""Rotation of the LiDAR's axes by the name of their convention."""
 PAGE = Path(__file__).parents[2] / "docs" / "exports.md"
 
 
@@ -42,71 +45,76 @@ def main(folder: Path) -> None:
     turn_the_ego(make_release(folder / "release", config))
     dataset = DeepAccident("v1", folder / "release", verbose=False)
     expected = {}
-    for axes in ("ego", "nuscenes"):
+    for axes, rotation in ROTATIONS.items():
         for kind in (NuScenes, Mmdet3d):
             export_release(dataset, folder / axes, kind(agents=AGENTS, lidar_axes=axes))
-        expected[axes] = {
-            f"{record['token']}/{agent}/{number:03d}": moment_of(
-                dataset, record["token"], agent, number, TURNS[axes]
-            )
-            for record in dataset.scenario
-            for agent in AGENTS
-            for number in keyframes(record["num_frames"])
-        }
-    (code,) = re.findall(
-        r"^    from mmdet3d.*?(?=^\S)", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-    )
-    assert any("van" in moment["classes"] for moment in expected["ego"].values())
+        expected[axes] = {}
+        for record, agent in product(dataset.scenario, AGENTS):
+            for frame in keyframes(record["num_frames"]):
+                sample = f"{record['token']}/{agent}/{frame:03d}"
+                expected[axes][sample] = describe_sample(dataset, sample, rotation)
+
+    assert any("van" in facts["classes"] for facts in expected["ego"].values())
+
+    page = PAGE.read_text(encoding="utf-8")
+    (code,) = re.findall(r"^    from mmdet3d.*?(?=^\S)", page, re.DOTALL | re.MULTILINE)
     (folder / "expected.json").write_text(json.dumps({"exports": expected, "class": dedent(code)}))
 
 
 def turn_the_ego(release: Path) -> None:
-    """Let the ego turn by 3° a frame: where nobody turns, a wrong way to place sweeps may be
-    right.
-    """
+    """Turn the ego by 3° a frame; without a rotation, misplaced sweeps may look right."""
     for path in release.glob("*/ego_vehicle/calib/*/*.pkl"):
         calib = read_calib(path)
-        turned = calib.world_from_ego @ SE3.from_yaw(np.radians(3 * int(path.stem[-3:])))
-        write_calib(path, replace(calib, world_from_ego=turned))
+        turn = SE3.from_yaw(np.radians(3 * int(path.stem[-3:])))
+        write_calib(path, replace(calib, world_from_ego=calib.world_from_ego @ turn))
 
 
-def moment_of(
-    dataset: DeepAccident, scenario: str, agent: str, number: int, turn: np.ndarray
-) -> dict[str, Any]:
-    """What the client must find, in the LiDAR's frame with its axes turned; distances in metres."""
-    sample = f"{scenario}/{agent}/{number:03d}"
+def describe_sample(dataset: DeepAccident, sample: str, rotation: np.ndarray) -> dict[str, Any]:
+    """Describe what the client must read, in the rotated LiDAR frame and in metres."""
     boxes = dataset.boxes(sample, "lidar", velocity="derived")
     boxes = boxes.select((boxes.actor_id != OWN_ACTOR_ID) & (boxes.num_lidar_pts > 0))
-    velocity = np.nan_to_num(boxes.velocity) @ turn.T
-    yaw = boxes.yaw + np.arctan2(turn[1, 0], turn[0, 0])
-    lidar = dataset.world_from(sample, "lidar").inverse()
-    ahead = dataset.world_from(sample, "Camera_BackLeft").apply(
-        [[1.0, 0.5, 10.0]]
-    )  # right, down, forward
+    velocity = np.nan_to_num(boxes.velocity) @ rotation.T
+    yaw = boxes.yaw + np.arctan2(rotation[1, 0], rotation[0, 0])
+    columns = [
+        boxes.center @ rotation.T,
+        boxes.size,
+        yaw,
+        velocity[:, :2],
+    ]
+
+    frame = int(sample[-3:])
+    clouds = {}
+    for number in range(frame, max(frame - 11, 0), -1):
+        age_s = f"{(frame - number) / 10:.1f}"
+        clouds[age_s] = describe_cloud(
+            dataset,
+            f"{sample[:-3]}{number:03d}",
+            sample,
+            rotation,
+        )
+
+    point_in_camera = [[1.0, 0.5, 10.0]]  # right, down, forward
+    point_in_world = dataset.world_from(sample, "Camera_BackLeft").apply(point_in_camera)
+    lidar_from_world = dataset.world_from(sample, "lidar").inverse()
+    camera = dataset.camera(sample, "Camera_BackLeft")
     return {
-        "boxes": np.column_stack(
-            [boxes.center @ turn.T, boxes.size, yaw, velocity[:, :2]]
-        ).tolist(),
+        "boxes": np.column_stack(columns).tolist(),
         "classes": boxes.category_names,
         "points": boxes.num_lidar_pts.tolist(),
-        "clouds": {
-            f"{(number - each) / 10:.1f}": cloud_of(
-                dataset, f"{sample[:-3]}{each:03d}", sample, turn
-            )
-            for each in range(number, max(number - 11, 0), -1)
-        },
-        "ahead": (lidar.apply(ahead)[0] @ turn.T).tolist(),
-        "pixel": dataset.camera(sample, "Camera_BackLeft")
-        .project([[1.0, 0.5, 10.0]])[0][0]
-        .tolist(),
+        "clouds": clouds,
+        "ahead": (lidar_from_world.apply(point_in_world)[0] @ rotation.T).tolist(),
+        "pixel": camera.project(point_in_camera)[0][0].tolist(),
     }
 
 
-def cloud_of(dataset: DeepAccident, sample: str, present: str, turn: np.ndarray) -> list[Any]:
-    """The number of points of a cloud, and their mean in the LiDAR's frame of another moment."""
+def describe_cloud(
+    dataset: DeepAccident, sample: str, present: str, rotation: np.ndarray
+) -> list[Any]:
+    """Return a cloud's number of points and their mean in the LiDAR frame of another moment."""
     points = dataset.load_point_cloud(sample).xyz
-    mean = dataset.world_from(present, "lidar").inverse().apply(points).mean(axis=0)
-    return [len(points), (mean @ turn.T).tolist()]
+    lidar_from_world = dataset.world_from(present, "lidar").inverse()
+    mean = lidar_from_world.apply(points).mean(axis=0)
+    return [len(points), (mean @ rotation.T).tolist()]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Make what `nuscenes_devkit.py` opens: `python -m tests.clients.make_nuscenes_devkit FOLDER`.
+"""Make the input of `nuscenes_devkit.py`: `python -m tests.clients.make_nuscenes_devkit FOLDER`.
 
 FOLDER gets a small release, its export, and `expected.json`: our boxes in every sensor's frame at
 keyframes, and in the world at all frames.
@@ -28,28 +28,33 @@ def main(folder: Path) -> None:
     )
     dataset = DeepAccident("v1", make_release(folder / "release", config), verbose=False)
     export_release(dataset, folder / "export", NuScenes(agents=AGENTS))
-    content = {
-        record["token"]: boxes_of(dataset, record["token"])
-        for record in dataset.sample
-        if record["agent"] in AGENTS
-    }
-    (folder / "expected.json").write_text(json.dumps(content))
+    boxes = {}
+    for record in dataset.sample:
+        if record["agent"] in AGENTS:
+            boxes[record["token"]] = list_boxes(dataset, record["token"])
+    (folder / "expected.json").write_text(json.dumps(boxes))
 
 
-def boxes_of(dataset: DeepAccident, sample: str) -> dict[str, Any]:
-    """nuScenes' channel, or `world` → [actor, x, y, z, width, length, height, w, x, y, z of the
-    quaternion] a box.
+def list_boxes(dataset: DeepAccident, sample: str) -> dict[str, Any]:
+    """List boxes as [actor, x, y, z, width, length, height, and w, x, y, z of the quaternion], by
+    nuScenes' channel and for `world`.
     """
-    last = dataset.scenario.get(dataset.sample.get(sample)["scenario_token"])["num_frames"]
+    scenario = dataset.scenario.get(dataset.sample.get(sample)["scenario_token"])
     frames = {"world": "world"}
-    if int(sample[-3:]) in keyframes(last):
+    if int(sample[-3:]) in keyframes(scenario["num_frames"]):
         frames |= {name: channel for channel, name in CHANNEL_NAMES.items()}
-    result = {}
+    boxes_by_frame = {}
     for name, frame in frames.items():
         boxes = dataset.boxes(sample, frame)
-        columns = [boxes.actor_id, boxes.center, boxes.size[:, [1, 0, 2]], boxes.rotation]
-        result[name] = np.column_stack(columns)[boxes.actor_id != OWN_ACTOR_ID].tolist()
-    return result
+        boxes = boxes.select(boxes.actor_id != OWN_ACTOR_ID)
+        columns = [
+            boxes.actor_id,
+            boxes.center,
+            boxes.size[:, [1, 0, 2]],
+            boxes.rotation,
+        ]
+        boxes_by_frame[name] = np.column_stack(columns).tolist()
+    return boxes_by_frame
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""nuscenes-devkit 1.2.0 on an export: `python tests/clients/nuscenes_devkit.py FOLDER`, in an
-environment without ours.
+"""Run nuscenes-devkit 1.2.0 on an export: `python tests/clients/nuscenes_devkit.py FOLDER`, in an
+environment without our devkit.
 
-FOLDER is what `make_nuscenes_devkit.py` made. Everything is compared with our own boxes, or
-evaluated by the devkit.
+FOLDER is the output of `make_nuscenes_devkit.py`. Everything is compared with our own boxes or
+evaluated by the nuScenes devkit.
 """
 
 import json
@@ -37,106 +37,126 @@ META = {
 
 def main(folder: Path) -> None:
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        line = checked(folder)
-    print(line)
+        summary = run_checks(folder)
+    print(summary)
 
 
-def checked(folder: Path) -> str:
-    """Run all checks; what they found."""
-    before = resident()
+def run_checks(folder: Path) -> str:
+    """Run all checks and summarise their results in one line."""
+    memory_before = resident_bytes()
     nusc = NuScenes(VERSION, str(folder / "export"), verbose=False)
-    grown = resident() - before
+    memory_per_sample = (resident_bytes() - memory_before) / len(nusc.ego_pose)
     nusc.list_scenes()
     expected = json.loads((folder / "expected.json").read_text())
-    boxes = check_boxes(nusc, expected)
-    off = check_sweeps(nusc, expected)
+    num_boxes = check_boxes(nusc, expected)
+    sweep_error_m = check_sweeps(nusc, expected)
     check_points(nusc)
-    render(nusc, folder)
+    check_rendering(nusc, folder)
     check_futures(nusc)
-    found = detect(nusc, folder)
-    tracked = track(nusc, folder)
+    detected_classes = check_detection(nusc, folder)
+    tracked_classes = check_tracking(nusc, folder)
     return (
-        f"nuscenes-devkit: {boxes} boxes in sensor frames within 1e-3 m, at sweeps "
-        f"within {off:.2f} m, rendered; "
-        f"AP 1.0 of {found}, MOTA 1.0 of {tracked}; "
-        f"{grown / len(nusc.ego_pose) / 1000:.0f} kB of memory a sample: good"
+        f"nuscenes-devkit: {num_boxes} boxes in sensor frames within 1e-3 m, at sweeps "
+        f"within {sweep_error_m:.2f} m, rendered; "
+        f"AP 1.0 of {detected_classes}, MOTA 1.0 of {tracked_classes}; "
+        f"{memory_per_sample / 1000:.0f} kB of memory a sample: good"
     )
 
 
-def resident() -> int:
-    """Bytes of this process in memory."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+def resident_bytes() -> int:
+    """Return the bytes of this process that are in memory."""
+    num_pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return num_pages * 4096
 
 
 def check_boxes(nusc: NuScenes, expected: dict) -> int:
-    """Boxes in the frames of all sensors of all keyframes are ours."""
-    count = 0
+    """Check that the boxes of each keyframe equal ours in every sensor's frame; return their
+    number.
+    """
+    num_boxes = 0
     for sample in nusc.sample:
         for channel, token in sample["data"].items():
-            _, found, _ = nusc.get_sample_data(token, box_vis_level=BoxVisibility.NONE)
+            _, boxes, _ = nusc.get_sample_data(token, box_vis_level=BoxVisibility.NONE)
             ours = np.array(expected[sample["deepaccident_token"]][channel])
-            if not found:
+            if not boxes:
                 assert len(ours) == 0
                 continue
-            actors = [nusc.get("sample_annotation", box.token)["actor_id"] for box in found]
+            actors = [nusc.get("sample_annotation", box.token)["actor_id"] for box in boxes]
+
             assert actors == ours[:, 0].tolist()
-            assert np.abs(np.array([box.center for box in found]) - ours[:, 1:4]).max() < 1e-3
-            assert np.abs(np.array([box.wlh for box in found]) - ours[:, 4:7]).max() < 1e-9
-            for box, rotation in zip(found, ours[:, 7:], strict=True):
+
+            centers = np.array([box.center for box in boxes])
+            assert np.abs(centers - ours[:, 1:4]).max() < 1e-3
+
+            sizes = np.array([box.wlh for box in boxes])
+            assert np.abs(sizes - ours[:, 4:7]).max() < 1e-9
+            for box, rotation in zip(boxes, ours[:, 7:], strict=True):
                 assert Quaternion.absolute_distance(box.orientation, Quaternion(rotation)) < 1e-4
-            count += len(found)
-    assert count > 1000
-    return count
+
+            num_boxes += len(boxes)
+
+    assert num_boxes > 1000
+
+    return num_boxes
 
 
 def check_sweeps(nusc: NuScenes, expected: dict) -> float:
-    """Boxes that the devkit interpolates at sweeps are near those of our 10 Hz labels; the 95th
-    percentile, metres.
+    """Check that boxes interpolated at sweeps are near our 10 Hz labels.
+
+    Returns:
+        95th percentile of the distances in metres.
     """
-    off = []
+    distances_m = []
     for row in nusc.sample_data:
         sample = nusc.get("sample", row["sample_token"])
         if row["is_key_frame"] or row["channel"] != "LIDAR_TOP" or not sample["prev"]:
             continue
         steps = (sample["timestamp"] - row["timestamp"]) // 100_000
         assert 1 <= steps <= 4
+
         name, number = sample["deepaccident_token"].rsplit("/", 1)
-        ours = {
-            box[0]: box[1:4]
-            for box in expected[f"{name}/{int(number) - steps:03d}"]["world"]
-            if box[0] != -1
-        }
+        our_boxes = expected[f"{name}/{int(number) - steps:03d}"]["world"]
+        our_centers = {box[0]: box[1:4] for box in our_boxes if box[0] != -1}
         for box in nusc.get_boxes(row["token"]):
             record = nusc.get("sample_annotation", box.token)
-            if record["prev"] and record["actor_id"] in ours:
-                off.append(np.linalg.norm(box.center - ours[record["actor_id"]]))
-    assert len(off) > 500
-    assert np.percentile(off, 95) < 0.25, np.percentile(off, 95)
-    return float(np.percentile(off, 95))
+            actor = record["actor_id"]
+            if record["prev"] and actor in our_centers:
+                distances_m.append(np.linalg.norm(box.center - our_centers[actor]))
+
+    assert len(distances_m) > 500
+
+    percentile_m = np.percentile(distances_m, 95)
+    assert percentile_m < 0.25, percentile_m
+
+    return float(percentile_m)
 
 
 def check_points(nusc: NuScenes) -> None:
-    """Boxes hold the points that their rows count; clouds of several sweeps come together."""
+    """Check that boxes hold the points that their rows count, and that sweeps can be joined."""
     wrong = total = 0
     for sample in nusc.sample:
         path, boxes, _ = nusc.get_sample_data(sample["data"]["LIDAR_TOP"])
         points = LidarPointCloud.from_file(path).points[:3]
         for box in boxes:
-            said = nusc.get("sample_annotation", box.token)["num_lidar_pts"]
-            wrong += abs(points_in_box(box, points).sum() - said) > 3 + 0.05 * said
-            total += said > 0
+            expected = nusc.get("sample_annotation", box.token)["num_lidar_pts"]
+            count = points_in_box(box, points).sum()
+            wrong += abs(count - expected) > 3 + 0.05 * expected
+            total += expected > 0
+
     assert total > 100
     assert wrong < 0.02 * total, (wrong, total)
+
     last = nusc.get("sample", nusc.scene[0]["last_sample_token"])
     cloud, times = LidarPointCloud.from_file_multisweep(
         nusc, last, "LIDAR_TOP", "LIDAR_TOP", nsweeps=6
     )
+
     assert np.allclose(np.unique(times), np.arange(6) / 10, atol=1e-6)
     assert cloud.points.shape == (4, times.shape[1])
 
 
-def render(nusc: NuScenes, folder: Path) -> None:
-    """Pictures of a camera, of the LiDAR over the map, of an annotation."""
+def check_rendering(nusc: NuScenes, folder: Path) -> None:
+    """Render two cameras, the LiDAR over the map, and an annotation."""
     sample = nusc.get("sample", nusc.scene[0]["last_sample_token"])
     for channel in ("CAM_FRONT", "CAM_BACK_LEFT", "LIDAR_TOP"):
         path = folder / f"{channel}.png"
@@ -144,44 +164,52 @@ def render(nusc: NuScenes, folder: Path) -> None:
             sample["data"][channel], nsweeps=3, underlay_map=True, out_path=str(path), verbose=False
         )
         assert path.stat().st_size > 1000
-    seen = nusc.get_sample_data(sample["data"]["CAM_FRONT"])[1]
-    nusc.render_annotation(seen[0].token, out_path=str(folder / "annotation.png"))
-    assert (folder / "annotation.png").stat().st_size > 1000
+    _, visible_boxes, _ = nusc.get_sample_data(sample["data"]["CAM_FRONT"])
+    picture = folder / "annotation.png"
+    nusc.render_annotation(visible_boxes[0].token, out_path=str(picture))
+
+    assert picture.stat().st_size > 1000
 
 
 def check_futures(nusc: NuScenes) -> None:
-    """The prediction helper finds where an actor goes in the next two seconds."""
-    helper, seen = PredictHelper(nusc), 0
+    """Check that the prediction helper returns an actor's path in the next two seconds."""
+    helper = PredictHelper(nusc)
+    num_whole_paths = 0
     for sample in nusc.sample:
-        for first in (nusc.get("sample_annotation", token) for token in sample["anns"]):
-            record, path = first, []
+        for token in sample["anns"]:
+            record = nusc.get("sample_annotation", token)
+            path = []
             while record["next"] and len(path) < 4:
                 record = nusc.get("sample_annotation", record["next"])
                 path.append(record["translation"][:2])
-            found = helper.get_future_for_agent(
-                first["instance_token"], sample["token"], 2, in_agent_frame=False
+            predicted = helper.get_future_for_agent(
+                record["instance_token"], sample["token"], 2, in_agent_frame=False
             )
-            assert np.allclose(found.reshape(-1, 2), np.reshape(path, (-1, 2)))
-            seen += len(path) == 4
-    assert seen > 100
+
+            assert np.allclose(predicted.reshape(-1, 2), np.reshape(path, (-1, 2)))
+
+            num_whole_paths += len(path) == 4
+
+    assert num_whole_paths > 100
 
 
 def write_results(
     nusc: NuScenes, path: Path, kind: str, name_of: Callable[[str], str | None]
 ) -> None:
-    """Write the true boxes of the split that have points as `detection` or `tracking` results."""
+    """Write the split's true boxes that have points as `detection` or `tracking` results."""
     scenes = set(json.loads((Path(nusc.table_root) / "splits.json").read_text())[SPLIT])
     results = {}
     for sample in nusc.sample:
         if nusc.get("scene", sample["scene_token"])["name"] not in scenes:
             continue
-        results[sample["token"]] = boxes = []
-        for record in (nusc.get("sample_annotation", token) for token in sample["anns"]):
+        boxes = results[sample["token"]] = []
+        for token in sample["anns"]:
+            record = nusc.get("sample_annotation", token)
             name = name_of(record["category_name"])
             if record["num_lidar_pts"] == 0 or name is None:
                 continue
             box = {key: record[key] for key in ("sample_token", "translation", "size", "rotation")}
-            box["velocity"] = np.nan_to_num(nusc.box_velocity(record["token"])[:2]).tolist()
+            box["velocity"] = np.nan_to_num(nusc.box_velocity(token)[:2]).tolist()
             box |= {f"{kind}_name": name, f"{kind}_score": 1.0}
             if kind == "detection":
                 box["attribute_name"] = nusc.get("attribute", record["attribute_tokens"][0])["name"]
@@ -191,30 +219,31 @@ def write_results(
     path.write_text(json.dumps({"meta": META, "results": results}))
 
 
-def detect(nusc: NuScenes, folder: Path) -> str:
-    """Perfect detections have AP 1.0 in every class, and no error of any kind."""
-    path, config = folder / "detections.json", config_factory("detection_cvpr_2019")
+def check_detection(nusc: NuScenes, folder: Path) -> str:
+    """Check that perfect detections have AP 1.0 and no error; return the classes."""
+    path = folder / "detections.json"
+    config = config_factory("detection_cvpr_2019")
     write_results(nusc, path, "detection", category_to_detection_name)
     evaluation = DetectionEval(
         nusc, config, str(path), SPLIT, str(folder / "detection"), verbose=False
     )
     metrics, _ = evaluation.evaluate()
-    near = {
-        box.detection_name
-        for token in evaluation.sample_tokens
-        for box in evaluation.gt_boxes[token]
-    }
-    assert {"car", "pedestrian"} <= near
-    for name in near:
-        assert metrics.mean_dist_aps[name] > 1 - 1e-9, (name, metrics.mean_dist_aps[name])
+    present = {box.detection_name for box in evaluation.gt_boxes.all}
+
+    assert {"car", "pedestrian"} <= present
+
+    for name in present:
+        precision = metrics.mean_dist_aps[name]
+        assert precision > 1 - 1e-9, (name, precision)
         errors = metrics.serialize()["label_tp_errors"][name]
         assert np.nanmax(list(errors.values())) < 1e-6, (name, errors)
-    return ", ".join(sorted(near))
+    return ", ".join(sorted(present))
 
 
-def track(nusc: NuScenes, folder: Path) -> str:
-    """Perfect tracks have MOTA 1.0 in every class."""
-    path, config = folder / "tracks.json", config_factory("tracking_nips_2019")
+def check_tracking(nusc: NuScenes, folder: Path) -> str:
+    """Check that perfect tracks have MOTA 1.0 in every class; return the classes."""
+    path = folder / "tracks.json"
+    config = config_factory("tracking_nips_2019")
     write_results(nusc, path, "tracking", category_to_tracking_name)
     evaluation = TrackingEval(
         config,
@@ -226,12 +255,13 @@ def track(nusc: NuScenes, folder: Path) -> str:
         verbose=False,
     )
     metrics, _ = evaluation.evaluate()
-    found = {
-        name: value for name, value in metrics.label_metrics["mota"].items() if not np.isnan(value)
-    }
-    assert {"car", "pedestrian"} <= found.keys()
-    assert all(value > 1 - 1e-9 for value in found.values()), found
-    return ", ".join(sorted(found))
+    accuracies = metrics.label_metrics["mota"]
+    known = {name: value for name, value in accuracies.items() if not np.isnan(value)}
+
+    assert {"car", "pedestrian"} <= known.keys()
+    assert all(value > 1 - 1e-9 for value in known.values()), known
+
+    return ", ".join(sorted(known))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Opens the exports of make_tables.py with datasets, Polars, DuckDB, pandas and webdataset; knows
-no devkit.
+"""Open the exports of make_tables.py with datasets, Polars, DuckDB, pandas and webdataset, without
+the devkit.
 
-Runs the code of docs/exports.md, too, that is marked with one of these names.
+It also runs the code of docs/exports.md that is marked with one of these names.
 """
 
 import hashlib
@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,133 +29,167 @@ import polars as pl  # noqa: E402
 import webdataset as wds  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "exports.md"
-CLIENTS = ("datasets", "duckdb", "polars", "pandas", "webdataset")
+CLIENTS = ("datasets", "duckdb", "polars", "webdataset")
 Rows = tuple[int, Callable[[int], dict[str, Any]]]
+"""Number of rows, and a function that returns the row at a position."""
+Images = tuple[Any, Any]
+"""Encoded images of the front and back left cameras; None for a missing one."""
 
 
-def files(table: str, split: str) -> list[str]:
-    once = table in ("sensor", "category")
-    return sorted(map(str, Path("out/tables", table).glob(f"{'all' if once else split}-*.parquet")))
+def list_files(table: str, split: str) -> list[str]:
+    prefix = "all" if table in ("sensor", "category") else split
+    return sorted(map(str, Path("out/tables", table).glob(f"{prefix}-*.parquet")))
 
 
-def by_datasets(table: str, split: str) -> Rows:
-    found = datasets.load_dataset("out/tables", table, split=split)
-    return len(found), lambda row: found[row]
+def open_with_datasets(table: str, split: str) -> Rows:
+    rows = datasets.load_dataset("out/tables", table, split=split)
+    return len(rows), lambda position: rows[position]
 
 
-def by_polars(table: str, split: str) -> Rows:
-    found = pl.read_parquet(files(table, split))
-    return len(found), lambda row: found.row(row, named=True)
+def open_with_polars(table: str, split: str) -> Rows:
+    rows = pl.read_parquet(list_files(table, split))
+    return len(rows), lambda position: rows.row(position, named=True)
 
 
-def by_duckdb(table: str, split: str) -> Rows:
-    found = duckdb.read_parquet(files(table, split))
-    return len(found), lambda row: dict(
-        zip(found.columns, found.limit(1, row).fetchall()[0], strict=True)
-    )
+def open_with_duckdb(table: str, split: str) -> Rows:
+    rows = duckdb.read_parquet(list_files(table, split))
+
+    def read_row(position: int) -> dict[str, Any]:
+        (row,) = rows.limit(1, position).fetchall()
+        return dict(zip(rows.columns, row, strict=True))
+
+    return len(rows), read_row
 
 
-def by_pandas(table: str, split: str) -> Rows:
-    found = pd.concat(map(pd.read_parquet, files(table, split)), ignore_index=True)
-    return len(found), lambda row: found.iloc[row].to_dict()
+def open_with_pandas(table: str, split: str) -> Rows:
+    parts = [pd.read_parquet(path) for path in list_files(table, split)]
+    rows = pd.concat(parts, ignore_index=True)
+    return len(rows), lambda position: rows.iloc[position].to_dict()
 
 
-def same(found: Any, told: Any) -> bool:
-    """Whether values are equal; NaN is null."""
-    if isinstance(told, dict):
-        return all(same(found[name], value) for name, value in told.items())
-    if isinstance(told, list):
-        return len(found) == len(told) and all(map(same, found, told))
-    return bool(found == told) if told is not None else found is None or math.isnan(found)
+def equals(value: Any, expected: Any) -> bool:
+    """Compare a value with JSON, in which null may stand for NaN."""
+    if isinstance(expected, dict):
+        return all(equals(value[name], entry) for name, entry in expected.items())
+    if isinstance(expected, list):
+        return len(value) == len(expected) and all(map(equals, value, expected))
+    if expected is None:
+        return value is None or math.isnan(value)
+    return bool(value == expected)
 
 
 def check_tables(tables: dict[str, Any]) -> int:
-    compared = 0
+    num_compared = 0
+    openers = (open_with_datasets, open_with_polars, open_with_duckdb, open_with_pandas)
     for table, splits in tables.items():
-        for split, told in splits.items():
-            for opened in (by_datasets, by_polars, by_duckdb, by_pandas):
-                count, row = opened(table, split)
-                assert count == told["rows"], (opened, table, split, count)
-                for at, record in told["some"].items():
-                    assert same(row(int(at)), record), (opened, table, split, row(int(at)), record)
-                    compared += 1
-    return compared
+        for (split, expected), opener in product(splits.items(), openers):
+            count, read_row = opener(table, split)
+            assert count == expected["rows"], (opener, table, split, count)
+            for position, record in expected["some"].items():
+                row = read_row(int(position))
+                assert equals(row, record), (opener, table, split, row, record)
+                num_compared += 1
+    return num_compared
 
 
-def check_queries(told: dict[str, Any]) -> int:
-    """Run the page's code; some of its blocks leave what it must find under these names."""
+def find_hidden_actors() -> set[tuple[str, str]]:
+    """Return the frame and instance of actors that the pole's LiDAR hits, but not the ego's."""
+    columns = ["sample_token", "instance_token", "num_lidar_pts"]
+    annotations = pd.read_parquet("out/tables/annotation", columns=columns)
+    hit = annotations.query("num_lidar_pts > 0").dropna()
+    samples = pd.read_parquet("out/tables/sample", columns=["token", "frame_token", "agent"])
+    hit = hit.merge(samples, left_on="sample_token", right_on="token")
+    seen = {}
+    for agent, rows in hit.groupby("agent"):
+        seen[agent] = set(zip(rows.frame_token, rows.instance_token, strict=True))
+    return seen["infrastructure"] - seen["ego_vehicle"]
+
+
+def check_queries(expected: dict[str, Any]) -> int:
+    """Run a query with pandas, and the page's code, which assigns its results to `boxes` and
+    `impacts`.
+    """
     blocks = re.findall(
         rf"^```python ({'|'.join(CLIENTS)})\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE
     )
     assert {client for client, _ in blocks} == set(CLIENTS)
+
     names: dict[str, Any] = {}
     for client, code in blocks:
         with redirect_stdout(io.StringIO()):
             exec(compile(code, f"{PAGE.name}: {client}", "exec"), names)  # noqa: S102
-    assert [list(row) for row in names["boxes"].fetchall()] == told["boxes"]
-    assert sorted(names["impacts"]["token"]) == told["impacts"]
-    assert sorted(map(list, names["hidden"])) == told["hidden"]
-    return len(blocks)
+
+    assert [list(row) for row in names["boxes"].fetchall()] == expected["boxes"]
+    assert sorted(names["impacts"]["token"]) == expected["impacts"]
+    assert sorted(map(list, find_hidden_actors())) == expected["hidden"]
+
+    return len(blocks) + 1
 
 
-def check_sample(sample: dict[str, Any], told: dict[str, Any], images: tuple[Any, Any]) -> None:
-    points, facts = np.array(sample["lidar.npy"], dtype=np.float32), sample["json"]
-    assert points.shape == (told["count"], 4)
-    assert digest(points.tobytes()) == told["points"]
-    assert [None if image is None else digest(image) for image in images] == [
-        told["front"],
-        told["back"],
-    ]
+def check_sample(sample: dict[str, Any], expected: dict[str, Any], images: Images) -> None:
+    points = np.array(sample["lidar.npy"], dtype=np.float32)
+    assert points.shape == (expected["count"], 4)
+    assert digest(points.tobytes()) == expected["points"]
+
+    digests = [None if image is None else digest(image) for image in images]
+    assert digests == [expected["front"], expected["back"]]
+
+    facts = sample["json"]
     world_from_lidar = np.array(facts["world_from_ego"]) @ facts["ego_from_lidar"]
-    assert np.allclose(world_from_lidar, told["world_from_lidar"], atol=1e-9)
+    assert np.allclose(world_from_lidar, expected["world_from_lidar"], atol=1e-9)
+
     boxes = facts["boxes"]
     centers = np.array(boxes["center"]).reshape(-1, 3)
-    assert np.allclose(
-        centers @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3],
-        np.reshape(told["centers"], (-1, 3)),
-    )
-    assert same(boxes["velocity"], told["velocities"])
+    centers_in_world = centers @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3]
+    assert np.allclose(centers_in_world, np.reshape(expected["centers"], (-1, 3)))
+    assert equals(boxes["velocity"], expected["velocities"])
     assert len({len(column) for column in boxes.values()}) == 1
-    assert facts["cameras"]["camera_back_left"]["intrinsic"] == told["intrinsic"]
-    assert facts["time_to_impact"] == told["time_to_impact"]
+    assert facts["cameras"]["camera_back_left"]["intrinsic"] == expected["intrinsic"]
+    assert facts["time_to_impact"] == expected["time_to_impact"]
 
 
 def digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def by_webdataset(split: str) -> Iterator[tuple[dict[str, Any], tuple[Any, Any]]]:
+def read_with_webdataset(split: str) -> Iterator[tuple[dict[str, Any], Images]]:
     paths = sorted(map(str, Path("out/shards").glob(f"{split}-*.tar")))
-    raw = iter(wds.WebDataset(paths, shardshuffle=False))
+    encoded_samples = iter(wds.WebDataset(paths, shardshuffle=False))
     for sample in wds.WebDataset(paths, shardshuffle=False).decode("rgb8"):
-        undecoded = next(raw)
+        encoded = next(encoded_samples)
         assert sample["camera_back_left.jpg"].shape == (36, 64, 3)
-        yield sample, (undecoded.get("camera_front.jpg"), undecoded["camera_back_left.jpg"])
+        yield sample, (encoded.get("camera_front.jpg"), encoded["camera_back_left.jpg"])
 
 
-def shards_by_datasets(split: str) -> Iterator[tuple[dict[str, Any], tuple[Any, Any]]]:
-    found = datasets.load_dataset("out/shards", split=split)
-    assert found[0]["camera_back_left.jpg"].size == (64, 36)
-    images = ("camera_front.jpg", "camera_back_left.jpg")
-    for name in images:
-        found = found.cast_column(name, datasets.Image(decode=False))
-    for sample in found:
-        yield sample, tuple(sample[name] and sample[name]["bytes"] for name in images)
+def read_with_datasets(split: str) -> Iterator[tuple[dict[str, Any], Images]]:
+    samples = datasets.load_dataset("out/shards", split=split)
+    assert samples[0]["camera_back_left.jpg"].size == (64, 36)
+
+    image_names = ("camera_front.jpg", "camera_back_left.jpg")
+    for name in image_names:
+        samples = samples.cast_column(name, datasets.Image(decode=False))
+    for sample in samples:
+        yield sample, tuple(sample[name] and sample[name]["bytes"] for name in image_names)
 
 
-def check_shards(told: dict[str, Any]) -> int:
-    compared = 0
-    for split, samples in told.items():
-        for opened in (by_webdataset, shards_by_datasets):
-            keys = []
-            for sample, images in opened(split):
-                keys.append(sample["__key__"])
-                check_sample(sample, samples[keys[-1]], images)
-            assert sorted(keys) == sorted(samples)
-            moments = [(*key.split("/")[:2], key.split("/")[3]) for key in keys]
-            assert moments == sorted(moments)
-            compared += len(keys)
-    return compared
+def check_shards(shards: dict[str, Any]) -> int:
+    num_compared = 0
+    readers = (read_with_webdataset, read_with_datasets)
+    for (split, expected), reader in product(shards.items(), readers):
+        keys = []
+        for sample, images in reader(split):
+            keys.append(sample["__key__"])
+            check_sample(
+                sample,
+                expected[keys[-1]],
+                images,
+            )
+        assert sorted(keys) == sorted(expected)
+        parts = [key.split("/") for key in keys]
+        moments = [(kind, name, frame) for kind, name, _, frame in parts]
+        assert moments == sorted(moments)
+        num_compared += len(keys)
+    return num_compared
 
 
 def main(folder: Path) -> None:

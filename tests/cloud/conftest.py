@@ -1,4 +1,4 @@
-"""An S3 server of this machine alone, with a release in a bucket, loose and as one zip.
+"""Serve a release on S3 from this machine, once as single files and once as one zip.
 
 Not collected where s3fs and moto are not installed, unless DEEPACCIDENT_REQUIRE_CLOUD is set.
 """
@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from packing import files_of, packed
-from processes import wait_for
+from support.linux_processes import wait_for
+from support.zipped_releases import release_files, zip_release
 
-_NEEDED = ("s3fs", "moto")
+_REQUIRED_PACKAGES = ("s3fs", "moto")
 
-if missing := [name for name in _NEEDED if importlib.util.find_spec(name) is None]:
+if missing := [name for name in _REQUIRED_PACKAGES if importlib.util.find_spec(name) is None]:
     if os.environ.get("DEEPACCIDENT_REQUIRE_CLOUD"):
         raise pytest.UsageError(
             f"DEEPACCIDENT_REQUIRE_CLOUD is set, but {', '.join(missing)} is not installed"
@@ -27,7 +27,7 @@ if missing := [name for name in _NEEDED if importlib.util.find_spec(name) is Non
 
 @pytest.fixture(scope="session")
 def bucket(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """`s3://bucket`, with the release loose below `data/DeepAccident` and in `zips/all.zip`."""
+    """The URL of a bucket with the release below `data/DeepAccident` and in `zips/all.zip`."""
     import s3fs
 
     with socket.socket() as free:
@@ -45,23 +45,22 @@ def bucket(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
         for name, value in environment.items():
             patch.setenv(name, value)
         try:
-            wait_for(lambda: _answers(port))
+            wait_for(lambda: _accepts_connections(port))
             files = s3fs.S3FileSystem()
             files.mkdir("bucket")
-            below = {
-                path: path.relative_to(release_root).as_posix() for path in files_of(release_root)
-            }
+            paths = release_files(release_root)
+            names = [path.relative_to(release_root).as_posix() for path in paths]
             files.put(
-                [str(path) for path in below],
-                [f"bucket/data/DeepAccident/{name}" for name in below.values()],
+                [str(path) for path in paths],
+                [f"bucket/data/DeepAccident/{name}" for name in names],
             )
-            archive = packed(release_root, tmp_path_factory.mktemp("bucket") / "all.zip")
+            archive = zip_release(release_root, tmp_path_factory.mktemp("bucket") / "all.zip")
             files.put(str(archive), "bucket/zips/all.zip")
             yield "s3://bucket"
         finally:
             server.terminate()
 
 
-def _answers(port: int) -> bool:
-    with socket.socket() as asked:
-        return asked.connect_ex(("127.0.0.1", port)) == 0
+def _accepts_connections(port: int) -> bool:
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0

@@ -1,4 +1,4 @@
-"""A release, results of a baseline, and what a run on this machine makes of them."""
+"""Make a release, results of a baseline, and the outputs of all commands on this machine."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from engines.products import COMMANDS, Cluster, Local, command, contents, done, words
+from engines.products import COMMANDS, Cluster, Local, command_line, python_command, read_files, run
 
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
@@ -15,24 +15,18 @@ from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 @pytest.fixture(scope="session")
 def local(tmp_path_factory: pytest.TempPathFactory) -> Local:
     folder = tmp_path_factory.mktemp("engines")
-    config = SynthConfig(scenarios=6, frames=24, sensors=False, seed=12, designed=True)
-    release = make_release(folder / "release", config, workers=2)
-    done(
-        command(
-            [
-                "predict",
-                "constant_velocity",
-                str(release),
-                "--split",
-                "train",
-                "--out",
-                str(folder / "results"),
-            ]
-        )
+    release = make_release(
+        folder / "release",
+        SynthConfig(scenarios=6, frames=24, sensors=False, seed=12, designed=True),
+        workers=2,
     )
-    places = {"release": release, "results": folder / "results", "out": folder / "local"}
-    printed = {name: done(command(words(name, places))) for name in COMMANDS}
-    return Local(places, contents(folder / "local"), printed["validate"])
+    results = folder / "results"
+    options = ["--split", "train", "--out", str(results)]
+    run(python_command(["predict", "constant_velocity", str(release), *options]))
+
+    paths = {"release": release, "results": results, "out": folder / "local"}
+    outputs = {name: run(python_command(command_line(name, paths))) for name in COMMANDS}
+    return Local(paths, read_files(folder / "local"), outputs["validate"])
 
 
 @pytest.fixture
@@ -42,6 +36,6 @@ def cluster() -> Iterator[Cluster]:
         [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
         assert process.stdout is not None
-        told = json.loads(process.stdout.readline())
-        yield Cluster(told["address"], told["workers"])
+        facts = json.loads(process.stdout.readline())
+        yield Cluster(facts["address"], facts["workers"])
         process.communicate(timeout=300)

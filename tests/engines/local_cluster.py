@@ -1,4 +1,4 @@
-"""A dask cluster of two worker processes; prints where it is, and ends when its input does."""
+"""Start a dask cluster of two worker processes, print its address, and run until stdin closes."""
 
 import json
 import sys

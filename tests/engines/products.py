@@ -1,4 +1,4 @@
-"""What bulk commands make of one release, on whatever engine: the same bytes."""
+"""Run the bulk commands, which must write the same bytes on every engine."""
 
 import os
 import subprocess
@@ -20,56 +20,73 @@ COMMANDS = {
     "stats": "info {release} --statistics --out {out}/stats",
     "synth": "synth {out}/made --scenarios 3 --frames 3 --size 64x36 --seed 5",
 }
-"""Name → command line."""
+"""Command line by name."""
 
 
 class Local(NamedTuple):
-    """What the commands made here without a cluster: files by path, and what each printed of the
-    release.
+    """The outputs of the commands on this machine without a cluster.
+
+    Attributes:
+        paths: Folders by the name that `COMMANDS` gives them.
+        files: Contents by path below the folder `out`.
+        printed: Output of the command `validate`.
     """
 
-    places: dict[str, Path]
+    paths: dict[str, Path]
     files: dict[str, bytes]
     printed: str
 
 
 class Cluster(NamedTuple):
-    """A dask cluster in a process of its own: its scheduler's address, and the processes of its
-    workers.
+    """A dask cluster in its own process.
+
+    Attributes:
+        address: Address of the scheduler.
+        workers: Process ids of the workers.
     """
 
     address: str
     workers: list[int]
 
 
-def words(name: str, places: dict[str, Path]) -> list[str]:
-    """The command line of a product."""
-    return COMMANDS[name].format(**places).split()
+def command_line(name: str, paths: dict[str, Path]) -> list[str]:
+    return COMMANDS[name].format(**paths).split()
 
 
-def command(arguments: Sequence[str]) -> list[str]:
-    """A process of its own, as a user has it."""
+def python_command(arguments: Sequence[str]) -> list[str]:
+    """Prepend the Python that runs the devkit in its own process."""
     return [sys.executable, "-m", "deepaccident_devkit.cli", *arguments]
 
 
-def done(line: Sequence[str], **environment: str) -> str:
-    """Run a command to its end; what it printed."""
-    ended = subprocess.run(
-        line,
+def run(command: Sequence[str], **environment: str) -> str:
+    """Run a command to its end and return its output."""
+    result = subprocess.run(
+        command,
         capture_output=True,
         text=True,
         timeout=300,
         check=False,
         env={**os.environ, **environment},
     )
-    assert ended.returncode in (0, 1), ended.stderr  # 1: what `validate` finds
-    return ended.stdout
+
+    assert result.returncode in (0, 1), result.stderr  # 1: `validate` has findings
+
+    return result.stdout
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Path → bytes of all that was made; not the locks."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not path.name.endswith(".lock")
-    }
+def read_files(folder: Path, prefix: str = "") -> dict[str, bytes]:
+    """Read all files but the locks.
+
+    Returns:
+        Content by the path below the folder, with the prefix before it.
+    """
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not path.name.endswith(".lock"):
+            files[prefix + str(path.relative_to(folder))] = path.read_bytes()
+    return files
+
+
+def opencood_files(local: Local) -> dict[str, bytes]:
+    """Select the files of the OpenCOOD export."""
+    return {path: data for path, data in local.files.items() if path.startswith("opencood/")}

@@ -1,4 +1,4 @@
-"""The commands of docs/clusters.md, as far as one machine can run them."""
+"""Run the commands of docs/clusters.md, as far as one machine can."""
 
 import os
 import re
@@ -7,57 +7,61 @@ import sys
 from pathlib import Path
 
 import pytest
-from engines.products import Local, contents
-from engines.test_mpi import AS_ROOT, CROWDED, HERE
+from engines.products import Local, opencood_files, read_files
+from engines.test_mpi import AS_ROOT, HAS_MPI, OVERSUBSCRIBED
 
 pytestmark = pytest.mark.slow
 
 PAGE = (Path(__file__).parents[2] / "docs" / "clusters.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(bash|python)\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 PROGRAMS = {
-    "ssh": '#!/bin/bash\nshift\nexec bash -c "$*"\n',
     "sbatch": """#!/bin/bash
 [[ $1 == --wait && $(cat "$2") =~ --array=1-([0-9]+) ]] || exit 1
-for each in $(seq "${BASH_REMATCH[1]}"); do bash -e "$2" >&2 & done
+for task in $(seq "${BASH_REMATCH[1]}"); do bash -e "$2" >&2 & done
 for job in $(jobs -p); do wait "$job" || exit; done
 """,
 }
-"""Programs of a cluster that stand for themselves here: one host, all tasks at once."""
+"""Scripts that replace a cluster's programs: all tasks run at once, on this host."""
 
 
 @pytest.fixture
-def place(local: Local, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with `deepaccident_demo/release`, where those programs are found."""
-    (tmp_path / "bin").mkdir()
+def workspace(local: Local, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with `deepaccident_demo/release`, and with `PROGRAMS` on the path."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
     for name, script in PROGRAMS.items():
-        (tmp_path / "bin" / name).write_text(script)
-        (tmp_path / "bin" / name).chmod(0o755)
-    (tmp_path / "work" / "deepaccident_demo").mkdir(parents=True)
-    (tmp_path / "work" / "deepaccident_demo" / "release").symlink_to(local.places["release"])
-    own = Path(sys.executable).parent
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{own}:{os.environ['PATH']}")
-    for name, value in {**AS_ROOT, **CROWDED}.items():
+        (programs / name).write_text(script)
+        (programs / name).chmod(0o755)
+    folder = tmp_path / "work"
+    (folder / "deepaccident_demo").mkdir(parents=True)
+    (folder / "deepaccident_demo" / "release").symlink_to(local.paths["release"])
+
+    python_folder = Path(sys.executable).parent
+    monkeypatch.setenv("PATH", f"{programs}:{python_folder}:{os.environ['PATH']}")
+    for name, value in {**AS_ROOT, **OVERSUBSCRIBED}.items():
         monkeypatch.setenv(name, value)
-    return tmp_path / "work"
+    return folder
 
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_the_page(local: Local, place: Path, number: int) -> None:
+def test_the_page(local: Local, workspace: Path, number: int) -> None:
     language, code = BLOCKS[number]
-    if "mpiexec" in code and not HERE and not os.environ.get("DEEPACCIDENT_REQUIRE_MPI"):
+    if "mpiexec" in code and not HAS_MPI and not os.environ.get("DEEPACCIDENT_REQUIRE_MPI"):
         pytest.skip("no mpiexec, or no mpi4py")
-    # the demo's release has point clouds, and the one here none
-    code = code.replace("export opencood ", "export opencood --without-clouds ").replace(
-        "OpenCood()", "OpenCood(without_clouds=True)"
+    # the demo's release has point clouds, but this one has none
+    code = code.replace("export opencood ", "export opencood --without-clouds ")
+    code = code.replace("OpenCood()", "OpenCood(without_clouds=True)")
+    (workspace / "script").write_text(code)
+    interpreter = ["bash", "-eu"] if language == "bash" else [sys.executable]
+    result = subprocess.run(
+        [*interpreter, "script"],
+        cwd=workspace,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
     )
-    (place / "script").write_text(code)
-    run = ["bash", "-eu", "script"] if language == "bash" else [sys.executable, "script"]
-    ended = subprocess.run(run, cwd=place, capture_output=True, text=True, timeout=300, check=False)
-    assert ended.returncode == 0, ended.stderr
-    exported = {
-        path: content for path, content in local.files.items() if path.startswith("opencood/")
-    }
-    for folder in (place / "out").glob("[!l]*"):
-        assert {
-            f"opencood/{path}": content for path, content in contents(folder).items()
-        } == exported
+
+    assert result.returncode == 0, result.stderr
+    for folder in (workspace / "out").glob("[!l]*"):
+        assert read_files(folder, prefix="opencood/") == opencood_files(local)

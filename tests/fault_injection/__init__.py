@@ -1,1 +1,1 @@
-"""Fault injection: seeded mutations of a synthetic release, and what `validate` says of them."""
+"""Seeded mutations of a healthy release: `validate` must find each fault that they plant."""

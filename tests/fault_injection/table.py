@@ -1,4 +1,4 @@
-"""The table of found and missed faults, as Markdown: made from a run."""
+"""The Markdown table of found and missed faults, made from the outcomes of a run."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,28 +11,27 @@ _HEAD = """# What `deepaccident validate` finds
 *Needs* is the option that `validate` needs.
 
 """
-_SUMMARY = """{count} faults of {kinds} kinds: {found} found, {harmless} harmless, {missed} missed. `validate` need not
-find {beyond} more kinds; the table that the command prints says why.
-
-"""  # noqa: E501
+_SUMMARY = """Of {count} faults of {kinds} kinds, {found} are found, {harmless} are harmless, and
+{missed} are missed. {beyond} further kinds need not be found.
+"""
 _COLUMNS = ("kind", "what is done", "needs", "applied", "found", "verdict", "found by, or why not")
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One kind of mutation and what became of it."""
+    """One kind of mutation and the outcomes of its applications."""
 
     mutation: Mutation
     outcomes: Sequence[Outcome]
 
     @property
     def found(self) -> int:
-        """How many applications were found."""
+        """Number of applications that were found."""
         return sum(outcome.found for outcome in self.outcomes)
 
     @property
     def verdict(self) -> str:
-        """`found`, `harmless`, `missed`, or `by chance` for what is found only sometimes."""
+        """`found`, `harmless`, `missed`, or `by chance` if only found sometimes."""
         if self.mutation.harmless is not None:
             return "harmless"
         if self.mutation.beyond is not None and self.found:
@@ -40,12 +39,12 @@ class Row:
         return "found" if self.found == len(self.outcomes) else "missed"
 
     def cells(self) -> list[str]:
-        """The cells of its row of the table."""
-        codes = sorted(
-            {code for outcome in self.outcomes for code in (*outcome.errors, *outcome.warnings)}
-        )
-        told = ", ".join(f"`{code}`" for code in codes)
-        why = self.mutation.harmless or self.mutation.beyond
+        """Return the cells of the row."""
+        codes: set[str] = set()
+        for outcome in self.outcomes:
+            codes.update(outcome.errors, outcome.warnings)
+        quoted_codes = ", ".join(f"`{code}`" for code in sorted(codes))
+        reason = self.mutation.harmless or self.mutation.beyond
         return [
             f"`{self.mutation.name}`",
             self.mutation.title,
@@ -53,62 +52,65 @@ class Row:
             str(len(self.outcomes)),
             str(self.found),
             self.verdict,
-            "; ".join(part for part in (why, told) if part),
+            "; ".join(filter(None, (reason, quoted_codes))),
         ]
 
 
-def rows_of(outcomes: Iterable[Outcome]) -> list[Row]:
-    """One row for each kind, in the order of the groups."""
-    by_name: dict[str, list[Outcome]] = {}
+def make_rows(outcomes: Iterable[Outcome]) -> list[Row]:
+    """Make one row for each kind of mutation, in the order of the groups."""
+    outcomes_by_name: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
-        by_name.setdefault(outcome.job.name, []).append(outcome)
-    return [Row(mutation, by_name[name]) for name, mutation in MUTATIONS.items() if name in by_name]
+        outcomes_by_name.setdefault(outcome.job.name, []).append(outcome)
+    return [
+        Row(mutation, outcomes_by_name[name])
+        for name, mutation in MUTATIONS.items()
+        if name in outcomes_by_name
+    ]
 
 
 def to_markdown(outcomes: Sequence[Outcome]) -> str:
-    """All kinds, with the findings for each."""
-    rows = rows_of(outcomes)
+    """Return a page with all kinds of mutations and the findings for each."""
     parts = [_HEAD + summary(outcomes)]
-    for group in dict.fromkeys(row.mutation.group for row in rows):
-        lines = [_line(row.cells()) for row in rows if row.mutation.group == group]
-        parts.append(
-            "\n".join([f"## {group[0].upper()}{group[1:]}", "", *_header(_COLUMNS), *lines, ""])
-        )
+    for group, rows in _group_rows(make_rows(outcomes)).items():
+        title = f"## {group[0].upper()}{group[1:]}"
+        lines = [_format_line(row.cells()) for row in rows]
+        parts.append("\n".join([title, "", *_header(_COLUMNS), *lines, ""]))
     return "\n".join(parts)
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """What docs/validation.md says of a run."""
-    rows = rows_of(outcomes)
-    must = [row for row in rows if row.mutation.beyond is None]
-    told = dict(zip(("found", "harmless", "missed"), _tally(must), strict=True))
-    counts = {
-        **told,
-        "count": sum(told.values()),
-        "kinds": len(must),
-        "beyond": len(rows) - len(must),
-    }
-    return _SUMMARY.format(**counts) + _groups(must)
+    """Return the part of docs/validation.md that describes a run."""
+    rows = make_rows(outcomes)
+    required_rows = [row for row in rows if row.mutation.beyond is None]
+    num_found, num_harmless, num_missed = _count_applications(required_rows)
+    return _SUMMARY.format(
+        found=num_found,
+        harmless=num_harmless,
+        missed=num_missed,
+        count=num_found + num_harmless + num_missed,
+        kinds=len(required_rows),
+        beyond=len(rows) - len(required_rows),
+    )
 
 
-def _tally(rows: Sequence[Row]) -> tuple[int, int, int]:
-    """How many applications were found, are harmless and were missed."""
-    harmless = sum(len(row.outcomes) for row in rows if row.verdict == "harmless")
-    found = sum(row.found for row in rows if row.verdict != "harmless")
-    return found, harmless, sum(len(row.outcomes) for row in rows) - found - harmless
+def _count_applications(rows: Sequence[Row]) -> tuple[int, int, int]:
+    """Return the numbers of applications that were found, are harmless and were missed."""
+    total = sum(len(row.outcomes) for row in rows)
+    num_harmless = sum(len(row.outcomes) for row in rows if row.verdict == "harmless")
+    num_found = sum(row.found for row in rows if row.verdict != "harmless")
+    return num_found, num_harmless, total - num_found - num_harmless
 
 
-def _groups(rows: Sequence[Row]) -> str:
-    lines = []
-    for group in dict.fromkeys(row.mutation.group for row in rows):
-        of_group = [row for row in rows if row.mutation.group == group]
-        lines.append(_line([group, str(len(of_group)), *map(str, _tally(of_group))]))
-    return "\n".join([*_header(("files", "kinds", "found", "harmless", "missed")), *lines, ""])
+def _group_rows(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    rows_by_group: dict[str, list[Row]] = {}
+    for row in rows:
+        rows_by_group.setdefault(row.mutation.group, []).append(row)
+    return rows_by_group
 
 
 def _header(columns: Sequence[str]) -> list[str]:
-    return [_line(columns), _line(["---"] * len(columns))]
+    return [_format_line(columns), _format_line(["---"] * len(columns))]
 
 
-def _line(cells: Sequence[str]) -> str:
+def _format_line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"

@@ -1,12 +1,12 @@
-"""The mutations themselves: each changes something, the same with the same seed, and is undone."""
+"""Each mutation changes something, the same with the same seed, and can be undone."""
 
 from pathlib import Path
 
 import pytest
 
+from fault_injection.editor import UndoableEditor
 from fault_injection.mutations import MUTATIONS
-from fault_injection.place import Place
-from fault_injection.run import Job, mutate, places
+from fault_injection.run import Job, mutate, open_editors
 
 pytestmark = pytest.mark.slow
 
@@ -14,36 +14,40 @@ SEED = 1
 
 
 @pytest.fixture(scope="module")
-def own_places(healthy_release: Path, release_copy: Path) -> dict[str, Place]:
-    return places(release_copy)
+def editors(release_copy: Path) -> dict[str, UndoableEditor]:
+    return open_editors(release_copy)
 
 
-def applied(name: str, of: dict[str, Place]) -> tuple[str, dict[str, bytes | None]]:
-    """The scenario that a mutation damages, and the changed files, which are put back."""
-    place = mutate(Job(name, SEED), of)
-    changes = place.changes()
-    place.restore()
-    return place.token, changes
+def apply_and_undo(
+    name: str, editors: dict[str, UndoableEditor]
+) -> tuple[str, dict[str, bytes | None]]:
+    """Return the token of the scenario that a mutation damages, and the files that it changes."""
+    editor = mutate(Job(name, SEED), editors)
+    changes = editor.changes()
+    editor.restore()
+    return editor.token, changes
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
-def test_a_mutation_changes_files_and_depends_on_its_seed_alone(own_places, name):
-    token, changes = applied(name, own_places)
+def test_a_mutation_changes_files_and_depends_only_on_its_seed(editors, name):
+    token, changes = apply_and_undo(name, editors)
     assert changes
-    assert applied(name, own_places) == (token, changes)
+    assert apply_and_undo(name, editors) == (token, changes)
 
 
-def test_restoring_brings_every_file_back(own_places, healthy_release):
+def test_restoring_brings_every_file_back(editors, healthy_release, release_copy):
     for name in MUTATIONS:
-        applied(name, own_places)
-    assert contents(next(iter(own_places.values())).root) == contents(healthy_release)
+        apply_and_undo(name, editors)
+    assert read_files(release_copy) == read_files(healthy_release)
 
 
-def test_every_mutation_says_what_it_does():
-    assert len({mutation.title for mutation in MUTATIONS.values()} - {""}) == len(MUTATIONS)
+def test_every_mutation_has_its_own_title():
+    titles = {mutation.title for mutation in MUTATIONS.values()}
+    assert "" not in titles
+    assert len(titles) == len(MUTATIONS)
 
 
-def contents(root: Path) -> dict[str, bytes]:
+def read_files(root: Path) -> dict[str, bytes]:
     return {
         path.relative_to(root).as_posix(): path.read_bytes()
         for path in sorted(root.rglob("*"))

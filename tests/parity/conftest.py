@@ -9,14 +9,14 @@ the file, the list or the array is missing or empty, it runs once, and fails.
 import functools
 import importlib.util
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from golden_model import GoldenModel
+from support.golden_model import GoldenModel
 
 if importlib.util.find_spec("torch") is None:
     collect_ignore_glob = ["test_model*"]
@@ -24,8 +24,9 @@ if importlib.util.find_spec("torch") is None:
 
 @dataclass(frozen=True)
 class GoldenCase:
-    """One entry of a golden part; arrays by (name, further indices): `golden["xy", 3]` is
-    `xy_<case>_3`.
+    """One entry of a golden part, indexed by an array's name and further indices.
+
+    `golden["xy", 3]` is the array `xy_<case>_3`.
     """
 
     folder: Path
@@ -43,29 +44,35 @@ class GoldenCase:
 
     @property
     def entry(self) -> Any:
-        """What the part's JSON says of this case."""
+        """Return the case's entry in the part's JSON file."""
         return _json(self.folder / f"{self.part}.json")[self.key][self._checked_index()]
 
     def __getitem__(self, name: str | tuple[str | int, ...]) -> np.ndarray:
         first, *rest = (name,) if isinstance(name, str) else name
-        arrays, index = _arrays(self.folder / f"{self.part}.npz"), self._checked_index()
-        names = ["_".join([str(first), f"{index:0{width}d}", *map(str, rest)]) for width in (2, 3)]
-        return arrays[next((name for name in names if name in arrays), names[0])]
+        arrays = _arrays(self.folder / f"{self.part}.npz")
+        index = self._checked_index()
+
+        suffix = "".join(f"_{number}" for number in rest)
+        long_name = f"{first}_{index:03d}{suffix}"
+        if long_name in arrays:
+            return arrays[long_name]
+        return arrays[f"{first}_{index:02d}{suffix}"]
 
     @property
     def whole(self) -> dict[str, Any]:
-        """All that the part's JSON says."""
+        """Return the content of the part's JSON file."""
         return _json(self.folder / f"{self.part}.json")
 
     def array(self, name: str) -> np.ndarray:
-        """An array of the part that is not one case's."""
+        """Return an array of the part that belongs to no single case."""
         return _arrays(self.folder / f"{self.part}.npz")[name]
 
 
 @dataclass(frozen=True)
 class GoldenRow:
-    """One row of the arrays of a golden part that have a row a case:
-    `golden_row["ego_to_world"]`.
+    """One case of a golden part that has a row a case in its arrays.
+
+    `golden_row["ego_to_world"]` is this case's row of the array.
     """
 
     folder: Path
@@ -84,7 +91,9 @@ class GoldenRow:
 
 @functools.cache
 def _json(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    if not path.is_file():
+        return {}
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 @functools.cache
@@ -110,29 +119,21 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if by_case is not None:
         part, key = by_case.args
         count = len(_json(folder / f"{part}.json").get(key, []))
-        _parametrize(
-            metafunc,
-            "golden",
-            [GoldenCase(folder, part, key, index) for index in range(count) or [None]],
-        )
+        cases = [GoldenCase(folder, part, key, index) for index in range(count) or [None]]
+        metafunc.parametrize("golden", cases, ids=_name_case)
     by_row = metafunc.definition.get_closest_marker("golden_rows")
     if by_row is not None:
         part, key = by_row.args
         count = len(_arrays(folder / f"{part}.npz").get(key, []))
-        _parametrize(
-            metafunc,
-            "golden_row",
-            [GoldenRow(folder, part, key, index) for index in range(count) or [None]],
-        )
+        rows = [GoldenRow(folder, part, key, index) for index in range(count) or [None]]
+        metafunc.parametrize("golden_row", rows, ids=_name_case)
 
 
-def _parametrize(
-    metafunc: pytest.Metafunc, name: str, cases: Sequence[GoldenCase | GoldenRow]
-) -> None:
-    metafunc.parametrize(name, cases, ids=lambda case: f"{case.part}-{case.index}")
+def _name_case(case: GoldenCase | GoldenRow) -> str:
+    return f"{case.part}-{case.index}"
 
 
 @pytest.fixture
 def golden_model(request: pytest.FixtureRequest) -> Callable[[str], GoldenModel]:
-    """A golden part of the model by its name."""
+    """Return a function that reads a golden part of the model by its name."""
     return functools.partial(GoldenModel, request.config.getoption("golden"))

@@ -2,7 +2,7 @@
 
 UString, DSTA, DRIVE and DAD were run with their sorts made stable, `clean` is plain code with
 scikit-learn's AP and AUC (tests/data/golden/safety/README.md). All numbers to 1e-9; where a
-published code raised an error the devkit says NaN.
+published code raised an error the devkit gives NaN.
 """
 
 import functools
@@ -46,18 +46,17 @@ CLEAN_NAMES = {
 @functools.cache
 def _cases(folder: Path) -> Mapping[str, Any]:
     path = folder / "safety" / "anticipation.json"
-    return json.loads(path.read_text(encoding="utf-8"))["cases"] if path.is_file() else {}
+    if not path.is_file():
+        return {}
+    return json.loads(path.read_text(encoding="utf-8"))["cases"]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     cases = _cases(metafunc.config.getoption("golden"))
     if "code" in metafunc.fixturenames:
-        pairs = [
-            (name, code)
-            for name, case in cases.items()
-            for code in case
-            if code.endswith("_stable")
-        ]
+        pairs = []
+        for name, codes in cases.items():
+            pairs += [(name, code) for code in codes if code.endswith("_stable")]
         metafunc.parametrize(("case", "code"), pairs or [(None, None)])
     else:
         metafunc.parametrize("case", list(cases) or [None])
@@ -75,12 +74,12 @@ def golden(
     return _cases(folder)[case], arrays
 
 
-def series_of(
+def make_series(
     entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, cut: bool
 ) -> ScoreSeries:
     positive = arrays["labels"] > 0
-    columns = arrays["scores"].shape[1]
-    toa = np.where(positive, arrays["toa"], arrays["length"] if cut else columns)
+    num_frames = arrays["length"] if cut else arrays["scores"].shape[1]
+    toa = np.where(positive, arrays["toa"], num_frames)
     return ScoreSeries(
         scores=arrays["scores"].astype(np.float64),
         positive=positive,
@@ -89,34 +88,36 @@ def series_of(
     )
 
 
-def same(found: float | None, expected: float | None, what: str) -> None:
+def assert_same(value: float | None, expected: float | None, name: str) -> None:
     if expected is None:
-        assert found is None or math.isnan(found), what
+        assert value is None or math.isnan(value), name
     else:
-        assert found == pytest.approx(expected, rel=1e-9, abs=1e-9), what
+        assert value == pytest.approx(expected, rel=1e-9, abs=1e-9), name
 
 
-def test_as_the_published_codes(golden, case: str, code: str) -> None:
+def test_figures_equal_the_published_codes(golden, case: str, code: str) -> None:
     entry, arrays = golden
     expected = entry[code]
-    figures = printed_figures(series_of(entry, arrays, cut=False), code.removesuffix("_stable"))
+    figures = printed_figures(make_series(entry, arrays, cut=False), code.removesuffix("_stable"))
     if "error" in expected:
         assert math.isnan(figures.average_precision)
         assert math.isnan(figures.mean_time)
         assert figures.note
         return
     for name, value in expected.items():
-        same(getattr(figures, FIELD_NAMES[name]), value, name)
+        assert_same(getattr(figures, FIELD_NAMES[name]), value, name)
 
 
 def test_clean(golden, case: str) -> None:
     entry, arrays = golden
     expected = entry["clean"]
-    clean = CleanScores(series_of(entry, arrays, cut=True))
+    clean = CleanScores(make_series(entry, arrays, cut=True))
     weight = np.ones(len(arrays["labels"]))
-    same(clean.average_precision(weight), expected["AP"], "AP")
-    same(clean.area_under_curve(weight), expected["AUC"], "AUC")
-    same(clean.mean_time(weight), expected.get("mTTA_curve"), "mTTA_curve")
+
+    assert_same(clean.average_precision(weight), expected["AP"], "AP")
+    assert_same(clean.area_under_curve(weight), expected["AUC"], "AUC")
+    assert_same(clean.mean_time(weight), expected.get("mTTA_curve"), "mTTA_curve")
+
     thresholds = {
         "at_0.5": 0.5,
         "at_R80": clean.threshold_of_recall(weight),
@@ -124,9 +125,9 @@ def test_clean(golden, case: str) -> None:
     }
     for point, threshold in thresholds.items():
         figures = clean.at(threshold, weight)
-        told = expected.get(point)
-        if told is None:
+        expected_figures = expected.get(point)
+        if expected_figures is None:
             assert math.isnan(figures.recall), point
             continue
-        for name, value in told.items():
-            same(getattr(figures, CLEAN_NAMES[name]), value, f"{point}/{name}")
+        for name, value in expected_figures.items():
+            assert_same(getattr(figures, CLEAN_NAMES[name]), value, f"{point}/{name}")

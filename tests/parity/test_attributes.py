@@ -1,9 +1,9 @@
 """The golden attributes (tests/data/golden: a_labels, d_accident), by which the released evaluation
-sorts its results.
+groups its results.
 
-a_labels has meta lines and what the released code read in them, d_accident which samples of a run
-have which value (docs/released_code.md, Visibility and attributes). Equal words.
-`accident_visibility` itself is `test_visibility`'s.
+a_labels has meta lines and the values that the released code read from them, d_accident the samples
+of a run that have each value (docs/released_code.md, Visibility and attributes). The words are
+equal. `test_visibility` tests `accident_visibility` itself.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ import pytest
 from deepaccident_devkit.evaluation.breakdowns import SampleAttributes, tokens_by_value
 from deepaccident_devkit.selection.fields import FIELDS
 
-_TIMES = ("Noon", "Sunset", "Night")
+_TIMES_OF_DAY = ("Noon", "Sunset", "Night")
 _NAMES = {
     "scenario_type": "scenario_type",
     "town_name": "town",
@@ -25,45 +25,45 @@ _NAMES = {
     "accident_visibility": "accident_visibility",
     "seconds_before_end_of_scenario": "time_to_end",
 }
-"""The released names → ours."""
+"""Our name of each released attribute."""
 _ROADS = {"four_way_junction": "four-way junction", "three_way_junction": "three-way junction"}
-"""The released words that meta, and so our table, has otherwise."""
+"""Our word for a released value that the meta files, and so our table, spell differently."""
 _VISIBILITY = {"True": "visible", "False": "invisible"}
 
 
-def record_of(golden) -> dict[str, Any]:
-    """The fields of a scenario's record that the stored meta lines and sample name say."""
-    first, *lines = golden.entry["meta"]
-    word, _, class1, _, class2 = first.split()[:5]
-    said = dict(line.split(": ", 1) for line in lines if ": " in line)
-    time = next(time for time in _TIMES if word.endswith(time))
+def make_record(golden) -> dict[str, Any]:
+    """Return a scenario's record with the fields of the stored meta lines and sample name."""
+    first_line, *lines = golden.entry["meta"]
+    word, _, class1, _, class2 = first_line.split()[:5]
+    meta = dict(line.split(": ", 1) for line in lines if ": " in line)
+    time = next(time for time in _TIMES_OF_DAY if word.endswith(time))
+    sample_name = golden.entry["sample_idx"]
     return {
-        "scenario_type": golden.entry["sample_idx"].split("_accident_")[0] + "_accident",
-        "town": next(
-            part for part in golden.entry["sample_idx"].split("_") if part.startswith("Town")
-        ),
+        "scenario_type": sample_name.split("_accident_")[0] + "_accident",
+        "town": next(part for part in sample_name.split("_") if part.startswith("Town")),
         "weather": word.removesuffix(time),
         "time_of_day": time,
         "collision": None if class1 == class2 == "-1" else {"classes": [class1, class2]},
-        "road_type": said["junction type"],
-        "ego_direction": said["self direction"],
-        "other_direction": said["other direction"],
+        "road_type": meta["junction type"],
+        "ego_direction": meta["self direction"],
+        "other_direction": meta["other direction"],
     }
 
 
 @pytest.mark.golden_cases("a_labels", "scenes")
 def test_attributes_of_meta_equal_the_released_codes(golden) -> None:
-    expected = golden.entry["scene_attributes"]
-    found = {name: FIELDS[_NAMES[name]].read(None, record_of(golden)) for name in expected}  # type: ignore[arg-type]
-    assert found == {name: _ROADS.get(value, value) for name, value in expected.items()}
+    record = make_record(golden)
+    for name, value in golden.entry["scene_attributes"].items():
+        attribute = FIELDS[_NAMES[name]].read(None, record)  # type: ignore[arg-type]
+        assert attribute == _ROADS.get(value, value), name
 
 
-def attributes_of(entry: dict[str, Any]) -> SampleAttributes:
-    said = {_NAMES[name]: value for name, value in entry["meta"].items()}
+def make_attributes(entry: dict[str, Any]) -> SampleAttributes:
+    story = {_NAMES[name]: value for name, value in entry["meta"].items()}
     return SampleAttributes(
         scenario=entry["sample_idx"],
         agent=entry["agent"],
-        story=said,
+        story=story,
         accident_visibility=_VISIBILITY[str(entry["accident_visibility"])],
         time_to_impact=None,
         impact_step=None,
@@ -72,16 +72,17 @@ def attributes_of(entry: dict[str, Any]) -> SampleAttributes:
 
 
 @pytest.mark.golden_cases("d_accident", "attributes_counter")
-def test_who_has_which_value(golden) -> None:
-    name = list(golden.whole["attributes_counter"])[golden.index]
+def test_samples_are_grouped_by_attribute_value(golden) -> None:
+    name, indices_by_value = list(golden.whole["attributes_counter"].items())[golden.index]
+    expected = {
+        _VISIBILITY.get(value, value): [str(index) for index in indices]
+        for value, indices in indices_by_value.items()
+    }
     attributes = {
-        str(index): attributes_of(entry) for index, entry in enumerate(golden.whole["samples"])
+        str(index): make_attributes(entry) for index, entry in enumerate(golden.whole["samples"])
     }
-    found = tokens_by_value(attributes, _NAMES[name])
-    expected = golden.whole["attributes_counter"][name]
-    as_ours = {
-        _VISIBILITY.get(value, value): [str(index) for index in each]
-        for value, each in expected.items()
-    }
-    assert found == as_ours
-    assert list(found) == list(as_ours)
+
+    tokens = tokens_by_value(attributes, _NAMES[name])
+
+    assert tokens == expected
+    assert list(tokens) == list(expected)

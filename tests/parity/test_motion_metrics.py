@@ -1,10 +1,10 @@
 """The golden IoU and VPQ (tests/data/golden, b_vpq) of linked instances, at both ranges, of each
 sequence and of all.
 
-Made by the released functions (FIERY's panoptic metric, torchmetrics' IoU) under numpy 1.23.5 and
-torch 2.13 on the CPU (tests/data/golden/README.md; docs/released_code.md, IoU and VPQ). Counts
-equal; rates and sums of intersections over unions to 2e-6, since the released code sums in float32.
-`test_trajectories` has the errors of the paths, `test_motion_end_to_end` the evaluator.
+The released functions (FIERY's panoptic metric, torchmetrics' IoU) made them under numpy 1.23.5 and
+torch 2.13 on the CPU (tests/data/golden/README.md; docs/released_code.md, IoU and VPQ). Counts are
+equal; rates and sums of intersections over unions agree to 2e-6, since the released code sums in
+float32. `test_trajectories` tests the errors of the paths, `test_motion_end_to_end` the evaluator.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,8 @@ from deepaccident_devkit.evaluation.instances import (
 
 RANGES = ("30x30", "100x100")
 TOLERANCE = 2e-6
-PARTS = ("iou", "true_positive", "false_positive", "false_negative")
+COUNTS = ("true_positive", "false_positive", "false_negative")
+PARTS = ("iou", *COUNTS)
 by_range = pytest.mark.parametrize("name", RANGES)
 
 
@@ -35,95 +36,99 @@ def crop(golden, name: str, maps: np.ndarray) -> np.ndarray:
     return maps[:, cells, cells]
 
 
-def instances(golden, name: str) -> tuple[np.ndarray, np.ndarray]:
+def crop_instances(golden, name: str) -> tuple[np.ndarray, np.ndarray]:
     return crop(golden, name, golden["pred"]), crop(golden, name, golden["gt"])
 
 
-def segmentations(golden, name: str) -> list[SegmentationCounts]:
-    predicted, true = (crop(golden, name, golden[which]) for which in ("seg_pred", "seg_gt"))
+def count_cells(golden, name: str) -> list[SegmentationCounts]:
+    predicted = crop(golden, name, golden["seg_pred"])
+    true = crop(golden, name, golden["seg_gt"])
     return [mask_counts(predicted == index, true == index) for index in (0, 1)]
 
 
-def vpq(counts: Sequence[VpqCounts]) -> list[PanopticQuality]:
-    """Of the background and of the instances, over all frames of all sequences."""
-    sums = [sum(getattr(each, part).sum(axis=0) for each in counts) for part in PARTS]
-    return [panoptic_quality(*numbers) for numbers in zip(*sums, strict=True)]
+def compute_vpq(sequences: Sequence[VpqCounts]) -> list[PanopticQuality]:
+    """Return the quality of background and instances over all frames of all sequences."""
+    frame_counts = concatenate_frames(sequences)
+    return quality_of_sums([counts.sum(axis=0) for counts in frame_counts])
 
 
-def assert_quality(found: Sequence[PanopticQuality], expected: dict) -> None:
+def concatenate_frames(sequences: Sequence[VpqCounts]) -> list[np.ndarray]:
+    """Return each part of the counts, frame by frame over all sequences."""
+    return [np.concatenate([getattr(counts, part) for counts in sequences]) for part in PARTS]
+
+
+def quality_of_sums(sums: Sequence[np.ndarray]) -> list[PanopticQuality]:
+    return [panoptic_quality(*class_sums) for class_sums in zip(*sums, strict=True)]
+
+
+def compute_ious(cells: Sequence[list[SegmentationCounts]]) -> list[float]:
+    """Return the IoU of background and instances over all sequences."""
+    return [iou(counts) for counts in zip(*cells, strict=True)]
+
+
+def assert_quality(qualities: Sequence[PanopticQuality], expected: dict) -> None:
     for key in ("pq", "sq", "rq", "denominator"):
-        assert_allclose(
-            [getattr(each, key) for each in found], expected[key], rtol=0, atol=TOLERANCE
-        )
+        values = [getattr(quality, key) for quality in qualities]
+        assert_allclose(values, expected[key], rtol=0, atol=TOLERANCE)
 
 
 @by_range
 @pytest.mark.golden_cases("b_vpq", "sequences")
 def test_vpq_of_a_sequence(golden, name: str) -> None:
-    found, expected = vpq_counts(*instances(golden, name)), golden.entry[name]
-    assert len(found.iou) == golden.entry["S"]
-    for key in ("true_positive", "false_positive", "false_negative"):
-        assert_array_equal(getattr(found, key), [frame[key] for frame in expected["per_frame"]])
-    assert_allclose(
-        found.iou, [frame["iou"] for frame in expected["per_frame"]], rtol=TOLERANCE, atol=TOLERANCE
-    )
-    assert_quality(vpq([found]), expected)
+    expected = golden.entry[name]
+    counts = vpq_counts(*crop_instances(golden, name))
+    assert len(counts.iou) == golden.entry["S"]
+    for key in COUNTS:
+        expected_counts = [frame[key] for frame in expected["per_frame"]]
+        assert_array_equal(getattr(counts, key), expected_counts)
+    expected_ious = [frame["iou"] for frame in expected["per_frame"]]
+    assert_allclose(counts.iou, expected_ious, rtol=TOLERANCE, atol=TOLERANCE)
+    assert_quality(compute_vpq([counts]), expected)
 
 
 @by_range
 @pytest.mark.golden_cases("b_vpq", "sequences")
 def test_panoptic_quality_of_a_sequence_frame_by_frame(golden, name: str) -> None:
-    found = vpq_counts(*instances(golden, name), temporally_consistent=False)
-    assert_quality(vpq([found]), golden.entry[name]["not_temporally_consistent"])
+    counts = vpq_counts(*crop_instances(golden, name), temporally_consistent=False)
+    assert_quality(compute_vpq([counts]), golden.entry[name]["not_temporally_consistent"])
 
 
 @by_range
 @pytest.mark.golden_cases("b_vpq", "sequences")
 def test_iou_of_a_sequence(golden, name: str) -> None:
-    found, expected = segmentations(golden, name), golden.entry[name]
-    for key in ("true_positive", "false_positive", "false_negative"):
-        assert [getattr(each, key) for each in found] == expected["seg_counts"][key]
-    support = [each.true_positive + each.false_negative for each in found]
+    expected = golden.entry[name]
+    cells = count_cells(golden, name)
+    for key in COUNTS:
+        numbers = [getattr(counts, key) for counts in cells]
+        assert numbers == expected["seg_counts"][key]
+    support = [counts.true_positive + counts.false_negative for counts in cells]
     assert support == expected["seg_counts"]["support"]
-    assert_allclose([iou([each]) for each in found], expected["iou"], rtol=0, atol=TOLERANCE)
+    assert_allclose(compute_ious([cells]), expected["iou"], rtol=0, atol=TOLERANCE)
 
 
 @pytest.mark.golden_cases("b_vpq", "aggregate")
 def test_all_sequences(golden) -> None:
-    """Sums over everything, and over the sequences `selected_index`, as a breakdown takes them; and
-    the mistake.
+    """Compare sums over all sequences and over the selected ones of a breakdown.
+
+    The released code takes the indices of the selected sequences for indices of frames.
     """
-    name = list(golden.whole["aggregate"])[golden.index]
-    expected, selected = golden.whole["aggregate"][name], golden.whole["selected_index"]
+    name, expected = list(golden.whole["aggregate"].items())[golden.index]
+    selected = golden.whole["selected_index"]
     cases = [
         replace(golden, key="sequences", index=number)
         for number in range(len(golden.whole["sequences"]))
     ]
-    counts = [vpq_counts(*instances(case, name)) for case in cases]
-    cells = [segmentations(case, name) for case in cases]
+    sequences = [vpq_counts(*crop_instances(case, name)) for case in cases]
+    cells = [count_cells(case, name) for case in cases]
 
-    assert_quality(vpq(counts), expected["separate"])
-    assert_quality(vpq(counts), expected["plain"])
-    frames = [
-        [getattr(each, part)[frame] for part in PARTS]
-        for each in counts
-        for frame in range(len(each.iou))
-    ]
-    wrong = np.sum([frames[number] for number in selected], axis=0)
-    assert_quality(
-        [panoptic_quality(*sums) for sums in wrong.T], expected["separate_selected_as_released"]
-    )
-    for key in ("iou_separate", "iou_plain"):
-        assert_allclose(
-            [iou([each[index] for each in cells]) for index in (0, 1)],
-            expected[key],
-            rtol=0,
-            atol=TOLERANCE,
-        )
-    chosen = [cells[number] for number in selected]
-    assert_allclose(
-        [iou([each[index] for each in chosen]) for index in (0, 1)],
-        expected["iou_selected"],
-        rtol=0,
-        atol=TOLERANCE,
-    )
+    assert_quality(compute_vpq(sequences), expected["separate"])
+    assert_quality(compute_vpq(sequences), expected["plain"])
+
+    wrong_sums = [counts[selected].sum(axis=0) for counts in concatenate_frames(sequences)]
+    assert_quality(quality_of_sums(wrong_sums), expected["separate_selected_as_released"])
+
+    ious = compute_ious(cells)
+    assert_allclose(ious, expected["iou_separate"], rtol=0, atol=TOLERANCE)
+    assert_allclose(ious, expected["iou_plain"], rtol=0, atol=TOLERANCE)
+    selected_ious = compute_ious([cells[number] for number in selected])
+    assert_allclose(selected_ious, expected["iou_selected"], rtol=0, atol=TOLERANCE)

@@ -15,6 +15,9 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.opencood import OpenCood
 
+PRECISE_KEYS = {"angle", "cords", "pos"}
+"""The keys of values that are equal within 1e-9 instead of 1e-6."""
+
 
 @pytest.fixture(scope="module")
 def golden(request: pytest.FixtureRequest) -> Path:
@@ -24,50 +27,48 @@ def golden(request: pytest.FixtureRequest) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The export of the golden release."""
+def exported(golden: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Export the golden release."""
     root = tmp_path_factory.mktemp("golden")
     shutil.copytree(golden / "release", root / "release")
     dataset = DeepAccident("v1", root / "release", index_dir=root / "index", verbose=False)
     return export_release(dataset, root / "out", OpenCood(without_clouds=True)).folder
 
 
-def test_every_value_is_equal(golden: Path, made: Path) -> None:
-    ours = {path.name: path for path in made.glob("*/*")}
+def test_every_value_is_equal(golden: Path, exported: Path) -> None:
+    scenario_folders = {path.name: path for path in exported.glob("*/*")}
     for path in sorted(golden.glob("opencood/*/*/*.yaml")):
         scenario, agent, name = path.parts[-3:]
-        expected, found = (
-            yaml.safe_load(each.read_text()) for each in (path, ours[scenario] / agent / name)
-        )
-        for where, theirs, mine in differences(expected, found):
-            tolerance = 1e-9 if "angle" in where or "cords" in where or "pos" in where else 1e-6
-            assert isinstance(theirs, float), (path, where, theirs, mine)
-            assert math.isclose(theirs, mine, rel_tol=0, abs_tol=tolerance), (
-                path,
-                where,
-                theirs,
-                mine,
-            )
+        expected = yaml.safe_load(path.read_text())
+        content = yaml.safe_load((scenario_folders[scenario] / agent / name).read_text())
+        for keys, theirs, ours in find_differences(expected, content):
+            message = (path, keys, theirs, ours)
+            tolerance = 1e-6 if PRECISE_KEYS.isdisjoint(keys) else 1e-9
+            assert isinstance(theirs, float), message
+            assert math.isclose(theirs, ours, rel_tol=0, abs_tol=tolerance), message
 
 
-def test_point_clouds_are_the_same_bytes(golden: Path, made: Path) -> None:
-    ours = {path.name: path for path in made.glob("*/*")}
+def test_point_clouds_are_the_same_bytes(golden: Path, exported: Path) -> None:
+    scenario_folders = {path.name: path for path in exported.glob("*/*")}
     clouds = list(golden.glob("opencood/*/*/*.pcd"))
     assert clouds
     for path in clouds:
         scenario, agent, name = path.parts[-3:]
-        assert (ours[scenario] / agent / name).read_bytes() == path.read_bytes()
+        exported_path = scenario_folders[scenario] / agent / name
+        assert exported_path.read_bytes() == path.read_bytes()
 
 
-def differences(
-    expected: Any, found: Any, where: tuple[str, ...] = ()
+def find_differences(
+    expected: Any, content: Any, keys: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
-    """Where two loaded files differ, and by what."""
-    if isinstance(expected, dict) and isinstance(found, dict) and expected.keys() == found.keys():
+    """Yield keys, expected value and value wherever two loaded files differ."""
+    are_dicts = isinstance(expected, dict) and isinstance(content, dict)
+    are_lists = isinstance(expected, list) and isinstance(content, list)
+    if are_dicts and expected.keys() == content.keys():
         for name, value in expected.items():
-            yield from differences(value, found[name], (*where, str(name)))
-    elif isinstance(expected, list) and isinstance(found, list) and len(expected) == len(found):
+            yield from find_differences(value, content[name], (*keys, str(name)))
+    elif are_lists and len(expected) == len(content):
         for number, value in enumerate(expected):
-            yield from differences(value, found[number], (*where, str(number)))
-    elif expected != found:
-        yield where, expected, found
+            yield from find_differences(value, content[number], (*keys, str(number)))
+    elif expected != content:
+        yield keys, expected, content

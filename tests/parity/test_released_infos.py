@@ -1,8 +1,7 @@
-"""The released infos against those that the released converter made of the same release, key by
-key.
+"""The exported infos against the ones that the released converter wrote, key by key.
 
-Made by the converter itself, unpatched (tests/data/golden/exports/README.md); the keys are
-docs/exports.md, The released code.
+The unpatched converter made the golden infos from the same release
+(tests/data/golden/exports/README.md); docs/exports.md, The released code, describes the keys.
 """
 
 import json
@@ -30,15 +29,18 @@ def test_every_info_is_equal(golden: Path, tmp_path: Path) -> None:
     shutil.copytree(golden / "release", tmp_path / "release")
     dataset = DeepAccident("v1", tmp_path / "release", index_dir=tmp_path / "index", verbose=False)
     export_release(dataset, tmp_path / "out", ReleasedInfos())
-    found = pickle.loads((tmp_path / "out/carla_infos_train.pkl").read_bytes())
+
+    content = pickle.loads((tmp_path / "out/carla_infos_train.pkl").read_bytes())
     expected = json.loads((golden / "released_infos.json").read_text())
     assert expected
-    assert [plain(info) for info in found["infos"]] == expected
-    assert found["metadata"] == {"version": "v1.0-trainval"}
+    assert [to_plain(info) for info in content["infos"]] == expected
+    assert content["metadata"] == {"version": "v1.0-trainval"}
 
 
-def plain(value: Any) -> Any:
-    """A value as the golden file has it."""
+def to_plain(value: Any) -> Any:
+    """Convert a value to the types of the golden file."""
     if isinstance(value, np.ndarray):
         return {"dtype": str(value.dtype), "shape": list(value.shape), "data": value.tolist()}
-    return {name: plain(each) for name, each in value.items()} if isinstance(value, dict) else value
+    if isinstance(value, dict):
+        return {name: to_plain(item) for name, item in value.items()}
+    return value

@@ -1,13 +1,11 @@
-"""Laws of motion labels: an id's cells are its box, flow leads to the next frame, orientations hold
-the same.
-"""
+"""Laws of motion labels: cells cover the box, flow leads to the next frame, orientations agree."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
-from strategies import ANGLES, grids, numbers
+from support.strategies import ANGLES, grids, numbers
 
 from deepaccident_devkit.geometry import SE3, BevGrid, conventions
 from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS, cells_in, to_orientation, vectors_in
@@ -18,7 +16,7 @@ from deepaccident_devkit.motion import (
     motion_labels_from_boxes,
 )
 
-CELL = 0.5
+CELL_M = 0.5
 orientations = st.sampled_from(ORIENTATIONS)
 protocols = st.sampled_from(sorted(LABEL_PROTOCOLS))
 
@@ -27,10 +25,16 @@ protocols = st.sampled_from(sorted(LABEL_PROTOCOLS))
 def placed_boxes(draw: st.DrawFn, reach: float = 60.0) -> tuple[np.ndarray, np.ndarray, float]:
     """Centre (3,), size (3,) and yaw of a road user's box."""
     center = np.array([draw(numbers(reach)), draw(numbers(reach)), 0.0])
-    return center, np.array([draw(st.floats(0.4, 12)), draw(st.floats(0.4, 3)), 1.5]), draw(ANGLES)
+    size = np.array([draw(st.floats(0.4, 12)), draw(st.floats(0.4, 3)), 1.5])
+    return center, size, draw(ANGLES)
 
 
-def frame(center, size, yaw) -> FrameBoxes:
+def stack_boxes(boxes: list) -> FrameBoxes:
+    centers, sizes, yaws = (np.array([box[column] for box in boxes]) for column in range(3))
+    return make_frame(centers, sizes, yaws)
+
+
+def make_frame(center, size, yaw) -> FrameBoxes:
     return FrameBoxes(
         center=np.reshape(center, (-1, 3)),
         size=np.reshape(size, (-1, 3)),
@@ -42,7 +46,7 @@ def frame(center, size, yaw) -> FrameBoxes:
     )
 
 
-def labels(frames, motion, orientation="devkit", protocol="clean"):
+def make_labels(frames, motion, orientation="devkit", protocol="clean"):
     config = MotionLabelConfig(
         receptive_field=1,
         future_frames=len(frames) - 1,
@@ -55,20 +59,18 @@ def labels(frames, motion, orientation="devkit", protocol="clean"):
 
 @given(placed_boxes(), orientations)
 def test_the_cells_of_an_id_are_its_box(box, orientation) -> None:
-    """All cells well inside it, none well beside it: the corners are moved to cells, by less than
-    one each way.
-    """
-    made = labels([frame(*box)] * 2, np.zeros((2, 6)), orientation)
+    """All cells well inside it and none well outside it: each corner moves by less than a cell."""
+    labels = make_labels([make_frame(*box)] * 2, np.zeros((2, 6)), orientation)
     center, size, yaw = box
-    across, along = np.moveaxis(made.config.grid.centers() - center[:2], -1, 0)
-    ahead = across * np.cos(yaw) + along * np.sin(yaw)
-    left = along * np.cos(yaw) - across * np.sin(yaw)
-    beyond = np.maximum(np.abs(ahead) - size[0] / 2, np.abs(left) - size[1] / 2)
-    drawn = made.instance[0] == 1
-    reach = np.sqrt(2) * CELL
-    assert (beyond[drawn] <= reach).all()
-    assert drawn[beyond < -reach].all()
-    assert_array_equal(made.segmentation[0] == 1, drawn)
+    x, y = np.moveaxis(labels.config.grid.centers() - center[:2], -1, 0)
+    ahead = x * np.cos(yaw) + y * np.sin(yaw)
+    left = y * np.cos(yaw) - x * np.sin(yaw)
+    distance = np.maximum(np.abs(ahead) - size[0] / 2, np.abs(left) - size[1] / 2)
+    is_drawn = labels.instance[0] == 1
+    max_error = np.sqrt(2) * CELL_M
+    assert (distance[is_drawn] <= max_error).all()
+    assert is_drawn[distance < -max_error].all()
+    assert_array_equal(labels.segmentation[0] == 1, is_drawn)
 
 
 @given(
@@ -84,51 +86,51 @@ def test_the_cells_of_an_id_are_its_box(box, orientation) -> None:
 def test_flow_leads_to_where_the_box_is_at_the_next_frame(
     box, dx, dy, turned, ex, ey, eyaw, orientation
 ) -> None:
-    """In metres, seen from this frame's ego, to the cells' accuracy.
+    """The flow is in metres, seen from this frame's ego, as accurate as cells allow.
 
-    Each of two centres is off by less than a cell, for the corners are, and rounded; the warp adds
-    half a diagonal.
+    Each of two centres is off by less than a cell, because the corners are, and is rounded; the
+    warp adds half a diagonal.
     """
     center, size, yaw = box
-    moved = center + np.array([dx, dy, 0])
+    next_center = center + np.array([dx, dy, 0])
     next_from_this = SE3.from_six([ex, ey, 0, 0, 0, eyaw])
-    seen = next_from_this.apply(moved[None])[0]
-    frames = [frame(center, size, yaw), frame(seen, size, yaw + turned + eyaw)]
-    made = labels(frames, np.stack([next_from_this.to_six(), np.zeros(6)]), orientation)
-    flow = made.flow[0][:, made.instance[0] == 1]
+    seen_center = next_from_this.apply(next_center[None])[0]
+    frames = [make_frame(center, size, yaw), make_frame(seen_center, size, yaw + turned + eyaw)]
+    motion = np.stack([next_from_this.to_six(), np.zeros(6)])
+    labels = make_labels(frames, motion, orientation)
+
+    is_drawn = labels.instance[0] == 1
+    flow = labels.flow[0][:, is_drawn]
     assert (flow == flow[:, :1]).all()
-    grid = made.config.grid
-    step = np.stack(
-        [grid.centers()[1, 0] - grid.centers()[0, 0], grid.centers()[0, 1] - grid.centers()[0, 0]]
-    )
-    assert_allclose(flow[:, 0] @ step, [dx, dy], atol=(2 * 1.5 + np.sqrt(0.5)) * CELL)
-    assert (made.flow[0][:, made.instance[0] == 0] == 255).all()
+    centers = labels.config.grid.centers()
+    cell_steps = np.stack([centers[1, 0] - centers[0, 0], centers[0, 1] - centers[0, 0]])
+    max_error = (2 * 1.5 + np.sqrt(0.5)) * CELL_M
+    assert_allclose(flow[:, 0] @ cell_steps, [dx, dy], atol=max_error)
+    assert (labels.flow[0][:, ~is_drawn] == 255).all()
 
 
 @given(st.lists(placed_boxes(), max_size=4), numbers(3.0), numbers(0.3), orientations, protocols)
 def test_offsets_lead_to_the_peak(boxes, ahead, turn, orientation, protocol) -> None:
-    centers, sizes, yaws = (np.array([box[part] for box in boxes]) for part in range(3))
     motion = np.tile([ahead, 0, 0, 0, 0, turn], (3, 1))
-    made = labels([frame(centers, sizes, yaws)] * 3, motion, orientation, protocol)
-    t, row, column = np.nonzero(made.instance)
-    down, along = made.offset[t, :, row, column].T
-    assert (
-        made.centerness[t, 0, (row + down).astype(int), (column + along).astype(int)] == 1
-    ).all()
-    assert ((made.offset == 255).all(axis=1) == (made.instance == 0)).all()
-    assert (
-        (made.centerness == 1).sum(axis=(1, 2, 3)) <= made.instance.reshape(3, -1).max(axis=1)
-    ).all()
+    labels = make_labels([stack_boxes(boxes)] * 3, motion, orientation, protocol)
+    t, row, column = np.nonzero(labels.instance)
+    down, along = labels.offset[t, :, row, column].T
+    peak_row = (row + down).astype(int)
+    peak_column = (column + along).astype(int)
+    assert (labels.centerness[t, 0, peak_row, peak_column] == 1).all()
+    assert ((labels.offset == 255).all(axis=1) == (labels.instance == 0)).all()
+    num_peaks = (labels.centerness == 1).sum(axis=(1, 2, 3))
+    assert (num_peaks <= labels.instance.max(axis=(1, 2))).all()
 
 
 @given(st.lists(placed_boxes(), max_size=4), numbers(3.0), numbers(0.3), orientations, protocols)
 def test_labels_of_every_orientation_are_the_same_cells(
     boxes, ahead, turn, orientation, protocol
 ) -> None:
-    centers, sizes, yaws = (np.array([box[part] for box in boxes]) for part in range(3))
     motion = np.tile([ahead, 0, 0, 0, 0, turn], (2, 1))
-    frames = [frame(centers, sizes, yaws)] * 2
-    devkit, other = (labels(frames, motion, lying, protocol) for lying in ("devkit", orientation))
+    frames = [stack_boxes(boxes)] * 2
+    devkit = make_labels(frames, motion, "devkit", protocol)
+    other = make_labels(frames, motion, orientation, protocol)
     for name in ("segmentation", "instance", "centerness", "offset", "flow"):
         turned = to_orientation(
             getattr(devkit, name),
@@ -146,13 +148,12 @@ def test_labels_of_every_orientation_are_the_same_cells(
     st.booleans(),
 )
 def test_orientations_compose(maps, first, second, third, vectors) -> None:
-    def turned(array, source, target):
+    def turn(array, source, target):
         return to_orientation(array, vectors=vectors, source=source, target=target, ignore=3)
 
-    assert_array_equal(turned(turned(maps, first, second), second, first), maps)
-    assert_array_equal(
-        turned(turned(maps, first, second), second, third), turned(maps, first, third)
-    )
+    turned = turn(maps, first, second)
+    assert_array_equal(turn(turned, second, first), maps)
+    assert_array_equal(turn(turned, second, third), turn(maps, first, third))
 
 
 @given(grids(), orientations, st.data())
@@ -162,23 +163,22 @@ def test_cells_and_vectors_change_with_the_maps(grid: BevGrid, target, data) -> 
     down, along = data.draw(st.integers(-3, 3)), data.draw(st.integers(-3, 3))
     raster = np.zeros((2, rows, columns))
     raster[:, row, column] = down, along
-    lying = {"source": grid.orientation, "target": target}
-    there = cells_in(np.array(row), np.array(column), grid.shape, **lying)
-    turned = to_orientation(raster, vectors=True, **lying)
-    assert_array_equal(
-        turned[:, there[0], there[1]], vectors_in(np.array(down), np.array(along), **lying)
-    )
-    assert_allclose(grid.with_orientation(target).centers()[there], grid.centers()[row, column])
+    options = {"source": grid.orientation, "target": target}
+    cell = cells_in(np.array(row), np.array(column), grid.shape, **options)
+    vector = vectors_in(np.array(down), np.array(along), **options)
+    turned = to_orientation(raster, vectors=True, **options)
+    assert_array_equal(turned[:, cell[0], cell[1]], vector)
+    assert_allclose(grid.with_orientation(target).centers()[cell], grid.centers()[row, column])
 
 
 @given(placed_boxes(40.0), numbers(20.0), numbers(0.5))
 def test_the_released_flow_of_what_stands_still_is_the_egos_motion(box, ahead, turn) -> None:
-    """Whatever the ego does, what stands still in the world has no flow, to the cells' accuracy."""
+    """For any motion of the ego, a standing box has no flow beyond the accuracy of cells."""
     center, size, yaw = box
     motion = np.array([-ahead / 10, 0, 0, 0, 0, turn / 5])
     next_from_this = SE3(conventions.matrices_of_six(motion))
-    seen = next_from_this.apply(center[None])[0]
-    frames = [frame(center, size, yaw), frame(seen, size, yaw + turn / 5)]
-    made = labels(frames, np.stack([motion, np.zeros(6)]), "released", "released")
-    flow = made.flow[0][:, made.instance[0] == 1]
+    seen_center = next_from_this.apply(center[None])[0]
+    frames = [make_frame(center, size, yaw), make_frame(seen_center, size, yaw + turn / 5)]
+    labels = make_labels(frames, np.stack([motion, np.zeros(6)]), "released", "released")
+    flow = labels.flow[0][:, labels.instance[0] == 1]
     assert (np.abs(flow[flow != 255]) <= 2).all()

@@ -1,9 +1,7 @@
-"""Laws of the motion metrics: the arrays do what the plain rules say, whatever ids are called and
-samples' order.
-"""
+"""Laws of the motion metrics: they follow the plain rules for any ids and any order of samples."""
 
 import math
-from itertools import pairwise
+from itertools import product
 
 import numpy as np
 from hypothesis import given, settings
@@ -32,9 +30,7 @@ CONFIG = MotionLabelConfig(grid=GRID, future_frames=2)
 
 @st.composite
 def pairs(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
-    """Prediction and label; the prediction is the label with some cells changed, so that there are
-    matches.
-    """
+    """Prediction and label; the prediction is the label with some cells changed, so they match."""
     shape = draw(SHAPES)
     label = draw(hnp.arrays(np.int32, shape, elements=IDS, fill=st.just(1)))
     noise = draw(hnp.arrays(np.int32, shape, elements=st.integers(0, 9), fill=st.just(9)))
@@ -43,102 +39,109 @@ def pairs(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
 
 @st.composite
 def paths(draw: st.DrawFn) -> dict[int, np.ndarray]:
-    count, quarters = draw(st.integers(0, 5)), st.integers(-40, 40).map(lambda number: number / 4)
-    return {
-        index + 1: draw(hnp.arrays(np.float64, (draw(st.integers(1, 4)), 2), elements=quarters))
-        for index in range(count)
-    }
+    count = draw(st.integers(0, 5))
+    quarters = st.integers(-40, 40).map(lambda number: number / 4)
+    shapes = st.tuples(st.integers(1, 4), st.just(2))
+    points = hnp.arrays(np.float64, shapes, elements=quarters)
+    return {name: draw(points) for name in range(1, count + 1)}
 
 
 def plain_vpq(
     prediction: np.ndarray, label: np.ndarray, *, temporally_consistent: bool
 ) -> list[list[float]]:
-    """[iou, tp, fp, fn] of the instances in each frame, as docs/released_code.md, IoU and VPQ,
-    tells it.
+    """Return [iou, tp, fp, fn] of the instances in each frame.
+
+    The rules are in docs/released_code.md, IoU and VPQ.
     """
-    result, partner = [], {}
-    for predicted, true in zip(prediction, label, strict=True):
-        sums = [0.0, 0, 0, 0]
-        mine, theirs = set(predicted[predicted > 0].tolist()), set(true[true > 0].tolist())
-        for name in sorted(theirs):
-            for other in sorted(mine):
-                both, either = (
-                    (true == name) & (predicted == other),
-                    (true == name) | (predicted == other),
-                )
-                if both.sum() / either.sum() > 0.5:
-                    changed = temporally_consistent and partner.get(name, other) != other
-                    partner[name] = other
-                    mine, theirs = mine - {other}, theirs - {name}
-                    if changed:
-                        sums[2], sums[3] = sums[2] + 1, sums[3] + 1
-                    else:
-                        sums[0], sums[1] = sums[0] + both.sum() / either.sum(), sums[1] + 1
-        result.append([sums[0], sums[1], sums[2] + len(mine), sums[3] + len(theirs)])
-    return result
+    rows = []
+    partners = {}
+    for predicted_map, true_map in zip(prediction, label, strict=True):
+        iou_sum, tp, num_changed = 0.0, 0, 0
+        predicted_ids = set(predicted_map[predicted_map > 0].tolist())
+        true_ids = set(true_map[true_map > 0].tolist())
+        for true_id, predicted_id in product(sorted(true_ids), sorted(predicted_ids)):
+            is_true = true_map == true_id
+            is_predicted = predicted_map == predicted_id
+            pair_iou = (is_true & is_predicted).sum() / (is_true | is_predicted).sum()
+            if pair_iou > 0.5:
+                partner = partners.get(true_id, predicted_id)
+                partners[true_id] = predicted_id
+                predicted_ids.remove(predicted_id)
+                true_ids.remove(true_id)
+                if temporally_consistent and partner != predicted_id:
+                    num_changed += 1
+                else:
+                    iou_sum += pair_iou
+                    tp += 1
+        fp = num_changed + len(predicted_ids)
+        fn = num_changed + len(true_ids)
+        rows.append([iou_sum, tp, fp, fn])
+    return rows
 
 
 @settings(max_examples=200)
 @given(given_pair=pairs(), consistent=st.booleans())
 def test_vpq_is_what_the_plain_rules_say(given_pair, consistent: bool) -> None:
-    found = vpq_counts(*given_pair, temporally_consistent=consistent)
-    columns = (found.iou, found.true_positive, found.false_positive, found.false_negative)
+    counts = vpq_counts(*given_pair, temporally_consistent=consistent)
+    columns = (counts.iou, counts.true_positive, counts.false_positive, counts.false_negative)
+    instance_counts = np.stack([values[:, 1] for values in columns], axis=1)
     expected = plain_vpq(*given_pair, temporally_consistent=consistent)
-    assert_allclose(
-        np.stack([values[:, 1] for values in columns], axis=1), expected, rtol=0, atol=1e-12
-    )
+    assert_allclose(instance_counts, expected, rtol=0, atol=1e-12)
 
 
 @given(given_pair=pairs(), names=st.permutations(range(1, 5)), large=st.booleans())
 def test_what_ids_are_called_makes_no_difference(given_pair, names: list[int], large: bool) -> None:
     prediction, label = given_pair
-    renamed = np.array([0, *names], dtype=np.int64) * (10**15 if large else 1)
-    expected, found = vpq_counts(prediction, label), vpq_counts(renamed[prediction], label)
+    new_ids = np.array([0, *names], dtype=np.int64) * (10**15 if large else 1)
+    expected = vpq_counts(prediction, label)
+    counts = vpq_counts(new_ids[prediction], label)
     for name in ("iou", "true_positive", "false_positive", "false_negative"):
-        assert_array_equal(getattr(found, name), getattr(expected, name))
-    found = vpq_counts(prediction, renamed[label])
-    assert_array_equal(found.iou, expected.iou)
+        assert_array_equal(getattr(counts, name), getattr(expected, name))
+    assert_array_equal(vpq_counts(prediction, new_ids[label]).iou, expected.iou)
 
 
 @given(given_pair=pairs())
-def test_frames_alone_treat_both_sides_alike(given_pair) -> None:
+def test_single_frames_treat_both_sides_alike(given_pair) -> None:
     prediction, label = given_pair
-    there = vpq_counts(prediction, label, temporally_consistent=False)
-    back = vpq_counts(label, prediction, temporally_consistent=False)
-    assert_array_equal(there.iou, back.iou)
-    assert_array_equal(there.false_positive, back.false_negative)
-    assert (vpq_counts(prediction, label).true_positive <= there.true_positive).all()
+    counts = vpq_counts(prediction, label, temporally_consistent=False)
+    swapped = vpq_counts(label, prediction, temporally_consistent=False)
+    assert_array_equal(counts.iou, swapped.iou)
+    assert_array_equal(counts.false_positive, swapped.false_negative)
+    assert (vpq_counts(prediction, label).true_positive <= counts.true_positive).all()
 
 
 @given(label=hnp.arrays(np.int32, SHAPES, elements=IDS))
 def test_the_truth_itself_is_perfect(label: np.ndarray) -> None:
-    found = vpq_counts(label, label)
-    assert_array_equal(found.iou[:, 1], found.true_positive[:, 1])
-    assert not found.false_positive.any()
-    assert not found.false_negative.any()
+    counts = vpq_counts(label, label)
+    assert_array_equal(counts.iou[:, 1], counts.true_positive[:, 1])
+    assert not counts.false_positive.any()
+    assert not counts.false_negative.any()
     assert iou([mask_counts(label == 1, label == 1)], absent=1.0) == 1.0
 
 
 @given(given_paths=paths(), length=st.integers(0, 6))
 def test_paths_keep_their_points_and_go_on(given_paths, length: int) -> None:
-    faster = padded(given_paths, length)
+    padded_paths = padded(given_paths, length)
     for name, path in given_paths.items():
-        assert_array_equal(faster[name][: len(path)], path)
-        assert len(faster[name]) == max(len(path), length)
-        step = path[-1] - path[-2] if len(path) > 1 else np.zeros(2)
-        for number, (first, second) in enumerate(pairwise(faster[name][len(path) - 1 :]), start=1):
-            assert_array_equal(second - first, number * step)
+        padded_path = padded_paths[name]
+        assert_array_equal(padded_path[: len(path)], path)
+        assert len(padded_path) == max(len(path), length)
+        last_step = path[-1] - path[-2] if len(path) > 1 else np.zeros(2)
+        added_steps = np.diff(padded_path[len(path) - 1 :], axis=0)
+        for number, step in enumerate(added_steps, start=1):
+            assert_array_equal(step, number * last_step)
 
 
 @given(prediction=paths(), truth=paths())
 def test_everybody_is_matched_once_or_not_at_all(prediction, truth) -> None:
     length = longest(truth)
-    found = match_trajectories(padded(prediction, length), padded(truth, length))
-    mine, theirs = ([pair[side] for pair in found.pairs] for side in (0, 1))
-    assert sorted([*mine, *found.unmatched_prediction]) == sorted(prediction)
-    assert sorted([*theirs, *found.unmatched_truth]) == sorted(truth)
-    assert list(found.costs) == sorted(found.costs)
-    assert all(cost <= 4.0 * length for cost in found.costs)
+    matching = match_trajectories(padded(prediction, length), padded(truth, length))
+    predicted_ids = [predicted_id for predicted_id, _ in matching.pairs]
+    true_ids = [true_id for _, true_id in matching.pairs]
+    assert sorted([*predicted_ids, *matching.unmatched_prediction]) == sorted(prediction)
+    assert sorted([*true_ids, *matching.unmatched_truth]) == sorted(truth)
+    assert list(matching.costs) == sorted(matching.costs)
+    assert all(cost <= 4.0 * length for cost in matching.costs)
     perfect = match_trajectories(padded(truth, length), padded(truth, length))
     assert perfect.costs == (0.0,) * len(truth)
 
@@ -148,17 +151,20 @@ def test_sides_in_another_order_have_the_same_partners_where_nothing_ties(
     prediction, truth
 ) -> None:
     length = longest(truth)
-    mine, theirs = padded(prediction, length), padded(truth, length)
-    found = match_trajectories(mine, theirs)
+    predicted_paths = padded(prediction, length)
+    true_paths = padded(truth, length)
     costs = [
-        np.linalg.norm(a[:length] - b, axis=1).sum() for a in mine.values() for b in theirs.values()
+        np.linalg.norm(predicted_path[:length] - true_path, axis=1).sum()
+        for predicted_path, true_path in product(predicted_paths.values(), true_paths.values())
     ]
     if len(set(np.round(costs, 9))) == len(costs):
-        backwards = match_trajectories(dict(reversed(mine.items())), dict(reversed(theirs.items())))
-        assert backwards == found
+        reversed_prediction = dict(reversed(predicted_paths.items()))
+        reversed_truth = dict(reversed(true_paths.items()))
+        expected = match_trajectories(predicted_paths, true_paths)
+        assert match_trajectories(reversed_prediction, reversed_truth) == expected
 
 
-def label_of(instance: np.ndarray) -> MotionLabels:
+def make_label(instance: np.ndarray) -> MotionLabels:
     vectors = np.full((3, 2, *GRID.shape), 255, dtype=np.float32)
     return MotionLabels(
         config=CONFIG,
@@ -184,22 +190,21 @@ MAPS = hnp.arrays(np.int32, (3, *GRID.shape), elements=IDS)
     parts=st.integers(1, 3),
 )
 def test_any_order_and_any_parts_give_the_same_bits(maps, order, parts: int) -> None:
-    samples = {
-        str(n): motion_counts(instances_of(mine, GRID), label_of(true))
-        for n, (mine, true) in enumerate(maps)
-    }
-    expected = MotionEvaluator()
-    for token, counts in samples.items():
-        expected.add(token, counts)
+    evaluator = MotionEvaluator()
+    samples = []
+    for number, (predicted_map, true_map) in enumerate(maps):
+        counts = motion_counts(instances_of(predicted_map, GRID), make_label(true_map))
+        samples.append((str(number), counts))
+        evaluator.add(str(number), counts)
+
     workers = [MotionEvaluator() for _ in range(parts)]
-    tokens = list(samples)
-    order.shuffle(tokens)
-    for token in tokens:
-        order.choice(workers).add(token, samples[token])
+    order.shuffle(samples)
+    for token, counts in samples:
+        order.choice(workers).add(token, counts)
     order.shuffle(workers)
     merged = MotionEvaluator()
     for worker in workers:
         merged.merge(worker)
-    found = merged.compute()
-    assert str(found) == str(expected.compute())
-    assert not math.isinf(found.min_ade)
+    result = merged.compute()
+    assert str(result) == str(evaluator.compute())
+    assert not math.isinf(result.min_ade)

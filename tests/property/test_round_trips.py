@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
-from strategies import boxes, calibs, clouds, labels, metas
+from support.strategies import boxes, calibs, clouds, labels, metas
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import DetectedBoxes
@@ -41,12 +41,13 @@ from deepaccident_devkit.release import (
 from deepaccident_devkit.taxonomy import BEV_SHAPE, CAMERAS
 
 
-def assert_same_labels(have: Labels, want: Labels) -> None:
-    """Equal to the bit (0.0 and −0.0 apart), types included."""
+def assert_same_labels(actual: Labels, expected: Labels) -> None:
+    """Check that values are equal to the bit (except 0.0 and −0.0) and have the same types."""
     for field in fields(Labels):
-        mine, theirs = getattr(have, field.name), getattr(want, field.name)
-        assert np.asarray(mine).dtype == np.asarray(theirs).dtype, field.name
-        assert_array_equal(mine, theirs, err_msg=field.name)
+        value = getattr(actual, field.name)
+        expected_value = getattr(expected, field.name)
+        assert np.asarray(value).dtype == np.asarray(expected_value).dtype, field.name
+        assert_array_equal(value, expected_value, err_msg=field.name)
 
 
 @given(labels())
@@ -61,29 +62,29 @@ def test_label_in_the_other_handedness_is_the_same_boxes(
 ) -> None:
     write_label(scratch / "label.txt", given_labels)
     other = read_label(scratch / "label.txt", raw=not given_labels.raw)
-    for name, y in {
+    signs_by_field = {
         "center": [1, -1, 1],
         "velocity": [1, -1],
         "agent_velocity": [1, -1],
         "yaw": -1,
         "size": 1,
-    }.items():
-        assert_array_equal(getattr(other, name), getattr(given_labels, name) * y)
+    }
+    for name, signs in signs_by_field.items():
+        assert_array_equal(getattr(other, name), getattr(given_labels, name) * signs)
 
 
 @given(st.lists(labels(), max_size=4))
 def test_many_labels_are_the_files_one_after_another(scratch: Path, several: list[Labels]) -> None:
     paths = [scratch / f"label_{number}.txt" for number in range(len(several))]
-    for path, one in zip(paths, several, strict=True):
-        write_label(path, one)
-    together = read_labels(paths)
-    apart = [read_label(path) for path in paths]
+    for path, file_labels in zip(paths, several, strict=True):
+        write_label(path, file_labels)
+    stacked = read_labels(paths)
+    labels_by_file = [read_label(path) for path in paths]
     for field in fields(Labels):
         if field.name != "raw":
-            have = getattr(together, field.name)
-            assert_array_equal(
-                have, np.concatenate([have[:0], *[getattr(one, field.name) for one in apart]])
-            )
+            values = getattr(stacked, field.name)
+            file_values = [getattr(file_labels, field.name) for file_labels in labels_by_file]
+            assert_array_equal(values, np.concatenate([values[:0], *file_values]))
 
 
 @given(metas())
@@ -110,11 +111,12 @@ def test_calib(scratch: Path, several: list[Calib]) -> None:
     assert len(stacked) == len(several)
     assert_array_equal(stacked.ego_from_lidar, [calib.ego_from_lidar.matrix for calib in several])
     assert_array_equal(stacked.world_from_ego, [calib.world_from_ego.matrix for calib in several])
-    cameras = [[calib.camera_from_lidar[camera].matrix for camera in CAMERAS] for calib in several]
-    assert_array_equal(stacked.camera_from_lidar, cameras)
-    assert_array_equal(
-        stacked.intrinsic, [[calib.intrinsic[camera] for camera in CAMERAS] for calib in several]
-    )
+    camera_poses = [
+        [calib.camera_from_lidar[camera].matrix for camera in CAMERAS] for calib in several
+    ]
+    assert_array_equal(stacked.camera_from_lidar, camera_poses)
+    intrinsics = [[calib.intrinsic[camera] for camera in CAMERAS] for calib in several]
+    assert_array_equal(stacked.intrinsic, intrinsics)
 
 
 @given(clouds())
@@ -156,36 +158,43 @@ def test_split_file(scratch: Path, pairs: list[tuple[str, str]]) -> None:
 @given(hnp.arrays(np.float64, (2, 2, 3), elements=st.floats(0, 255)))
 def test_image_within_jpegs_tolerance(scratch: Path, corners: np.ndarray) -> None:
     """A smooth picture comes back within a few levels; colours and sides keep their places."""
-    down, right = np.linspace(0, 1, 24)[:, None, None], np.linspace(0, 1, 40)[None, :, None]
-    top, bottom = (corners[row, 0] * (1 - right) + corners[row, 1] * right for row in (0, 1))
-    image = (top * (1 - down) + bottom * down).round().astype(np.uint8)
+    down = np.linspace(0, 1, 24)[:, None, None]
+    right = np.linspace(0, 1, 40)[None, :, None]
+    left_edge = corners[0, 0] * (1 - down) + corners[1, 0] * down
+    right_edge = corners[0, 1] * (1 - down) + corners[1, 1] * down
+    image = (left_edge * (1 - right) + right_edge * right).round().astype(np.uint8)
     write_image(scratch / "image.jpg", image)
     read = read_image(scratch / "image.jpg")
     assert read.shape == image.shape
     assert read.dtype == np.uint8
-    # chroma is stored at half resolution, so edges of saturated colours are off by more than the
-    # middle
-    assert np.abs(read.astype(int) - image).mean() < 4
-    assert np.abs(read.astype(int) - image).max() < 40
+    # chroma is stored at half resolution, so edges of saturated colours are off by more
+    errors = np.abs(read.astype(int) - image)
+    assert errors.mean() < 4
+    assert errors.max() < 40
 
 
 @given(given_boxes=boxes(), number=st.integers(0, 69))
 def test_detections_through_a_nuscenes_file(
     scratch: Path, da_motion: DeepAccident, given_boxes: Boxes, number: int
 ) -> None:
-    """From an agent's LiDAR to the world, through the file, and back."""
+    """The boxes go from an agent's LiDAR to the world, through the file, and back."""
     sample = da_motion.samples("train", "all")[number]
     world_from_lidar = da_motion.world_from(sample, "lidar")
-    world = given_boxes.transform(world_from_lidar, "world")
-    theirs, scores = token("sample", sample), np.linspace(-1, 2, len(world))
-    entries = detection_entries(theirs, DetectedBoxes(boxes=world, scores=scores))
-    (scratch / "nuscenes.json").write_text(json.dumps({"results": {theirs: entries}}))
-    found = results_from_nuscenes(da_motion, scratch / "nuscenes.json").boxes[sample]
-    assert_array_equal(found.scores, scores)
+    world_boxes = given_boxes.transform(world_from_lidar, "world")
+    scores = np.linspace(-1, 2, len(world_boxes))
+    nuscenes_token = token("sample", sample)
+    entries = detection_entries(nuscenes_token, DetectedBoxes(boxes=world_boxes, scores=scores))
+    path = scratch / "nuscenes.json"
+    path.write_text(json.dumps({"results": {nuscenes_token: entries}}))
+
+    detections = results_from_nuscenes(da_motion, path).boxes[sample]
+    assert_array_equal(detections.scores, scores)
+    read_boxes = detections.boxes
     for name in ("center", "size", "category"):
-        assert_array_equal(getattr(found.boxes, name), getattr(world, name), err_msg=name)
-    assert_array_equal(found.boxes.velocity[:, :2], world.velocity[:, :2])
-    back = found.boxes.transform(world_from_lidar.inverse(), "lidar")
-    assert_allclose(back.center, given_boxes.center, rtol=0, atol=1e-9)
-    rotations = (quaternions.to_matrix(each.rotation) for each in (back, given_boxes))
-    assert_allclose(*rotations, rtol=0, atol=1e-9)
+        assert_array_equal(getattr(read_boxes, name), getattr(world_boxes, name), err_msg=name)
+    assert_array_equal(read_boxes.velocity[:, :2], world_boxes.velocity[:, :2])
+    lidar_boxes = read_boxes.transform(world_from_lidar.inverse(), "lidar")
+    assert_allclose(lidar_boxes.center, given_boxes.center, rtol=0, atol=1e-9)
+    rotation = quaternions.to_matrix(lidar_boxes.rotation)
+    expected_rotation = quaternions.to_matrix(given_boxes.rotation)
+    assert_allclose(rotation, expected_rotation, rtol=0, atol=1e-9)

@@ -1,9 +1,11 @@
+"""Laws of SE(3) transforms, quaternions and six-vectors, and of boxes that they move."""
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from pyquaternion import Quaternion
-from strategies import ANGLES, arrays, boxes, points, poses
+from support.strategies import ANGLES, arrays, boxes, points, poses
 
 from deepaccident_devkit.geometry import SE3, Boxes, conventions, quaternions
 from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
@@ -11,23 +13,24 @@ from deepaccident_devkit.geometry.boxes import CORNER_SIGNS
 
 @given(poses(), poses(), points())
 def test_compose_then_apply_is_apply_twice(a_from_b: SE3, b_from_c: SE3, p_c: np.ndarray) -> None:
-    assert_allclose(
-        (a_from_b @ b_from_c).apply(p_c), a_from_b.apply(b_from_c.apply(p_c)), atol=1e-9
-    )
+    p_a = a_from_b.apply(b_from_c.apply(p_c))
+    assert_allclose((a_from_b @ b_from_c).apply(p_c), p_a, atol=1e-9)
     assert_allclose(a_from_b @ p_c, a_from_b.apply(p_c), rtol=0)
 
 
 @given(poses(), poses(), poses())
 def test_composing_is_associative(a_from_b: SE3, b_from_c: SE3, c_from_d: SE3) -> None:
-    left, right = (a_from_b @ b_from_c) @ c_from_d, a_from_b @ (b_from_c @ c_from_d)
-    assert_allclose(left.matrix, right.matrix, atol=1e-9)
+    left_first = (a_from_b @ b_from_c) @ c_from_d
+    right_first = a_from_b @ (b_from_c @ c_from_d)
+    assert_allclose(left_first.matrix, right_first.matrix, atol=1e-9)
 
 
 @given(poses(), points())
 def test_the_inverse_undoes(a_from_b: SE3, p_b: np.ndarray) -> None:
-    assert_allclose(a_from_b.inverse().apply(a_from_b.apply(p_b)), p_b, atol=1e-9)
-    assert_allclose((a_from_b @ a_from_b.inverse()).matrix, np.eye(4), atol=1e-9)
-    assert_allclose(a_from_b.inverse().inverse().matrix, a_from_b.matrix, atol=1e-9)
+    b_from_a = a_from_b.inverse()
+    assert_allclose(b_from_a.apply(a_from_b.apply(p_b)), p_b, atol=1e-9)
+    assert_allclose((a_from_b @ b_from_a).matrix, np.eye(4), atol=1e-9)
+    assert_allclose(b_from_a.inverse().matrix, a_from_b.matrix, atol=1e-9)
 
 
 @given(poses())
@@ -35,17 +38,16 @@ def test_quaternion_there_and_back(pose: SE3) -> None:
     quaternion = pose.quaternion
     assert quaternion.w >= 0
     assert_allclose(quaternion.norm, 1, atol=1e-12)
-    assert_allclose(
-        quaternion.rotation_matrix, pose.rotation, atol=1e-9
-    )  # pyquaternion's own formula
-    assert_allclose(
-        SE3.from_quaternion(quaternion, pose.translation).matrix, pose.matrix, atol=1e-9
-    )
+    # pyquaternion's own formula
+    assert_allclose(quaternion.rotation_matrix, pose.rotation, atol=1e-9)
+    same_pose = SE3.from_quaternion(quaternion, pose.translation)
+    assert_allclose(same_pose.matrix, pose.matrix, atol=1e-9)
 
 
 @given(poses(), arrays((3,), 100))
 def test_vectors_turn_and_do_not_move(pose: SE3, vector: np.ndarray) -> None:
-    assert_allclose(pose.rotate(vector), pose.apply(vector) - pose.apply(np.zeros(3)), atol=1e-9)
+    expected = pose.apply(vector) - pose.apply(np.zeros(3))
+    assert_allclose(pose.rotate(vector), expected, atol=1e-9)
 
 
 @given(ANGLES, arrays((3,), 100))
@@ -55,12 +57,14 @@ def test_yaw_turns_counter_clockwise(yaw: float, translation: np.ndarray) -> Non
 
 
 @given(poses(), poses())
-def test_quaternion_product_is_the_rotations_product(one: SE3, two: SE3) -> None:
-    q, r = (quaternions.from_matrix(pose.rotation) for pose in (one, two))
+def test_quaternion_product_is_the_rotations_product(first: SE3, second: SE3) -> None:
+    q = quaternions.from_matrix(first.rotation)
+    r = quaternions.from_matrix(second.rotation)
     product = quaternions.left_multiplier(q) @ r
-    assert_allclose(quaternions.to_matrix(product), one.rotation @ two.rotation, atol=1e-9)
+    assert_allclose(quaternions.to_matrix(product), first.rotation @ second.rotation, atol=1e-9)
     assert_allclose(product, (Quaternion(q) * Quaternion(r)).elements, atol=1e-12)
-    assert_allclose(quaternions.from_matrix(np.stack([one.rotation, two.rotation])), [q, r], rtol=0)
+    rotations = np.stack([first.rotation, second.rotation])
+    assert_allclose(quaternions.from_matrix(rotations), [q, r], rtol=0)
 
 
 @given(poses(), boxes())
@@ -77,36 +81,34 @@ def test_boxes_and_their_corners_move_together(target_from_source: SE3, given_bo
 
 @given(poses(), boxes())
 def test_boxes_come_back(target_from_source: SE3, given_boxes: Boxes) -> None:
-    back = given_boxes.transform(target_from_source, "world").transform(
-        target_from_source.inverse(), "lidar"
-    )
-    assert_allclose(back.corners(), given_boxes.corners(), atol=1e-8)
-    assert_allclose(back.velocity, given_boxes.velocity, atol=1e-9)
+    moved = given_boxes.transform(target_from_source, "world")
+    returned = moved.transform(target_from_source.inverse(), "lidar")
+    assert_allclose(returned.corners(), given_boxes.corners(), atol=1e-8)
+    assert_allclose(returned.velocity, given_boxes.velocity, atol=1e-9)
 
 
 @given(boxes(), arrays((30, 3), 1.5))
-def test_points_in_boxes_by_their_own_coordinates(given_boxes: Boxes, unit: np.ndarray) -> None:
-    """Points at a known fraction of a box's half size are in it exactly if all three fractions are
-    below one.
-    """
-    clear_of_the_faces = np.where(np.abs(np.abs(unit) - 1) < 1e-6, 0.5, unit)
+def test_points_in_boxes_by_their_own_coordinates(
+    given_boxes: Boxes, fractions: np.ndarray
+) -> None:
+    """A point at fractions of a box's half size is in it exactly if no fraction exceeds one."""
+    # no point lies on a face
+    fractions = np.where(np.abs(np.abs(fractions) - 1) < 1e-6, 0.5, fractions)
+    is_inside = (np.abs(fractions) <= 1).all(axis=1)
     for index in range(len(given_boxes)):
         box = given_boxes.select([index])
+        center, half_size = box.center[0], box.size[0] / 2
         axes = Quaternion(box.rotation[0]).rotation_matrix
-        points = box.center[0] + (clear_of_the_faces * box.size[0] / 2) @ axes.T
-        np.testing.assert_array_equal(
-            box.contains(points)[0], (np.abs(clear_of_the_faces) <= 1).all(axis=1)
-        )
-        assert_allclose(
-            box.corners()[0], box.center[0] + (CORNER_SIGNS * box.size[0] / 2) @ axes.T, atol=1e-9
-        )
+        points = center + (fractions * half_size) @ axes.T
+        np.testing.assert_array_equal(box.contains(points)[0], is_inside)
+        corners = center + (CORNER_SIGNS * half_size) @ axes.T
+        assert_allclose(box.corners()[0], corners, atol=1e-9)
 
 
 @given(poses())
 def test_six_vector_there_and_back(pose: SE3) -> None:
-    assert_allclose(
-        SE3.from_six(pose.to_six()).matrix, pose.matrix, atol=1e-7
-    )  # the gimbal costs half the digits
+    # near gimbal lock half the digits are lost
+    assert_allclose(SE3.from_six(pose.to_six()).matrix, pose.matrix, atol=1e-7)
 
 
 @given(arrays((3,), 1e3), ANGLES, st.floats(-1.5, 1.5), ANGLES)
@@ -115,10 +117,9 @@ def test_six_numbers_there_and_back(
 ) -> None:
     six = SE3.from_six([*translation, rx, ry, rz]).to_six()
     assert_array_equal(six[:3], translation)
-    turns = np.abs(six[3:] - [rx, ry, rz])
-    assert_allclose(
-        np.minimum(turns, 2 * np.pi - turns), 0, atol=1e-9
-    )  # −π and π are the same turn
+    differences = np.abs(six[3:] - [rx, ry, rz])
+    # −π and π are the same angle
+    assert_allclose(np.minimum(differences, 2 * np.pi - differences), 0, atol=1e-9)
 
 
 @given(arrays((3,), 1e3), ANGLES, ANGLES, ANGLES)
@@ -136,7 +137,6 @@ def test_six_turns_about_z_then_y_then_x(
 
 @given(poses())
 def test_a_flipped_six_vector_is_the_flipped_poses(pose: SE3) -> None:
-    flipped = conventions.flip_six_vector(pose.to_six())
-    assert_allclose(
-        conventions.matrices_of_six(flipped), conventions.flip_pose(pose.matrix), atol=1e-7
-    )
+    flipped_six = conventions.flip_six_vector(pose.to_six())
+    flipped_pose = conventions.flip_pose(pose.matrix)
+    assert_allclose(conventions.matrices_of_six(flipped_six), flipped_pose, atol=1e-7)

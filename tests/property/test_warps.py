@@ -1,12 +1,10 @@
-"""Laws of the warps: standing still changes nothing but the documented blur, and there and back is
-the way home.
-"""
+"""Laws of the warps: no motion changes only the documented blur, and inverses undo each other."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from strategies import grids
+from support.strategies import grids
 
 from deepaccident_devkit.geometry import BevGrid, conventions
 from deepaccident_devkit.motion.augmentation import Augmentation
@@ -37,18 +35,18 @@ AUGMENTATIONS = st.builds(
 )
 
 
-def noise(grid: BevGrid) -> np.ndarray:
+def make_noise(grid: BevGrid) -> np.ndarray:
     return np.random.default_rng(0).random((2, *grid.shape)).astype(np.float32)
 
 
 @given(grids(), RULES, ORIENTATIONS)
 def test_standing_still_keeps_every_cell(grid, rules, orientation) -> None:
     grid = grid.with_orientation(orientation)
-    raster = noise(grid)
-    assert_array_equal(warp(raster, np.eye(4), grid, rules, orientation=orientation), raster)
-    assert_array_equal(
-        warp(raster, np.eye(4), grid, CLEAN, "bilinear", orientation=orientation), raster
-    )
+    raster = make_noise(grid)
+    nearest = warp(raster, np.eye(4), grid, rules, orientation=orientation)
+    assert_array_equal(nearest, raster)
+    bilinear = warp(raster, np.eye(4), grid, CLEAN, "bilinear", orientation=orientation)
+    assert_array_equal(bilinear, raster)
 
 
 @given(grids())
@@ -61,36 +59,40 @@ def test_standing_still_samples_at_most_half_a_cell_away_as_released(grid) -> No
 def test_all_orientations_warp_alike(step, rules, orientation) -> None:
     grid = BevGrid((-10, 10, 0.5), (-10, 10, 0.5))
     matrix = sampling_matrix(conventions.matrices_of_six(step)[None], rules)[0]
-    native, raster = nearest_indices(matrix, grid, rules), noise(grid)
-    lying = rules.native
-    expected = warp(grid.reorient(raster, lying), matrix, grid, rules)
-    found = warp(grid.reorient(raster, orientation), matrix, grid, rules, orientation=orientation)
-    assert_array_equal(grid.with_orientation(orientation).reorient(found, lying), expected)
-    assert ((native >= -1) & (native < grid.cells)).all()
+    raster = make_noise(grid)
+    expected = warp(grid.reorient(raster, rules.native), matrix, grid, rules)
+    turned_raster = grid.reorient(raster, orientation)
+    turned = warp(turned_raster, matrix, grid, rules, orientation=orientation)
+    native = grid.with_orientation(orientation).reorient(turned, rules.native)
+    assert_array_equal(native, expected)
+    indices = nearest_indices(matrix, grid, rules)
+    assert ((indices >= -1) & (indices < grid.cells)).all()
 
 
 @given(STEPS)
 def test_there_and_back_brings_smooth_maps_home(step) -> None:
-    """Within what half a cell of rounding, twice, changes in a map that rises by 1 a cell."""
+    """Rounding half a cell twice changes little in a map that rises by 1 a cell."""
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), "released")
-    there = conventions.matrices_of_six(step)
-    column = np.broadcast_to(np.arange(grid.shape[1], dtype=np.float64) + 1000, grid.shape)
-    away = warp(column, there, grid, CLEAN, orientation="released")
-    home = warp(away, np.linalg.inv(there), grid, CLEAN, orientation="released")
-    seen = home > 0
-    assert (np.abs(home - column)[seen] <= 2).all()
-    assert seen[30:50, 30:50].all()
+    matrix = conventions.matrices_of_six(step)
+    columns = np.arange(grid.shape[1], dtype=np.float64) + 1000
+    raster = np.broadcast_to(columns, grid.shape)
+    warped = warp(raster, matrix, grid, CLEAN, orientation="released")
+    restored = warp(warped, np.linalg.inv(matrix), grid, CLEAN, orientation="released")
+    is_seen = restored > 0
+    assert (np.abs(restored - raster)[is_seen] <= 2).all()
+    assert is_seen[30:50, 30:50].all()
 
 
 @given(st.lists(STEPS, min_size=1, max_size=4), AUGMENTATIONS, RULES)
 def test_past_and_future_undo_each_other(steps, augmentation, rules) -> None:
-    """Of one motion: a past frame's transform is the inverse of the future frame's; augmented or
-    not.
+    """For one motion, a past frame's transform is the inverse of the future frame's.
+
+    This holds with and without augmentation.
     """
-    for given_one in (None, augmentation):
-        forward = present_from_past(steps[:1], rules, given_one)[0]
-        backward = present_from_frames([steps[0], steps[0]], rules, given_one)[1]
-        assert_allclose(forward @ backward, np.eye(4), atol=1e-4)
+    for optional_augmentation in (None, augmentation):
+        from_past = present_from_past(steps[:1], rules, optional_augmentation)[0]
+        from_future = present_from_frames([steps[0]] * 2, rules, optional_augmentation)[1]
+        assert_allclose(from_past @ from_future, np.eye(4), atol=1e-4)
 
 
 @given(st.lists(STEPS, min_size=2, max_size=5))
@@ -103,11 +105,10 @@ def test_exact_chains_are_the_products_of_their_steps(steps) -> None:
 
 @given(STEPS, ORIENTATIONS)
 def test_a_cell_lands_where_its_centre_goes(step, orientation) -> None:
-    """Right-handed metres in, right-handed metres out, in every orientation; a cell's neighbours at
-    most.
-    """
+    """Right-handed metres go in and come out in every orientation, within half a cell."""
     grid = BevGrid((-20, 20, 0.5), (-20, 20, 0.5), orientation)
-    blob = np.linalg.norm(grid.centers() - (3.25, -2.25), axis=-1) < 1.1
-    found = agents_to_ego(np.stack([blob] * 2), [[0] * 6, step], grid=grid, protocol="clean")[1]
+    disc = np.linalg.norm(grid.centers() - (3.25, -2.25), axis=-1) < 1.1
+    poses = [[0] * 6, step]
+    warped_disc = agents_to_ego(np.stack([disc] * 2), poses, grid=grid, protocol="clean")[1]
     expected = (conventions.matrices_of_six(step) @ [3.25, -2.25, 0, 1])[:2]
-    assert_allclose(grid.centers()[found].mean(axis=0), expected, atol=0.26)
+    assert_allclose(grid.centers()[warped_disc].mean(axis=0), expected, atol=0.26)

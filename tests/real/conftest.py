@@ -1,4 +1,4 @@
-"""The real scenario of `pytest --real DIR`; nothing of it is in this repository."""
+"""The real scenario of `pytest --real DIR`; no part of it is in this repository."""
 
 import shutil
 from pathlib import Path
@@ -23,7 +23,7 @@ def real_root(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture(scope="session")
 def real(real_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """It, opened; the index lies elsewhere."""
+    """The opened real scenario, with its index in another folder."""
     return DeepAccident(
         "v1", real_root, index_dir=tmp_path_factory.mktemp("real index"), verbose=False
     )

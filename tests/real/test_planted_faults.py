@@ -1,6 +1,4 @@
-"""Faults planted in a copy of the real scenario: the tolerances that its own rows set hide none of
-them.
-"""
+"""Faults planted in a copy of the real scenario; its own tolerances hide none of them."""
 
 import shutil
 from collections.abc import Callable
@@ -8,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fault_injection.editor import NoVictimError, UndoableEditor
 from fault_injection.mutations import BEYOND, HARMLESS, MUTATIONS
-from fault_injection.place import NoVictimError, Place
-from fault_injection.run import Job, mutate, places
+from fault_injection.run import Job, mutate, open_editors
 
 from deepaccident_devkit.release import read_lidar, write_lidar
 from deepaccident_devkit.taxonomy import LIDAR
@@ -23,134 +21,128 @@ SHALLOW = [
 ]
 
 
-def doubts(root: Path, *, deep: bool = False) -> set[str]:
-    report = validate_release(root, deep=deep, workers=1)
-    return {
-        f"{finding.code}: {finding}" for finding in report.findings if finding.severity != "note"
-    }
+def find_faults(root: Path, *, deep: bool = False) -> set[str]:
+    findings = validate_release(root, deep=deep, workers=1).findings
+    return {f"{finding.code}: {finding}" for finding in findings if finding.severity != "note"}
 
 
 @pytest.fixture(scope="session")
-def real_places(real_copy: Path) -> dict[str, Place]:
-    return places(real_copy)
+def real_places(real_copy: Path) -> dict[str, UndoableEditor]:
+    return open_editors(real_copy)
 
 
 @pytest.fixture(scope="session")
-def sound(real_copy: Path) -> set[str]:
-    """What is said of the copy before anything is planted: that sensor files are missing."""
-    return doubts(real_copy)
+def known_faults(real_copy: Path) -> set[str]:
+    """The faults of the copy before anything is planted: sensor files are missing."""
+    return find_faults(real_copy)
 
 
 @pytest.mark.parametrize("name", SHALLOW)
 def test_a_planted_fault_is_told(
-    real_copy: Path, real_places: dict[str, Place], sound: set[str], name: str
+    real_copy: Path, real_places: dict[str, UndoableEditor], known_faults: set[str], name: str
 ) -> None:
     try:
-        place = mutate(Job(name, 0), real_places)
+        fault_place = mutate(Job(name, 0), real_places)
     except (NoVictimError, FileNotFoundError) as error:
-        for place in real_places.values():
-            place.restore()
+        for fault_place in real_places.values():
+            fault_place.restore()
         pytest.skip(f"needs what this scenario does not have: {error}")
     try:
-        assert doubts(real_copy) - sound, place.changes()
+        assert find_faults(real_copy) - known_faults, fault_place.changes()
     finally:
-        place.restore()
+        fault_place.restore()
 
 
-def _exchanged(folder: Path, other: Path, stem: str, stem_other: str) -> None:
-    first, second = folder / f"{stem}.npz", other / f"{stem_other}.npz"
-    first_bytes, second_bytes = first.read_bytes(), second.read_bytes()
-    first.write_bytes(second_bytes)
-    second.write_bytes(first_bytes)
+def cloud_path(root: Path, agent: str, frame: int) -> Path:
+    scenario_type, name = TOKEN.split("/")
+    return root / scenario_type / agent / LIDAR / name / f"{name}_{frame:03d}.npz"
 
 
-def _two_frames(root: Path) -> None:
-    folder, name = _clouds(root, "ego_vehicle")
-    _exchanged(folder, folder, f"{name}_026", f"{name}_051")
+def exchange_files(path: Path, other_path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(other_path.read_bytes())
+    other_path.write_bytes(content)
 
 
-def _two_agents(root: Path) -> None:
-    (folder, name), (other, _) = _clouds(root, "ego_vehicle"), _clouds(root, "infrastructure")
-    _exchanged(folder, other, f"{name}_051", f"{name}_051")
+def exchange_two_frames(root: Path) -> None:
+    exchange_files(cloud_path(root, "ego_vehicle", 26), cloud_path(root, "ego_vehicle", 51))
 
 
-def _shifted(root: Path) -> None:
-    _moved(root, lambda xyz: xyz + np.array([0.5, 0.0, 0.0]))
+def exchange_two_agents(root: Path) -> None:
+    exchange_files(cloud_path(root, "ego_vehicle", 51), cloud_path(root, "infrastructure", 51))
 
 
-def _mirrored(root: Path) -> None:
-    _moved(root, lambda xyz: xyz * (1.0, -1.0, 1.0))
-
-
-def _halved(root: Path) -> None:
-    _moved(root, lambda xyz: xyz[::2])
-
-
-def _moved(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+def change_points(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     """Change the points of one cloud."""
-    folder, name = _clouds(root, "other_vehicle_behind")
-    path = folder / f"{name}_026.npz"
+    path = cloud_path(root, "other_vehicle_behind", 26)
     xyz = change(read_lidar(path).xyz)
     write_lidar(path, xyz, np.zeros(len(xyz)))
 
 
-def _turned(root: Path) -> None:
-    _moved(root, lambda xyz: xyz[:, [1, 0, 2]] * (-1.0, 1.0, 1.0))
+def shift_points(root: Path) -> None:
+    change_points(root, lambda xyz: xyz + np.array([0.5, 0.0, 0.0]))
 
 
-def _raised(root: Path) -> None:
-    _moved(root, lambda xyz: xyz + np.array([0.0, 0.0, 1.0]))
+def mirror_points(root: Path) -> None:
+    change_points(root, lambda xyz: xyz * (1.0, -1.0, 1.0))
 
 
-def _one_late(root: Path) -> None:
-    """Each cloud of an agent is that of the frame before, where that is there."""
-    folder, name = _clouds(root, "ego_vehicle")
+def halve_points(root: Path) -> None:
+    change_points(root, lambda xyz: xyz[::2])
+
+
+def turn_points(root: Path) -> None:
+    change_points(root, lambda xyz: xyz[:, [1, 0, 2]] * (-1.0, 1.0, 1.0))
+
+
+def raise_points(root: Path) -> None:
+    change_points(root, lambda xyz: xyz + np.array([0.0, 0.0, 1.0]))
+
+
+def delay_clouds(root: Path) -> None:
+    """Replace each cloud of an agent by that of the frame before, if both exist."""
     for frame in range(100, 1, -1):
-        path, before = (folder / f"{name}_{number:03d}.npz" for number in (frame, frame - 1))
-        if path.is_file() and before.is_file():
-            path.write_bytes(before.read_bytes())
+        path = cloud_path(root, "ego_vehicle", frame)
+        previous_path = cloud_path(root, "ego_vehicle", frame - 1)
+        if path.is_file() and previous_path.is_file():
+            path.write_bytes(previous_path.read_bytes())
 
 
-def _miscounted(root: Path) -> None:
-    """A near car's points, up by a half."""
-    folder, name = _clouds(root, "ego_vehicle")
-    label = folder.parents[1] / "label" / name / f"{name}_001.txt"
-    first, *lines = [line.split() for line in label.read_text().splitlines()]
-    most = max(
-        (line for line in lines if int(line[FIELD["id"]]) > 0 and line[0] == "car"),
-        key=lambda line: int(line[FIELD["num_lidar_pts"]]),
-    )
-    most[FIELD["num_lidar_pts"]] = str(int(1.5 * int(most[FIELD["num_lidar_pts"]])))
-    label.write_text("\n".join(" ".join(words) for words in (first, *lines)) + "\n")
-
-
-def _clouds(root: Path, agent: str) -> tuple[Path, str]:
-    folder, name = TOKEN.split("/")
-    return root / folder / agent / LIDAR / name, name
+def miscount_points(root: Path) -> None:
+    """Raise the number of points of the car that has the most by a half."""
+    scenario_type, name = TOKEN.split("/")
+    label = root / scenario_type / "ego_vehicle" / "label" / name / f"{name}_001.txt"
+    header, *rows = [line.split() for line in label.read_text().splitlines()]
+    cars = [row for row in rows if int(row[FIELD["id"]]) > 0 and row[0] == "car"]
+    points_column = FIELD["num_lidar_pts"]
+    nearest_car = max(cars, key=lambda row: int(row[points_column]))
+    nearest_car[points_column] = str(int(1.5 * int(nearest_car[points_column])))
+    label.write_text("\n".join(" ".join(words) for words in (header, *rows)) + "\n")
 
 
 @pytest.fixture
-def damaged(real_root: Path, tmp_path: Path) -> Path:
+def release_copy(real_root: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(real_root, tmp_path / "release"))
 
 
 @pytest.mark.parametrize(
     "plant",
     [
-        _two_frames,
-        _two_agents,
-        _shifted,
-        _mirrored,
-        _halved,
-        _turned,
-        _raised,
-        _one_late,
-        _miscounted,
+        exchange_two_frames,
+        exchange_two_agents,
+        shift_points,
+        mirror_points,
+        halve_points,
+        turn_points,
+        raise_points,
+        delay_clouds,
+        miscount_points,
     ],
 )
 def test_a_cloud_that_does_not_fit_its_label_is_told(
-    damaged: Path, plant: Callable[[Path], None]
+    release_copy: Path, plant: Callable[[Path], None]
 ) -> None:
-    before = doubts(damaged, deep=True)
-    plant(damaged)
-    assert any("points-differ" in doubt for doubt in doubts(damaged, deep=True) - before)
+    before = find_faults(release_copy, deep=True)
+    plant(release_copy)
+    new_faults = find_faults(release_copy, deep=True) - before
+    assert any("points-differ" in fault for fault in new_faults)

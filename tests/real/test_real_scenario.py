@@ -1,17 +1,16 @@
-"""One real scenario: what the format says of the release holds on it, and the devkit reads it
-without a doubt.
+"""One real scenario: it follows the format of the release, and the devkit finds no fault in it.
 
-Run with `pytest tests/real --real DIR`. Its cameras and clouds are there for some frames alone.
+Run with `pytest tests/real --real DIR`. Only some frames have their images and clouds.
 """
 
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import cv2
 import numpy as np
-import plain_fiery
 import pytest
 from click.testing import CliRunner
+from support import plain_fiery
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -44,32 +43,33 @@ def sample_token(agent: str, frame: int) -> str:
 def test_it_opens_as_its_files_say(real: DeepAccident) -> None:
     (scenario,) = real.scenario
     assert scenario["token"] == TOKEN
-    assert (scenario["weather"], scenario["time_of_day"], scenario["road_type"]) == (
-        "Clear",
-        "Noon",
-        "three-way junction",
-    )
-    assert (scenario["collision"], scenario["num_frames"], scenario["velocity_frame"]) == (
-        None,
-        100,
-        "released",
-    )
+    expected = {
+        "weather": "Clear",
+        "time_of_day": "Noon",
+        "road_type": "three-way junction",
+        "collision": None,
+        "num_frames": 100,
+        "velocity_frame": "released",
+    }
+    assert {field: scenario[field] for field in expected} == expected
     assert [agent["name"] for agent in real.agent] == list(AGENTS)
     assert len(real.sample) == 500
 
 
 def test_few_pairs_interact_and_one_of_them_touches(real: DeepAccident) -> None:
-    found = real.interactions(TOKEN)
-    actors = len(real.instance)
-    assert 0 < len(found.pairs) < actors * (actors - 1) / 2 / 4
-    assert len(found) < 10 * real.scenario[0]["num_frames"]
-    assert not (found.pairs.actor_ids >= STATIC_ACTOR_ID).all(axis=1).any(), (
-        "parked cars are no pair"
-    )
-    touching = found.pairs.min_gap == 0
-    assert touching.sum() == 1, "a car drives over a pedestrian's box, which meta does not name"
-    assert found.pairs.min_ttc[touching] == found.pairs.pet[touching] == 0
-    pedestrian = real.get("instance", f"{TOKEN}/actor/{found.pairs.actor_ids[touching][0, 1]}")
+    interactions = real.interactions(TOKEN)
+    pairs = interactions.pairs
+    num_actors = len(real.instance)
+    assert 0 < len(pairs) < num_actors * (num_actors - 1) / 2 / 4
+    assert len(interactions) < 10 * real.scenario[0]["num_frames"]
+    are_both_parked = (pairs.actor_ids >= STATIC_ACTOR_ID).all(axis=1)
+    assert not are_both_parked.any()
+
+    is_touching = pairs.min_gap == 0
+    assert is_touching.sum() == 1, "a car drives over a pedestrian's box, which meta does not name"
+    assert pairs.min_ttc[is_touching] == pairs.pet[is_touching] == 0
+    pedestrian_id = pairs.actor_ids[is_touching][0, 1]
+    pedestrian = real.get("instance", f"{TOKEN}/actor/{pedestrian_id}")
     assert pedestrian["category"] == "pedestrian"
     text = real.describe(TOKEN).text
     assert (
@@ -81,14 +81,10 @@ def test_few_pairs_interact_and_one_of_them_touches(real: DeepAccident) -> None:
 @pytest.mark.parametrize("deep", [False, True])
 def test_validate_tells_what_is_missing_and_nothing_else(real_root: Path, deep: bool) -> None:
     report = validate_release(real_root, deep=deep, workers=1)
-    told = [finding for finding in report.findings if finding.code != "sensor-frames-missing"]
-    said = [
-        finding.what
-        for finding in told
-        if (finding.code, finding.severity) != ("box-points-differ", "note")
-    ]
-    assert said == ["actors 7242, 7247 overlap by up to 0.56 m, frames 24–28"]
-    assert {finding.severity for finding in told} == {"note"}
+    findings = [finding for finding in report.findings if finding.code != "sensor-frames-missing"]
+    assert {finding.severity for finding in findings} == {"note"}
+    texts = [finding.what for finding in findings if finding.code != "box-points-differ"]
+    assert texts == ["actors 7242, 7247 overlap by up to 0.56 m, frames 24–28"]
     assert report.velocity_frames == {TOKEN: "released"}
 
 
@@ -96,56 +92,59 @@ def test_validate_tells_what_is_missing_and_nothing_else(real_root: Path, deep: 
 def test_the_preset_fiery_draws_as_fierys_class(real: DeepAccident, filter_invisible: bool) -> None:
     """Agents lean by up to 14° here."""
     config = MotionLabelConfig.preset("fiery", filter_invisible=filter_invisible)
-    for token in (sample_token(agent, frame) for agent in AGENTS for frame in range(15, 81, 5)):
+    inner_cells = (slice(None), plain_fiery.INNER_MARGIN, plain_fiery.INNER_MARGIN)
+    for agent, frame in product(AGENTS, range(15, 81, 5)):
+        token = sample_token(agent, frame)
         expected = plain_fiery.instances(real, token, filter_invisible=filter_invisible)
-        drawn = motion_labels(real, token, config).instance
-        inner = (slice(None), plain_fiery.INNER, plain_fiery.INNER)
-        assert np.array_equal(drawn[inner], expected[inner]), token
+        instances = motion_labels(real, token, config).instance
+        assert np.array_equal(instances[inner_cells], expected[inner_cells]), token
 
 
 def test_decoded_velocities_are_the_displacements(real: DeepAccident) -> None:
-    """Within 1 % in the median, for all classes together; taken for world's or the LiDAR's they fit
-    nothing.
+    """They agree within 1 % in the median of all classes.
+
+    As velocities in the world or the LiDAR frame, the labels' numbers would fit nothing.
     """
-    off, raw_off, category = [], [], []
+    decoded_errors, raw_errors, categories = [], [], []
     for sample in real.sample:
-        decoded, derived = real.boxes(sample), real.boxes(sample, velocity="derived")
-        raw = real.boxes(sample, velocity="label").velocity
-        moved = derived.velocity[:, :2]
-        speed = np.linalg.norm(moved, axis=1)
-        telling = (speed > 1.0) & (decoded.actor_id > 0)
-        off.append(
-            np.linalg.norm(decoded.velocity[:, :2] - moved, axis=1)[telling] / speed[telling]
-        )
-        raw_off.append(np.linalg.norm(raw[:, :2] - moved, axis=1)[telling] / speed[telling])
-        category.append(decoded.category[telling])
-    share, raw_share, cars = (
-        np.concatenate(off),
-        np.concatenate(raw_off),
-        np.concatenate(category) == 0,
-    )
-    assert len(share) > 5000
-    assert np.median(share) < 0.01
-    assert (share[cars] < 0.1).mean() > 0.98
-    assert (raw_share < 0.1).mean() < 0.25
+        boxes = real.boxes(sample)
+        raw_velocity = real.boxes(sample, velocity="label").velocity[:, :2]
+        derived_velocity = real.boxes(sample, velocity="derived").velocity[:, :2]
+        speed = np.linalg.norm(derived_velocity, axis=1)
+        is_moving = (speed > 1.0) & (boxes.actor_id > 0)
+        for velocity, errors in (
+            (boxes.velocity[:, :2], decoded_errors),
+            (raw_velocity, raw_errors),
+        ):
+            error = np.linalg.norm(velocity - derived_velocity, axis=1)
+            errors.append(error[is_moving] / speed[is_moving])
+        categories.append(boxes.category[is_moving])
+
+    decoded_error = np.concatenate(decoded_errors)
+    is_car = np.concatenate(categories) == 0
+    assert len(decoded_error) > 5000
+    assert np.median(decoded_error) < 0.01
+    assert (decoded_error[is_car] < 0.1).mean() > 0.98
+    assert (np.concatenate(raw_errors) < 0.1).mean() < 0.25
 
 
 def test_velocities_agree_between_agents(real: DeepAccident) -> None:
-    """One actor, one moment, five agents: the raw pairs differ, the decoded ones do not, unless an
-    agent pitches.
+    """The decoded velocities of an actor at one time agree unless an agent pitches.
+
+    The raw ones differ from agent to agent.
     """
-    apart = []
+    distances = []
     for frame in real.frame:
         views = [real.boxes(sample) for sample in real.samples_of(frame["token"])]
         for first, second in combinations(views, 2):
-            ids = np.intersect1d(first.actor_id[first.actor_id > 0], second.actor_id)
-            one, other = (
-                view.velocity[[int(np.flatnonzero(view.actor_id == actor)[0]) for actor in ids]]
-                for view in (first, second)
+            tracked = first.select(first.actor_id > 0)
+            _, first_rows, second_rows = np.intersect1d(
+                tracked.actor_id, second.actor_id, return_indices=True
             )
-            apart.append(np.linalg.norm((one - other)[:, :2], axis=1))
-    assert np.quantile(np.concatenate(apart), 0.9) < 1e-3
-    assert np.quantile(np.concatenate(apart), 0.99) < 0.1
+            difference = tracked.velocity[first_rows] - second.velocity[second_rows]
+            distances.append(np.linalg.norm(difference[:, :2], axis=1))
+    assert np.quantile(np.concatenate(distances), 0.9) < 1e-3
+    assert np.quantile(np.concatenate(distances), 0.99) < 0.1
 
 
 def test_untracked_boxes_and_ends_of_tracks_have_velocities(real: DeepAccident) -> None:
@@ -158,56 +157,46 @@ def test_a_sensor_has_one_row_and_every_frame_its_exact_matrix(
     real: DeepAccident, real_root: Path
 ) -> None:
     assert len(real.calibrated_sensor) <= 45
-    folder, name = TOKEN.split("/")
-    for agent in AGENTS:
-        for frame in (1, 50, 100):
-            calib = read_calib(
-                real_root / folder / agent / "calib" / name / f"{name}_{frame:03d}.pkl"
-            )
-            sample = sample_token(agent, frame)
-            np.testing.assert_array_equal(
-                real.ego_from(sample, LIDAR).matrix, calib.ego_from_lidar.matrix
-            )
-            np.testing.assert_array_equal(
-                real.world_from(sample, "lidar").matrix,
-                (calib.world_from_ego @ calib.ego_from_lidar).matrix,
-            )
-            for camera in CAMERAS:
-                camera_from_lidar = real.ego_from(sample, camera).inverse() @ real.ego_from(
-                    sample, LIDAR
-                )
-                np.testing.assert_allclose(
-                    camera_from_lidar.matrix, calib.camera_from_lidar[camera].matrix, atol=1e-12
-                )
-                nominal = real.get("calibrated_sensor", f"{TOKEN}/{agent}/{camera}")["matrix"]
-                np.testing.assert_allclose(nominal, real.ego_from(sample, camera).matrix, atol=1e-3)
+    scenario_type, name = TOKEN.split("/")
+    for agent, frame in product(AGENTS, (1, 50, 100)):
+        calib_folder = real_root / scenario_type / agent / "calib" / name
+        calib = read_calib(calib_folder / f"{name}_{frame:03d}.pkl")
+        sample = sample_token(agent, frame)
+        ego_from_lidar = real.ego_from(sample, LIDAR)
+        np.testing.assert_array_equal(ego_from_lidar.matrix, calib.ego_from_lidar.matrix)
+        world_from_lidar = calib.world_from_ego @ calib.ego_from_lidar
+        np.testing.assert_array_equal(
+            real.world_from(sample, "lidar").matrix, world_from_lidar.matrix
+        )
+        for camera in CAMERAS:
+            ego_from_camera = real.ego_from(sample, camera)
+            camera_from_lidar = ego_from_camera.inverse() @ ego_from_lidar
+            expected = calib.camera_from_lidar[camera].matrix
+            np.testing.assert_allclose(camera_from_lidar.matrix, expected, atol=1e-12)
+            nominal = real.get("calibrated_sensor", f"{TOKEN}/{agent}/{camera}")["matrix"]
+            np.testing.assert_allclose(nominal, ego_from_camera.matrix, atol=1e-3)
 
 
 def test_labels_are_read_to_the_digit(real: DeepAccident, real_root: Path) -> None:
-    """Every number of every label, by `float` of its word."""
-    folder, name = TOKEN.split("/")
-    for agent in AGENTS:
-        for frame in range(1, 101):
-            path = real_root / folder / agent / "label" / name / f"{name}_{frame:03d}.txt"
-            first, *lines = [
-                line.split() for line in path.read_text().splitlines() if len(line.split()) > 1
-            ]
-            labels, boxes = (
-                read_label(path, raw=True),
-                real.boxes(sample_token(agent, frame), "lidar"),
-            )
-            words = np.array([[float(word) for word in line[1:10]] for line in lines])
-            np.testing.assert_array_equal(labels.agent_velocity[0], [float(word) for word in first])
-            numbers = np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity])
-            np.testing.assert_array_equal(numbers, words)
-            np.testing.assert_array_equal(boxes.center * (1, -1, 1), words[:, :3])
-            assert [line[0] for line in lines] == [
-                box.category for box in real.get_boxes(sample_token(agent, frame))
-            ]
-            np.testing.assert_array_equal(boxes.num_lidar_pts, [int(line[11]) for line in lines])
-            np.testing.assert_array_equal(
-                boxes.camera_visible, [line[12] == "True" for line in lines]
-            )
+    """Every number of every label is the `float` of its word."""
+    scenario_type, name = TOKEN.split("/")
+    for agent, frame in product(AGENTS, range(1, 101)):
+        path = real_root / scenario_type / agent / "label" / name / f"{name}_{frame:03d}.txt"
+        lines = [line.split() for line in path.read_text().splitlines()]
+        header, *rows = [words for words in lines if len(words) > 1]
+        expected = np.array([[float(word) for word in row[1:10]] for row in rows])
+
+        labels = read_label(path, raw=True)
+        np.testing.assert_array_equal(labels.agent_velocity[0], [float(word) for word in header])
+        numbers = np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity])
+        np.testing.assert_array_equal(numbers, expected)
+
+        token = sample_token(agent, frame)
+        boxes = real.boxes(token, "lidar")
+        np.testing.assert_array_equal(boxes.center * (1, -1, 1), expected[:, :3])
+        assert [box.category for box in real.get_boxes(token)] == [row[0] for row in rows]
+        np.testing.assert_array_equal(boxes.num_lidar_pts, [int(row[11]) for row in rows])
+        np.testing.assert_array_equal(boxes.camera_visible, [row[12] == "True" for row in rows])
 
 
 def test_all_agents_see_an_actor_in_the_same_place(real: DeepAccident) -> None:
@@ -219,105 +208,108 @@ def test_all_agents_see_an_actor_in_the_same_place(real: DeepAccident) -> None:
             for actor, center in zip(boxes.actor_id.tolist(), boxes.center, strict=True):
                 if actor not in (OWN_ACTOR_ID, UNTRACKED_ID):
                     centers.setdefault(actor, []).append(center)
-        assert max(np.ptp(places, axis=0).max() for places in centers.values()) < 0.01
+        for actor_centers in centers.values():
+            assert np.ptp(actor_centers, axis=0).max() < 0.01
         for agent in AGENTS[:4]:
-            own = views[agent].center[views[agent].actor_id == OWN_ACTOR_ID][0]
+            boxes = views[agent]
+            own_center = boxes.center[boxes.actor_id == OWN_ACTOR_ID][0]
             actor = real.get("agent", f"{TOKEN}/{agent}")["actor_id"]
-            assert np.linalg.norm(own - centers[actor][0]) < 0.3
+            assert np.linalg.norm(own_center - centers[actor][0]) < 0.3
 
 
 def test_the_ground_is_where_all_agents_see_it(real: DeepAccident) -> None:
-    """Heights of the road in the world, of the five agents' clouds, in the cells that two of them
-    share.
-    """
+    """In the cells that two clouds share, both give the same height of the road in the world."""
     for frame in CLOUD_FRAMES:
-        grounds, samples = [], real.samples_of(f"{TOKEN}/{frame:03d}")
-        road = np.mean([real.world_from(sample, "ego").translation[2] for sample in samples[:4]])
+        samples = real.samples_of(f"{TOKEN}/{frame:03d}")
+        agent_heights = [real.world_from(sample, "ego").translation[2] for sample in samples[:4]]
+        road_height = np.mean(agent_heights)
+        grounds = []
         for sample in samples:
             points = real.load_point_cloud(sample, "world").xyz
-            near = points[np.abs(points[:, 2] - road) < 0.3]
-            cells, place = np.unique(
-                np.floor(near[:, :2] / 0.5).astype(int), axis=0, return_inverse=True
-            )
-            low = np.full(len(cells), np.inf)
-            np.minimum.at(low, place.reshape(-1), near[:, 2])
-            grounds.append(dict(zip(map(tuple, cells.tolist()), low.tolist(), strict=True)))
+            road_points = points[np.abs(points[:, 2] - road_height) < 0.3]
+            heights: dict[tuple[int, ...], float] = {}
+            point_cells = np.floor(road_points[:, :2] / 0.5).astype(int)
+            for cell, z in zip(point_cells.tolist(), road_points[:, 2].tolist(), strict=True):
+                heights[tuple(cell)] = min(z, heights.get(tuple(cell), np.inf))
+            grounds.append(heights)
         for first, second in combinations(grounds, 2):
-            shared = first.keys() & second.keys()
-            if len(shared) >= 50:
-                assert abs(np.median([first[cell] - second[cell] for cell in shared])) < 0.03
+            shared_cells = first.keys() & second.keys()
+            if len(shared_cells) >= 50:
+                differences = [first[cell] - second[cell] for cell in shared_cells]
+                assert abs(np.median(differences)) < 0.03
 
 
 def test_points_fall_on_the_right_pixels(real: DeepAccident) -> None:
-    """Where depth jumps from one LiDAR point to the next, the pictures have vertical edges: there,
-    and not beside.
-    """
+    """An image has vertical edges where depth jumps between LiDAR points, and not beside them."""
     shifts = np.array([-60, -40, -24, -16, -8, 0, 8, 16, 24, 40, 60])
-    contrast, edges = np.zeros(len(shifts)), 0
+    contrast = np.zeros(len(shifts))
+    num_edges = 0
     for frame in IMAGE_FRAMES:
         sample = sample_token(INFRASTRUCTURE, frame)
         cloud = real.load_point_cloud(sample, "lidar")
         for camera in CAMERAS:
-            image = cv2.cvtColor(real.load_image(f"{sample}/{camera}"), cv2.COLOR_RGB2GRAY).astype(
-                np.float32
-            )
-            slope = np.abs(cv2.Sobel(cv2.GaussianBlur(image, (0, 0), 2), cv2.CV_32F, 1, 0))
-            seen = project_to_image(real, cloud, sample, f"{sample}/{camera}", colors=False)
-            places = _depth_edges(seen.pixels[seen.mask], seen.depth[seen.mask])
-            edges += len(places)
+            token = f"{sample}/{camera}"
+            gray = cv2.cvtColor(real.load_image(token), cv2.COLOR_RGB2GRAY).astype(np.float32)
+            slope = np.abs(cv2.Sobel(cv2.GaussianBlur(gray, (0, 0), 2), cv2.CV_32F, 1, 0))
+            projection = project_to_image(real, cloud, sample, token, colors=False)
+            is_visible = projection.mask
+            edges = find_depth_edges(projection.pixels[is_visible], projection.depth[is_visible])
+            num_edges += len(edges)
+            rows = edges[:, 1].astype(int)
             for number, shift in enumerate(shifts):
-                column = np.clip(places[:, 0] + shift, 0, image.shape[1] - 1).astype(int)
-                contrast[number] += slope[places[:, 1].astype(int), column].sum() / slope.mean()
-    assert edges > 2000
+                columns = np.clip(edges[:, 0] + shift, 0, gray.shape[1] - 1).astype(int)
+                contrast[number] += slope[rows, columns].sum() / slope.mean()
+    assert num_edges > 2000
     assert abs(shifts[contrast.argmax()]) <= 8
     assert contrast.max() > 1.15 * np.median(contrast)
 
 
-def _depth_edges(pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """(M, 2) pixels of the nearer of two neighbours in a row of points that lie over 2 m behind
-    each other.
+def find_depth_edges(pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Return the pixels (M, 2) where the depths of neighbours in a row differ by over 2 m.
+
+    Each is the pixel of the nearer neighbour.
     """
-    row = np.round(pixels[:, 1] / 6)
-    order = np.lexsort((pixels[:, 0], row))
-    pixels, depth, row = pixels[order], depth[order], row[order]
-    neighbours = (row[1:] == row[:-1]) & (np.abs(np.diff(pixels[:, 0])) < 15)
-    jump = np.flatnonzero(neighbours & (np.abs(np.diff(depth)) > 2.0))
-    return pixels[np.where(depth[jump + 1] < depth[jump], jump + 1, jump)]
+    rows = np.round(pixels[:, 1] / 6)
+    order = np.lexsort((pixels[:, 0], rows))
+    pixels, depth, rows = pixels[order], depth[order], rows[order]
+    are_neighbours = (rows[1:] == rows[:-1]) & (np.abs(np.diff(pixels[:, 0])) < 15)
+    jumps = np.flatnonzero(are_neighbours & (np.abs(np.diff(depth)) > 2.0))
+    return pixels[np.where(depth[jumps + 1] < depth[jumps], jumps + 1, jumps)]
 
 
 def test_boxes_hold_the_points_that_labels_count(real: DeepAccident) -> None:
-    """Of the boxes with points three in four hold exactly as many."""
-    counted, said = [], []
-    for agent in AGENTS:
-        for frame in CLOUD_FRAMES:
-            boxes = real.boxes(sample_token(agent, frame), "lidar")
-            counted.append(
-                boxes.count_points(real.load_point_cloud(sample_token(agent, frame), "lidar").xyz)
-            )
-            said.append(boxes.num_lidar_pts)
-    recount, label = np.concatenate(counted), np.concatenate(said)
-    with_points = (recount > 0) | (label > 0)
-    assert with_points.sum() > 200
-    assert (recount == label)[with_points].mean() > 0.7
-    assert np.corrcoef(recount, label)[0, 1] > 0.999
+    """Three in four of the boxes with points hold exactly as many."""
+    counts_by_sample, label_counts_by_sample = [], []
+    for agent, frame in product(AGENTS, CLOUD_FRAMES):
+        token = sample_token(agent, frame)
+        boxes = real.boxes(token, "lidar")
+        counts_by_sample.append(boxes.count_points(real.load_point_cloud(token, "lidar").xyz))
+        label_counts_by_sample.append(boxes.num_lidar_pts)
+    counts = np.concatenate(counts_by_sample)
+    label_counts = np.concatenate(label_counts_by_sample)
+    has_points = (counts > 0) | (label_counts > 0)
+    assert has_points.sum() > 200
+    assert (counts == label_counts)[has_points].mean() > 0.7
+    assert np.corrcoef(counts, label_counts)[0, 1] > 0.999
 
 
 def test_motion_labels_of_fifty_samples(real: DeepAccident) -> None:
-    """Both protocols draw whom the rule sees, where the boxes are."""
+    """Both protocols draw the actors that the rule sees, at the places of their boxes."""
     tokens = [sample["token"] for sample in real.sample[::10]]
     assert len(tokens) == 50
-    drawn = 0
+    num_drawn = 0
     for token in tokens:
         for protocol in ("released", "clean"):
             labels = motion_labels(real, token, MotionLabelConfig(protocol=protocol))
             assert labels.instance.shape == (5, 200, 200)
             np.testing.assert_array_equal(labels.segmentation.astype(bool), labels.instance > 0)
             boxes = real.boxes(token, "ego", visible="released")
-            inside = (np.abs(boxes.center[:, :2]) < 48.0).all(axis=1) & (boxes.size[:, 1] > 1.5)
-            index = np.floor((boxes.center[inside, :2] + 50.0) / 0.5).astype(int)
-            assert (labels.instance[0, index[:, 1], index[:, 0]] > 0).all()
-            drawn += int(inside.sum())
-    assert drawn > 300
+            is_inside = (np.abs(boxes.center[:, :2]) < 48.0).all(axis=1)
+            centers = boxes.center[is_inside & (boxes.size[:, 1] > 1.5), :2]
+            columns, rows = np.floor((centers + 50.0) / 0.5).astype(int).T
+            assert (labels.instance[0, rows, columns] > 0).all()
+            num_drawn += len(centers)
+    assert num_drawn > 300
 
 
 def test_statistics_count_what_is_there(real: DeepAccident) -> None:
@@ -326,7 +318,7 @@ def test_statistics_count_what_is_there(real: DeepAccident) -> None:
 
 
 def test_the_index_costs_at_most_one_percent(real: DeepAccident) -> None:
-    """Shards included, of the whole release's bytes a sample."""
+    """One percent of the bytes a sample of the whole release; the index includes its shards."""
     index = real.tables_folder.parent
     size = sum(path.stat().st_size for path in index.rglob("*") if path.is_file())
     assert size / len(real.sample) <= 0.01 * BYTES_A_SAMPLE
@@ -368,11 +360,10 @@ def test_it_can_be_drawn(real: DeepAccident, tmp_path: Path, view: str, token: s
 
 
 def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
-    """Of frame 51 all clouds and the pole's images are there; what is not there is left out and
-    told.
-    """
-    mcap_reading = pytest.importorskip("mcap_reading")
-    out, index = tmp_path / "real.mcap", str(real.tables_folder.parents[1])
+    """Frame 51 has all clouds and only the infrastructure's images; the others are left out."""
+    mcap_reading = pytest.importorskip("support.mcap_reader")
+    out = tmp_path / "real.mcap"
+    index = str(real.tables_folder.parents[1])
     arguments = [
         "export",
         "mcap",
@@ -388,17 +379,14 @@ def test_it_can_be_exported_to_mcap(real: DeepAccident, tmp_path: Path) -> None:
     )
     assert result.exit_code == 0, result.output
     messages = mcap_reading.read_mcap(out).messages
-    assert {agent: len(messages[f"/{agent}/{LIDAR}/points"]) for agent in AGENTS} == dict.fromkeys(
-        AGENTS, 1
-    )
-    assert {
-        camera: len(messages[f"/{INFRASTRUCTURE}/{camera}/image"]) for camera in CAMERAS
-    } == dict.fromkeys(CAMERAS, 1)
+    for agent in AGENTS:
+        assert len(messages[f"/{agent}/{LIDAR}/points"]) == 1
+    for camera in CAMERAS:
+        assert len(messages[f"/{INFRASTRUCTURE}/{camera}/image"]) == 1
 
 
 def test_facts_say_nothing_false(real: DeepAccident) -> None:
-    rows = {row.key: row for row in release_facts(real, workers=1).facts}
-    assert {row.verdict for row in rows.values()} == {"agree", "cannot say"}
-    assert [rows[key].here for key in ("slow", "fast", "vehicles")] == pytest.approx(
-        [0.16, 0.11, 11], abs=0.02
-    )
+    facts = {fact.key: fact for fact in release_facts(real, workers=1).facts}
+    assert {fact.verdict for fact in facts.values()} == {"agree", "cannot say"}
+    values = [facts[key].here for key in ("slow", "fast", "vehicles")]
+    assert values == pytest.approx([0.16, 0.11, 11], abs=0.02)

@@ -1,7 +1,7 @@
-"""Tests of the extra `nuscenes`, with PyTorch: not collected without them, unless
-DEEPACCIDENT_REQUIRE_NUSCENES is set.
+"""Test the extra `nuscenes` together with PyTorch.
 
-nuScenes' devkit needs numpy 1.26, so that this folder has an environment of its own (.ci/run).
+Nothing here is collected without them, unless DEEPACCIDENT_REQUIRE_NUSCENES is set. The nuScenes
+devkit needs numpy 1.26, which is why this folder has its own environment (.ci/run).
 """
 
 import importlib.util
@@ -18,9 +18,9 @@ from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.plugins.nuscenes import NuScenesRelease, open_nuscenes
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 
-_NEEDED = ("nuscenes", "torch")
+_REQUIRED_PACKAGES = ("nuscenes", "torch")
 
-if missing := [name for name in _NEEDED if importlib.util.find_spec(name) is None]:
+if missing := [name for name in _REQUIRED_PACKAGES if importlib.util.find_spec(name) is None]:
     if os.environ.get("DEEPACCIDENT_REQUIRE_NUSCENES"):
         raise pytest.UsageError(
             f"DEEPACCIDENT_REQUIRE_NUSCENES is set, but {', '.join(missing)} is not installed"
@@ -30,13 +30,13 @@ if missing := [name for name in _NEEDED if importlib.util.find_spec(name) is Non
 
 @dataclass(frozen=True)
 class Pair:
-    """A release, and the same as nuScenes: what `ego_vehicle` recorded.
+    """A release and the export of `ego_vehicle`'s recordings to nuScenes' format.
 
     Attributes:
-        release: ours.
-        road: its export, opened.
-        ours: sample of `road` → the release's.
-        folder: of the export.
+        release: Original release.
+        road: Export, opened as a release.
+        ours: Token of the original sample by sample of `road`.
+        folder: Root folder of the export.
     """
 
     release: DeepAccident
@@ -47,24 +47,28 @@ class Pair:
 
 @pytest.fixture(scope="session", params=["ego", "nuscenes"])
 def pair(
-    request: pytest.FixtureRequest, made: DeepAccident, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, release: DeepAccident, tmp_path_factory: pytest.TempPathFactory
 ) -> Pair:
-    """The release and its export, with either axes of the LiDAR."""
+    """The release and its export, once for each convention of the LiDAR's axes."""
     folder = tmp_path_factory.mktemp("road") / request.param
-    export_release(made, folder, NuScenes(agents=("ego_vehicle",), lidar_axes=request.param))
+    export_release(
+        release,
+        folder,
+        NuScenes(agents=("ego_vehicle",), lidar_axes=request.param),
+    )
     road = open_nuscenes(folder)
     ours = {}
     for record in road.sample:
         scene, _, frame = record["token"].removeprefix("nuscenes/").rsplit("/", 2)
         kind, name, _ = scene.split("-")
         ours[record["token"]] = f"{kind}/{name}/ego_vehicle/{frame}"
-    return Pair(made, road, ours, folder)
+    return Pair(release, road, ours, folder)
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """Accidents and their twins of 31 frames: each fifth one, from the first to the last, is a
-    keyframe.
+def release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """Accidents and their twins of 31 frames; every fifth frame is a keyframe, including the first
+    and the last.
     """
     config = SynthConfig(
         scenarios=8,
@@ -75,6 +79,5 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
         unplanned=0,
         designed=True,
     )
-    return DeepAccident(
-        "v1", make_release(tmp_path_factory.mktemp("made") / "release", config), verbose=False
-    )
+    root = make_release(tmp_path_factory.mktemp("made") / "release", config)
+    return DeepAccident("v1", root, verbose=False)

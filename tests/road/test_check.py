@@ -1,12 +1,12 @@
-"""A source whose axes, ground or cameras are wrong is refused, by the mistake's name, before
-anything is trained.
+"""A source with wrong axes, ground or cameras is refused before training, and the error names the
+mistake.
 """
 
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from nuscenes_mistakes import MISTAKES, copied
+from support.nuscenes_mistakes import MISTAKES, copy_dataroot
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import SourceError
@@ -15,47 +15,34 @@ from deepaccident_devkit.plugins.nuscenes.check import check_source, look_at
 
 
 def test_a_good_source_passes(pair) -> None:
-    found = check_source(pair.road)
-    assert [
-        words for words in found.unchecked() if not words.startswith("whether the images")
-    ] == []
+    unchecked = check_source(pair.road).unchecked()
+    assert all(sentence.startswith("whether the images") for sentence in unchecked)
 
 
 def test_the_release_passes_too(pair) -> None:
-    found = look_at(pair.release)
-    assert list(found.faults()) == []
+    assert list(look_at(pair.release).faults()) == []
 
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_is_named(pair, tmp_path: Path, name: str) -> None:
-    plant, words = MISTAKES[name]
-    folder = copied(pair.folder, tmp_path / "wrong")
-    plant(folder)
-    with pytest.raises(SourceError, match=words):
+    plant_mistake, message = MISTAKES[name]
+    folder = copy_dataroot(pair.folder, tmp_path / "wrong")
+    plant_mistake(folder)
+    with pytest.raises(SourceError, match=message):
         check_source(open_nuscenes(folder))
 
 
-def test_training_begins_with_it(pair, tmp_path: Path) -> None:
-    folder = copied(pair.folder, tmp_path / "wrong")
-    MISTAKES["mirrored"][0](folder)
+def test_training_begins_with_the_check(pair, tmp_path: Path) -> None:
+    folder = copy_dataroot(pair.folder, tmp_path / "wrong")
+    plant_mistake, _ = MISTAKES["mirrored"]
+    plant_mistake(folder)
     run = tmp_path / "run"
-    for first, others in (
-        (folder, ["--agents", "single"]),
-        (pair.release.dataroot, ["--also", str(folder)]),
+    options = ["--preset", "tiny", "--steps", "1", "--validation", "none", "--out", str(run)]
+    for sources in (
+        [str(folder), "--agents", "single"],
+        [str(pair.release.dataroot), "--also", str(folder)],
     ):
-        words = [
-            "train",
-            str(first),
-            "--preset",
-            "tiny",
-            "--steps",
-            "1",
-            "--validation",
-            "none",
-            "--out",
-            str(run),
-        ]
-        result = CliRunner().invoke(deepaccident, [*words, *others])
+        result = CliRunner().invoke(deepaccident, ["train", *sources, *options])
         assert isinstance(result.exception, SourceError)
         assert "y is mirrored" in str(result.exception)
         assert not run.exists()

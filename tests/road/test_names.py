@@ -1,5 +1,5 @@
-"""Each public name and argument of the installed nuScenes devkit is here, or an error says what to
-use.
+"""Every public name and argument of the installed nuScenes devkit exists here too, or its error
+names the replacement.
 """
 
 import ast
@@ -25,30 +25,30 @@ PAIRS = [
 
 
 def public_names(kind: type) -> set[str]:
-    """Methods and properties, and what the methods set on `self`."""
-    names = {name for name in dir(kind) if not name.startswith("_")}
+    """Collect methods, properties, and the attributes that methods set on `self`."""
+    names = set(dir(kind))
     for base in kind.__mro__[:-2]:
         tree = ast.parse(textwrap.dedent(inspect.getsource(base)))
-        names |= {
-            node.attr
-            for node in ast.walk(tree)
-            if isinstance(node, ast.Attribute)
-            and isinstance(node.ctx, ast.Store)
-            and ast.unparse(node.value) == "self"
-        }
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Attribute):
+                continue
+            if isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self":
+                names.add(node.attr)
     return {name for name in names if not name.startswith("_")}
 
 
 def own_names(kind: type) -> set[str]:
-    return {name for name in {*dir(kind), *getattr(kind, "__slots__", ())} if hasattr(kind, name)}
+    candidates = {*dir(kind), *getattr(kind, "__slots__", ())}
+    return {name for name in candidates if hasattr(kind, name)}
 
 
 @pytest.mark.parametrize(
-    ("theirs", "ours", "hints"), PAIRS, ids=lambda each: getattr(each, "__name__", "")
+    ("theirs", "ours", "hints"), PAIRS, ids=lambda value: getattr(value, "__name__", "")
 )
 def test_each_name_is_here_or_hinted(theirs: type, ours: type, hints: dict[str, str]) -> None:
-    known = own_names(ours) | {"token", "velocity", "dataroot", "version"}  # set on the object
-    assert public_names(theirs) - known - hints.keys() == set()
+    set_on_the_object = {"token", "velocity", "dataroot", "version"}
+    unknown = public_names(theirs) - own_names(ours) - set_on_the_object
+    assert unknown - hints.keys() == set()
 
 
 def shared_methods() -> Iterator[tuple[type, type, str]]:
@@ -62,9 +62,9 @@ def shared_methods() -> Iterator[tuple[type, type, str]]:
 @pytest.mark.parametrize(("theirs", "ours", "name"), [*shared_methods()])
 def test_each_argument_is_here_or_hinted(theirs: type, ours: type, name: str) -> None:
     method = getattr(ours, name)
-    wanted = inspect.signature(getattr(theirs, name)).parameters.keys() - {"self"}
-    lacking = wanted - inspect.signature(method).parameters.keys()
-    assert lacking <= nuscenes_names.KEYWORDS.keys()
-    for argument in lacking:
-        with pytest.raises(TypeError, match=f"has no argument '{argument}': .*reading.md"):
+    their_arguments = inspect.signature(getattr(theirs, name)).parameters.keys() - {"self"}
+    missing = their_arguments - inspect.signature(method).parameters.keys()
+    assert missing <= nuscenes_names.KEYWORDS.keys()
+    for argument in missing:
+        with pytest.raises(TypeError, match=f"has no argument '{argument}': .*nuscenes_names.md"):
             method(None, **{argument: None})

@@ -1,13 +1,11 @@
-"""A study on a stand-in for the road: releases in nuScenes' format, models of two sources, and no
-accidents.
-"""
+"""A study on releases in nuScenes' format, with models of two sources and no accidents."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from studies import written
+from support.study_recipes import write_recipe
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
@@ -46,41 +44,42 @@ RECIPE = {
 }
 
 
-def test_it_runs_and_has_no_numbers_of_accidents(tmp_path: Path) -> None:
-    report = run_study(
-        read_recipe(str(written(tmp_path, RECIPE))), tmp_path / "out", device="cpu", workers=1
-    )
-    rows = report.summary["rows"]
-    numbers = rows["everything"]["groups"]["all samples"]
-    assert numbers["iou_100"]["value"] > 0
-    assert "apa" not in numbers
+def test_a_study_on_the_road_has_no_accident_metrics(tmp_path: Path) -> None:
+    recipe = read_recipe(str(write_recipe(tmp_path, RECIPE)))
+    out = tmp_path / "out"
+    report = run_study(recipe, out, device="cpu", workers=1)
+    metrics = report.summary["rows"]["everything"]["groups"]["all samples"]
+
+    assert metrics["iou_100"]["value"] > 0
+    assert "apa" not in metrics
     assert report.summary["groups"]["all samples"]["samples"] == 4 * 4
-    trained = {
-        each["name"]: each["key"] for each in report.summary["cells"] if each["kind"] == "weights"
-    }
-    notes = json.loads(
-        (tmp_path / "out" / "weights" / trained["mixed, seed 1"] / "run.json").read_text()
-    )
+
+    cells = report.summary["cells"]
+    weights = {cell["name"]: cell["key"] for cell in cells if cell["kind"] == "weights"}
+    notes = json.loads((out / "weights" / weights["mixed, seed 1"] / "run.json").read_text())
     assert notes["also"]["mix"] == 0.5
     assert "APA" not in report.to_text()
 
 
 def test_an_export_to_nuscenes_is_known_by_its_actors(pair: Any) -> None:
-    """Its instances have other numbers, and its scenes other names."""
-    ours, theirs = (
-        (each, [record["token"] for record in each.scenario]) for each in (pair.release, pair.road)
-    )
-    assert known_scenarios(ours, theirs) == theirs[1]
-    assert known_scenarios(theirs, ours) == ours[1]
-    assert known_scenarios((pair.road, theirs[1][:1]), ours)
-    assert {cluster_of(token) for token in theirs[1]} == {cluster_of(token) for token in ours[1]}
+    """The export numbers its instances anew and gives its scenes other names."""
+    our_tokens = [record["token"] for record in pair.release.scenario]
+    road_tokens = [record["token"] for record in pair.road.scenario]
+    ours = (pair.release, our_tokens)
+    road = (pair.road, road_tokens)
+
+    assert known_scenarios(ours, road) == road_tokens
+    assert known_scenarios(road, ours) == our_tokens
+    assert known_scenarios((pair.road, road_tokens[:1]), ours)
+    assert set(map(cluster_of, road_tokens)) == set(map(cluster_of, our_tokens))
 
 
 def test_a_training_on_the_release_of_a_tested_export_is_refused(tmp_path: Path) -> None:
-    """It has more frames, other sensors, and the other format, but the same seed."""
+    """The release has more frames, other sensors and the other format, but the same seed."""
     releases = {**RECIPE["releases"], "simulation": {**SMALL, "seed": 3, "frames": 20}}
-    path = written(tmp_path, {**RECIPE, "releases": releases})
+    path = write_recipe(tmp_path, {**RECIPE, "releases": releases})
     with pytest.raises(
-        ConfigError, match=r"weights.simulation: simulation, all: shows \d+ scenarios of the test"
+        ConfigError,
+        match=r"weights.simulation: simulation, all: contains \d+ scenarios of the test",
     ):
         run_study(read_recipe(str(path)), tmp_path / "out", device="cpu", workers=1)

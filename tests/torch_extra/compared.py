@@ -1,16 +1,18 @@
-"""Whether nested batches and items are equal."""
+"""Comparison of nested batches and items."""
 
 from typing import Any
 
 import torch
 
 
-def same(one: Any, other: Any) -> bool:
-    """Whether two batches, or what stands in them, are the same bits of the same kind."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, torch.Tensor):
-        return one.dtype == other.dtype and torch.equal(one, other)
-    return bool(one == other)
+def are_identical(first: Any, second: Any) -> bool:
+    """Compare two batches, or values in them, bit for bit and with their kinds."""
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(
+            are_identical(first[key], second[key]) for key in first
+        )
+    if isinstance(first, list | tuple):
+        return len(first) == len(second) and all(map(are_identical, first, second))
+    if isinstance(first, torch.Tensor):
+        return first.dtype == second.dtype and torch.equal(first, second)
+    return bool(first == second)

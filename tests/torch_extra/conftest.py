@@ -1,8 +1,7 @@
-"""Tests of the extra `torch`: not collected where it is not installed, unless
-DEEPACCIDENT_REQUIRE_TORCH is set.
+"""Tests of the extra `torch`, which are left out where torch is not installed.
 
-(The folder cannot be called `torch`: the tests' folder is on the path, so that it would be found in
-torch's place.)
+With DEEPACCIDENT_REQUIRE_TORCH set, a missing torch is an error. The folder cannot be called
+`torch`: the tests' folder is on the path, so Python would import it instead of the library.
 """
 
 import importlib.util
@@ -26,11 +25,12 @@ if not HAS_TORCH:
 
 @pytest.fixture(scope="session")
 def sample(da: DeepAccident) -> str:
-    """The vehicle with a few frames before and after it, in an accident scenario."""
+    """The ego vehicle's sample in an accident scenario, with frames before and after it."""
     return f"{da.scenario[0]['token']}/ego_vehicle/004"
 
 
 @pytest.fixture(scope="session")
 def tokens(da: DeepAccident) -> list[str]:
-    """Samples of every agent and scenario."""
-    return [record["token"] for record in da.sample if record["token"].endswith("/004")]
+    """The samples of frame 4 of every agent and scenario."""
+    all_tokens = [record["token"] for record in da.sample]
+    return [token for token in all_tokens if token.endswith("/004")]

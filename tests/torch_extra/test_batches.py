@@ -5,7 +5,6 @@ import pickle
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ import pytest
 import torch
 from click.testing import CliRunner
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 from torch.utils.data import DataLoader
-from torch_extra.compared import same
+from torch_extra.compared import are_identical
+from torch_extra.items import load_item
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -34,7 +34,7 @@ from deepaccident_devkit.training.torch import (
 )
 from deepaccident_devkit.v2x import Link
 
-EVERYTHING = V2XConfig(
+FULL_CONFIG = V2XConfig(
     agents="all",
     link=Link(latency=0.1, pose_noise=0.3, packet_loss=0.3),
     past=2,
@@ -47,61 +47,78 @@ EVERYTHING = V2XConfig(
 )
 
 
-def test_agents_side_by_side(da: DeepAccident, tokens: list[str]) -> None:
-    one, two = (
-        V2XDataset(da, [token], V2XConfig(agents=agents, images=ImageConfig()))[0]
-        for token, agents in zip(tokens, ("single", "all"), strict=False)
-    )
-    batch = collate([one, two])
-    first, second = ({key: each[row] for key, each in batch.items()} for row in range(2))
-    assert same(second, two)
-    filling = {
+def test_collate_places_agents_side_by_side(da: DeepAccident, tokens: list[str]) -> None:
+    single = load_item(da, tokens[0], agents="single", images=ImageConfig())
+    cooperative = load_item(da, tokens[1], agents="all", images=ImageConfig())
+
+    batch = collate([single, cooperative])
+
+    first, second = ({key: values[row] for key, values in batch.items()} for row in range(2))
+    assert are_identical(second, cooperative)
+    padding = {
         "agent_valid": torch.zeros(4, 1, dtype=torch.bool),
         "images": torch.zeros(4, 1, 6, 3, 36, 64),
         "intrinsics": torch.eye(3).expand(4, 1, 6, 3, 3),
     }
-    expected = {key: torch.cat([one[key], blank]) for key, blank in filling.items()}
-    assert same({key: first[key] for key in filling}, expected)
+    expected = {key: torch.cat([single[key], blank]) for key, blank in padding.items()}
+    assert are_identical({key: first[key] for key in padding}, expected)
 
 
-def test_agents_one_after_another(da: DeepAccident, tokens: list[str]) -> None:
-    items = [
-        V2XDataset(da, [tokens[0]], V2XConfig(agents=agents))[0]
-        for agents in ("+other", "single", "all")
-    ]
+def test_collate_fusion_places_agents_one_after_another(
+    da: DeepAccident, tokens: list[str]
+) -> None:
+    items = [load_item(da, tokens[0], agents=agents) for agents in ("+other", "single", "all")]
+
     batch = collate_fusion(items)
-    assert (batch["record_len"].tolist(), batch["record_len"].dtype) == ([2, 1, 5], torch.int64)
-    assert (batch["ego_from_agent"].shape, len(batch["points"])) == ((8, 1, 4, 4), 8)
+
+    assert (batch["record_len"].tolist(), batch["record_len"].dtype) == (
+        [2, 1, 5],
+        torch.int64,
+    )
+    assert (batch["ego_from_agent"].shape, len(batch["points"])) == (
+        (8, 1, 4, 4),
+        8,
+    )
     pairwise = batch["pairwise_t_matrix"]
     assert_array_equal(
-        torch.cat([pairwise[1], pairwise[0, 2:]]), np.broadcast_to(np.eye(4), (8, 5, 4, 4))
+        torch.cat([pairwise[1], pairwise[0, 2:]]),
+        np.broadcast_to(np.eye(4), (8, 5, 4, 4)),
     )
+
     frames = [da.get_sample(da.scenario[0], name, 4) for name in items[2]["agents"]]
     expected = [[da.transform(target, source).matrix for target in frames] for source in frames]
     assert_allclose(pairwise[2], expected, atol=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_agents_that_a_partial_release_lacks(own_release: Path) -> None:
+def test_agents_that_a_partial_release_lacks_are_left_out(own_release: Path) -> None:
     scenario = min(path.name for path in own_release.glob("*/*/other_vehicle/calib/*"))
     for folder in own_release.glob(f"*/*/other_vehicle/*/{scenario}"):
         shutil.rmtree(folder)
-    partial = DeepAccident("v1", own_release, verbose=False)
-    here = [f"{record['token']}/ego_vehicle/004" for record in partial.scenario]
+
+    da = DeepAccident("v1", own_release, verbose=False)
+    tokens = [f"{record['token']}/ego_vehicle/004" for record in da.scenario]
     data = V2XDataset(
-        partial, here, V2XConfig(agents=None, points=False, past=2, step=1, labels="deepaccident")
+        da,
+        tokens,
+        V2XConfig(agents=None, points=False, past=2, step=1, labels="deepaccident"),
     )
-    counts = [4 if scenario in token else 5 for token in here]
-    assert set(counts) == {4, 5}
-    arguments = {"batch_size": len(here), "num_workers": 1, "multiprocessing_context": "fork"}
-    [side_by_side] = DataLoader(data, collate_fn=collate, **arguments)
-    assert side_by_side["agent_valid"].sum(dim=(1, 2)).tolist() == [2 * count for count in counts]
-    [one_after_another] = DataLoader(data, collate_fn=collate_fusion, **arguments)
-    assert (
-        one_after_another["record_len"].tolist()
-        == [len(names) for names in one_after_another["agents"]]
-        == counts
-    )
+    num_agents = [4 if scenario in token else 5 for token in tokens]
+    assert set(num_agents) == {4, 5}
+    options = {
+        "batch_size": len(tokens),
+        "num_workers": 1,
+        "multiprocessing_context": "fork",
+    }
+
+    [side_by_side] = DataLoader(data, collate_fn=collate, **options)
+    assert side_by_side["agent_valid"].sum(dim=(1, 2)).tolist() == [
+        2 * count for count in num_agents
+    ]
+
+    [one_after_another] = DataLoader(data, collate_fn=collate_fusion, **options)
+    num_names = [len(names) for names in one_after_another["agents"]]
+    assert one_after_another["record_len"].tolist() == num_names == num_agents
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
@@ -109,59 +126,59 @@ def test_agents_that_a_partial_release_lacks(own_release: Path) -> None:
 def test_a_loader_without_collate_fn_batches_as_collate_does(
     da: DeepAccident, sample: str, start: str | None
 ) -> None:
-    """The registry of torch's own collation; the items differ in boxes and points, which torch
-    could not stack.
-    """
+    """torch's own collation finds ours in its registry; by itself it could not stack the items."""
     partner = sample.replace("ego_vehicle", "infrastructure")
     data = V2XDataset(da, [sample, partner], V2XConfig(agents="all"))
     assert len(data[0]["boxes"]) != len(data[1]["boxes"])
+
     workers = {} if start is None else {"num_workers": 1, "multiprocessing_context": start}
     [batch] = DataLoader(data, batch_size=2, **workers)
-    assert same(batch, collate([data[0], data[1]]))
+
+    assert are_identical(batch, collate([data[0], data[1]]))
     assert type(batch) is dict
 
 
 def test_skipped_files_are_as_if_they_had_not_arrived(
     da: DeepAccident, da_partial: DeepAccident, sample: str
 ) -> None:
-    """The pole has no LiDAR, and the ego no front camera: with the pole, images are of the other
-    vehicles.
-    """
-    both = {"agents": ["ego_vehicle", "other_vehicle", "infrastructure"], "past": 2, "step": 1}
-    images = V2XConfig(**both, on_missing="skip", points=False, images=ImageConfig())
-    skip = "infrastructure.*no such file; .* with on_missing='skip'"
-    own = (
+    """The pole of this release has no LiDAR, and the ego vehicle no front camera."""
+    fields = {"agents": ["ego_vehicle", "other_vehicle", "infrastructure"], "past": 2, "step": 1}
+    images = {"points": False, "images": ImageConfig()}
+    pole_message = "infrastructure.*no such file; .* with on_missing='skip'"
+    ego_message = (
         f"Camera_Front.*no such file; {sample} lacks 1 of the 6 .*cannot be "
         f"skipped.*sensors=.'Camera_Front'"
     )
-    assert_refused(
-        (lambda: V2XDataset(da_partial, [sample], V2XConfig(**both))[0], MissingFileError, skip),
-        *[
-            (
-                partial(V2XDataset(da_partial, [sample], config).__getitem__, 0),
-                MissingFileError,
-                own,
-            )
-            for config in (images, replace(images, on_missing="raise"))
-        ],
+    assert_raises(
+        (lambda: load_item(da_partial, sample, **fields), MissingFileError, pole_message),
+        (
+            lambda: load_item(da_partial, sample, **fields, **images, on_missing="skip"),
+            MissingFileError,
+            ego_message,
+        ),
+        (
+            lambda: load_item(da_partial, sample, **fields, **images, on_missing="raise"),
+            MissingFileError,
+            ego_message,
+        ),
     )
-    item, whole = (
-        V2XDataset(each, [sample], V2XConfig(**both, on_missing="skip"))[0]
-        for each in (da_partial, da)
-    )
+
+    item = load_item(da_partial, sample, **fields, on_missing="skip")
+    complete = load_item(da, sample, **fields, on_missing="skip")
     missing = [[0, 0], [0, 0], [1, 1]]
     assert (~item["agent_valid"]).long().tolist() == item["files_missing"].tolist() == missing
-    assert same(item["points"], [*whole["points"][:2], [cloud[:0] for cloud in whole["points"][0]]])
+    empty_clouds = [cloud[:0] for cloud in complete["points"][0]]
+    assert are_identical(item["points"], [*complete["points"][:2], empty_clouds])
     assert_array_equal(item["ego_from_agent"][2], np.broadcast_to(np.eye(4), (2, 4, 4)))
-    assert collate([item, whole])["files_missing"].tolist() == [missing, [[0, 0]] * 3]
+    assert collate([item, complete])["files_missing"].tolist() == [missing, [[0, 0]] * 3]
 
 
-@pytest.mark.parametrize("collated", [collate, collate_fusion])
-def test_items_that_make_no_batch(
-    da: DeepAccident, tokens: list[str], collated: Callable[..., Any]
+@pytest.mark.parametrize("collate_items", [collate, collate_fusion])
+def test_items_of_other_kinds_make_no_batch(
+    da: DeepAccident, tokens: list[str], collate_items: Callable[..., Any]
 ) -> None:
     plain, small, large, longer = (
-        V2XDataset(da, tokens[:1], V2XConfig(points=False, boxes=None, **fields))[0]
+        load_item(da, tokens[0], points=False, boxes=None, **fields)
         for fields in (
             {},
             {"images": ImageConfig(resize=(9, 16))},
@@ -169,22 +186,22 @@ def test_items_that_make_no_batch(
             {"past": 2},
         )
     )
-    assert_refused(
-        (lambda: collated([]), ConfigError, "batch: expected at least one item, found none"),
+    assert_raises(
+        (lambda: collate_items([]), ConfigError, "batch: expected at least one item, found none"),
         (
-            lambda: collated([plain, small]),
+            lambda: collate_items([plain, small]),
             ConfigError,
             r"only some of the items have 'ego_from_camera'; .* of one V2XConfig",
         ),
         (
-            lambda: collated([large, small]),
+            lambda: collate_items([large, small]),
             ConfigError,
-            r"images: items of shapes .*9, 16\) and .*18, 32\) make no batch; .*resize=",
+            r"images: items of shapes .*9, 16\) and .*18, 32\) cannot form a batch; .*resize=",
         ),
         (
-            lambda: collated([plain, longer]),
+            lambda: collate_items([plain, longer]),
             ConfigError,
-            r"agent_valid: items of shapes .* make no batch",
+            r"agent_valid: items of shapes .* cannot form a batch",
         ),
     )
 
@@ -194,14 +211,16 @@ def test_items_that_make_no_batch(
 def test_workers_give_what_one_process_gives(
     da: DeepAccident, tokens: list[str], start: str
 ) -> None:
-    load = partial(
-        DataLoader, V2XDataset(da, tokens[:4], EVERYTHING), batch_size=2, collate_fn=collate_fusion
+    make_loader = partial(
+        DataLoader, V2XDataset(da, tokens[:4], FULL_CONFIG), batch_size=2, collate_fn=collate_fusion
     )
-    assert same(list(load()), list(load(num_workers=2, multiprocessing_context=start)))
+    assert are_identical(
+        list(make_loader()), list(make_loader(num_workers=2, multiprocessing_context=start))
+    )
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]) -> None:
+def test_persistent_workers_use_the_new_epoch(da: DeepAccident, tokens: list[str]) -> None:
     data = V2XDataset(
         da, tokens[:3], V2XConfig(points=False, boxes=None, augmentation=RandomAugmentation())
     )
@@ -216,44 +235,46 @@ def test_workers_that_stay_hear_of_the_epoch(da: DeepAccident, tokens: list[str]
     for epoch in range(2):
         data.set_epoch(epoch)
         epochs.append(torch.cat([batch["augmentation"] for batch in loader]))
-        assert same(epochs[-1], torch.stack([item["augmentation"] for item in data]))
+        assert are_identical(epochs[-1], torch.stack([item["augmentation"] for item in data]))
     assert not torch.equal(*epochs)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_errors_come_out_of_workers_as_they_are(da_b: DeepAccident) -> None:
     loader = DataLoader(
-        V2XDataset(da_b, [da_b.sample[0]["token"]]), num_workers=1, collate_fn=collate
+        V2XDataset(da_b, [da_b.sample[0]["token"]]),
+        num_workers=1,
+        collate_fn=collate,
     )
-    assert_refused((lambda: next(iter(loader)), MissingFileError, "no such file"))
+    assert_raises((lambda: next(iter(loader)), MissingFileError, "no such file"))
 
 
 def test_a_dataset_pickles_cheaply(da: DeepAccident) -> None:
     data = V2XDataset(da, [record["token"] for record in da.sample], V2XConfig(points=False))
     data.set_epoch(7)
-    text = pickle.dumps(data)
-    assert len(text) < 8 * len(data) + 10_000
-    assert same(pickle.loads(text)[5], data[5])
+    pickled = pickle.dumps(data)
+    assert len(pickled) < 8 * len(data) + 10_000
+    assert are_identical(pickle.loads(pickled)[5], data[5])
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_the_documented_training_loop_learns(
     da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The code of docs/training.md as it stands there; the session's release takes the place of its
-    own.
-    """
+    """All code of docs/training.md runs, on the session's release instead of the page's own."""
     page = Path(__file__).parents[2] / "docs" / "training.md"
     blocks = re.findall(r"```(python|bash)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "training_release").symlink_to(da.dataroot)
     monkeypatch.chdir(tmp_path)
-    for name, value in {
+    torchrun_variables = {
         "RANK": "0",
         "WORLD_SIZE": "1",
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": "0",
-    }.items():
-        monkeypatch.setenv(name, value)  # as torchrun does
+    }
+    for name, value in torchrun_variables.items():
+        monkeypatch.setenv(name, value)
+
     names: dict[str, Any] = {}
     for language, code in blocks:
         if language == "bash":
@@ -262,9 +283,10 @@ def test_the_documented_training_loop_learns(
             )
         else:
             exec(compile(code, str(page), "exec"), names)  # noqa: S102
-    shown = (names["item"]["images"], names["fiery_batch"]["image"], names["fiery_batch"]["flow"])
-    shapes = [(5, 1, 6, 3, 12, 32), (2, 3, 6, 3, 224, 480), (2, 7, 2, 200, 200)]
-    assert [tuple(each.shape) for each in shown] == shapes
+
+    assert names["item"]["images"].shape == (5, 1, 6, 3, 12, 32)
+    assert names["fiery_batch"]["image"].shape == (2, 3, 6, 3, 224, 480)
+    assert names["fiery_batch"]["flow"].shape == (2, 7, 2, 200, 200)
     assert names["losses"][4] < 0.8 * names["losses"][0]
     assert names["evaluator"].tokens == set(da.evaluation_samples("val"))
     assert math.isfinite(names["loss"].item())

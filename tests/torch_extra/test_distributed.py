@@ -1,4 +1,4 @@
-"""Several processes: their counts together, epochs, and one index for all."""
+"""Several processes: merged counts, epochs, and one index for all of them."""
 
 import json
 from collections.abc import Callable
@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import torch
-from ranks import RANKS, counted, everything, run_ranks
-from refusals import assert_refused
-from torch_extra.compared import same
+from support.distributed_ranks import RANKS, filled_evaluators, run_ranks, write_rank_outputs
+from support.expected_errors import assert_raises
+from torch_extra.compared import are_identical
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError
@@ -22,81 +22,83 @@ from deepaccident_devkit.training.torch import (
     merged_evaluator,
 )
 
-Outcome = Callable[[str], list[Any]]
+OutputReader = Callable[[str], list[Any]]
+"""Returns the outputs of one name, in the order of ranks."""
 
 
-def test_alone_one_process_merges_its_own_and_only_evaluators() -> None:
+def test_one_process_merges_only_its_own_evaluators() -> None:
     evaluator = MotionEvaluator()
     merged = merged_evaluator(evaluator)
-    assert (merged is evaluator, merged.settings) == (False, evaluator.settings)
-    assert_refused(
+    assert merged is not evaluator
+    assert merged.settings == evaluator.settings
+
+    assert_raises(
         (lambda: merged_evaluator(0.5), EvaluationError, ("MotionEvaluator()", "rank 0 has 0.5"))
     )
 
 
 @pytest.fixture(scope="module")
 def tokens(da_motion: DeepAccident) -> list[str]:
-    """An odd number, so that ranks have different numbers."""
-    return [
-        record["token"]
-        for record in da_motion.sample
-        if record["token"].endswith("ego_vehicle/015")
-    ] + [
-        record["token"]
-        for record in da_motion.sample
-        if record["token"].endswith("other_vehicle/020")
-    ][:1]
+    """An odd number of samples, so that one rank has more than the other."""
+    all_tokens = [record["token"] for record in da_motion.sample]
+    ego_tokens = [token for token in all_tokens if token.endswith("ego_vehicle/015")]
+    other_tokens = [token for token in all_tokens if token.endswith("other_vehicle/020")]
+    return ego_tokens + other_tokens[:1]
 
 
 @pytest.fixture(scope="module")
-def outcome(
+def read_outputs(
     da_motion: DeepAccident,
     tokens: list[str],
     release_root_b: Path,
     tmp_path_factory: pytest.TempPathFactory,
-) -> Outcome:
-    """What `ranks.everything` found, by rank."""
+) -> OutputReader:
+    """A reader of the files that `write_rank_outputs` writes."""
     folder = tmp_path_factory.mktemp("ranks")
     root = copytree(release_root_b, folder / "release", ignore=ignore_patterns(".deepaccident"))
-    run_ranks(everything, folder, da_motion, tokens, root)
+    run_ranks(write_rank_outputs, folder, da_motion, tokens, root)
 
-    def read(what: str) -> list[Any]:
-        return [json.loads((folder / f"{what}_{rank}.json").read_text()) for rank in range(RANKS)]
+    def read(name: str) -> list[Any]:
+        paths = [folder / f"{name}_{rank}.json" for rank in range(RANKS)]
+        return [json.loads(path.read_text()) for path in paths]
 
     return read
 
 
 @pytest.mark.slow
 class TestTwoProcesses:
-    """One run for all, since each process takes seconds to start."""
-
-    def test_all_have_the_counts_of_one_process(
-        self, outcome: Outcome, da_motion: DeepAccident, tokens: list[str], tmp_path: Path
+    def test_ranks_have_the_counts_of_one_process(
+        self, read_outputs: OutputReader, da_motion: DeepAccident, tokens: list[str], tmp_path: Path
     ) -> None:
-        for alone in counted(da_motion, tokens):
-            saved = json.loads(alone.save(tmp_path / "alone.json").read_text())
-            assert outcome(type(alone).__name__) == [saved] * RANKS
+        for evaluator in filled_evaluators(da_motion, tokens):
+            path = evaluator.save(tmp_path / "one_process.json")
+            counts = json.loads(path.read_text())
+            assert read_outputs(type(evaluator).__name__) == [counts] * RANKS
 
-    def test_all_refuse_other_settings(self, outcome: Outcome) -> None:
-        assert all("evaluate both with the same settings" in error for error in outcome("refused"))
+    def test_ranks_refuse_other_settings(self, read_outputs: OutputReader) -> None:
+        for error in read_outputs("merge_error"):
+            assert "evaluate both with the same settings" in error
 
-    def test_they_draw_their_own_augmentations_each_epoch(
-        self, outcome: Outcome, da_motion: DeepAccident, tokens: list[str]
+    def test_ranks_draw_their_own_augmentations_each_epoch(
+        self, read_outputs: OutputReader, da_motion: DeepAccident, tokens: list[str]
     ) -> None:
         data = V2XDataset(
-            da_motion, tokens, V2XConfig(points=False, augmentation=RandomAugmentation())
+            da_motion,
+            tokens,
+            V2XConfig(points=False, augmentation=RandomAugmentation()),
         )
-        ranks = outcome("trained")
+        ranks = read_outputs("augmentations")
         for epoch in range(2):
             data.set_epoch(epoch)
-            together = {
-                token: torch.tensor(matrix)
-                for rank in ranks
-                for token, matrix in rank[epoch].items()
-            }
-            assert same(together, {item["token"]: item["augmentation"] for item in data})
-            assert len({str(matrix) for matrix in together.values()}) == len(tokens)
+            lists = ranks[0][epoch] | ranks[1][epoch]
+            matrices = {token: torch.tensor(rows) for token, rows in lists.items()}
+            assert are_identical(
+                matrices,
+                {item["token"]: item["augmentation"] for item in data},
+            )
+            assert len({str(matrix) for matrix in matrices.values()}) == len(tokens)
+
         assert ranks[0][0] != ranks[0][1]
 
-    def test_they_make_one_index(self, outcome: Outcome) -> None:
-        assert len(set(outcome("opened"))) == 1
+    def test_ranks_make_one_index(self, read_outputs: OutputReader) -> None:
+        assert len(set(read_outputs("tables"))) == 1

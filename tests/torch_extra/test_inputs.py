@@ -1,5 +1,6 @@
-"""torch tensors wherever the devkit takes arrays: read where numpy can, else refused with the
-remedy.
+"""torch tensors wherever the devkit takes arrays.
+
+They are read where numpy can read them, and otherwise refused with the remedy.
 """
 
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes
@@ -33,28 +34,27 @@ SHAPES = {
 }
 
 
-def heads(tensor: torch.Tensor) -> Any:
-    return MotionHeads(
-        **{name: tensor.expand(shape) for name, shape in SHAPES.items()}
-    ).segmentation
+def read_named_heads(tensor: torch.Tensor) -> Any:
+    tensors = {name: tensor.expand(shape) for name, shape in SHAPES.items()}
+    return MotionHeads(**tensors).segmentation
 
 
-def heads_in_order(tensor: torch.Tensor) -> Any:
-    return MotionHeads.from_arrays(*(tensor.expand(shape) for shape in SHAPES.values())).flow
+def read_ordered_heads(tensor: torch.Tensor) -> Any:
+    tensors = [tensor.expand(shape) for shape in SHAPES.values()]
+    return MotionHeads.from_arrays(*tensors).flow
 
 
-def labels_of_a_batch(tensor: torch.Tensor) -> Any:
-    batch: dict[str, Any] = motion_labels_from_boxes(
-        [None, None], np.zeros((2, 6)), CONFIG
-    ).as_batch("beverse")
+def read_batch_labels(tensor: torch.Tensor) -> Any:
+    labels = motion_labels_from_boxes([None, None], np.zeros((2, 6)), CONFIG)
+    batch: dict[str, Any] = labels.as_batch("beverse")
     batch["instance_offset"] = tensor.expand(batch["instance_offset"].shape)
     return MotionLabels.from_batch(batch, CONFIG, "beverse").offset
 
 
-ENTRIES: list[Callable[[torch.Tensor], Any]] = [
-    heads,
-    heads_in_order,
-    labels_of_a_batch,
+READERS: list[Callable[[torch.Tensor], Any]] = [
+    read_named_heads,
+    read_ordered_heads,
+    read_batch_labels,
     lambda tensor: agents_to_ego(tensor.expand(2, 6, 8), np.zeros((2, 6)), grid=CONFIG.grid),
     lambda tensor: agents_to_ego(np.zeros((2, 6, 8)), tensor.expand(2, 6), grid=CONFIG.grid),
     lambda tensor: past_to_present(tensor.expand(2, 3, 6, 8), np.zeros((1, 6)), grid=CONFIG.grid),
@@ -65,15 +65,15 @@ ENTRIES: list[Callable[[torch.Tensor], Any]] = [
 ]
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
+@pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.int32])
 def test_tensors_on_the_processor_are_read(
-    entry: Callable[[torch.Tensor], Any], dtype: torch.dtype
+    read: Callable[[torch.Tensor], Any], dtype: torch.dtype
 ) -> None:
-    entry(torch.zeros((), dtype=dtype))
+    read(torch.zeros((), dtype=dtype))
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
+@pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize(
     "tensor",
     [
@@ -84,12 +84,12 @@ def test_tensors_on_the_processor_are_read(
     ],
     ids=["grad", "device", "bfloat16", "complex"],
 )
-def test_others_are_refused_with_the_remedy(
-    entry: Callable[[torch.Tensor], Any], tensor: torch.Tensor
+def test_other_tensors_are_refused_with_the_remedy(
+    read: Callable[[torch.Tensor], Any], tensor: torch.Tensor
 ) -> None:
-    assert_refused(
+    assert_raises(
         (
-            lambda: entry(tensor),
+            lambda: read(tensor),
             GeometryError,
             ("found Tensor (", "pass a torch tensor as tensor.detach().cpu()"),
         )
@@ -97,8 +97,6 @@ def test_others_are_refused_with_the_remedy(
 
 
 def test_numbers_beyond_float32_are_refused() -> None:
-    huge, named = (
-        torch.full((), 1e300, dtype=torch.float64),
-        "expected numbers within float32's range, found 1e",
-    )
-    assert_refused(*((partial(entry, huge), GeometryError, named) for entry in ENTRIES[:3]))
+    tensor = torch.full((), 1e300, dtype=torch.float64)
+    message = "expected numbers within float32's range, found 1e"
+    assert_raises(*((partial(read, tensor), GeometryError, message) for read in READERS[:3]))

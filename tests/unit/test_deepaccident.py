@@ -1,6 +1,4 @@
-"""The facade's late-bound functions: fetched when they are asked for, and the same as in their
-packages.
-"""
+"""The facade's functions are imported on first use, and are the same as in their packages."""
 
 import inspect
 import subprocess
@@ -19,7 +17,7 @@ from deepaccident_devkit import (
     validation,
 )
 
-LATE = {
+LATE_FUNCTIONS = {
     name: getattr(package, name)
     for package in (descriptions, interactions, maps, motion, render, selection, validation)
     for name in package.__all__
@@ -27,13 +25,13 @@ LATE = {
 }
 
 
-def run(code: str) -> str:
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
-    ).stdout
+def run_code(code: str) -> str:
+    command = [sys.executable, "-c", code]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    return process.stdout
 
 
-PARTS = (
+PACKAGES = (
     "motion",
     "render",
     "descriptions",
@@ -43,8 +41,8 @@ PARTS = (
     "evaluation",
     "plugins",
 )
-HEAVY = [
-    *(f"deepaccident_devkit.{name}" for name in PARTS),
+HEAVY_MODULES = [
+    *(f"deepaccident_devkit.{name}" for name in PACKAGES),
     "cv2",
     "matplotlib",
     "scipy",
@@ -56,26 +54,37 @@ HEAVY = [
     ("used", "imported"),
     [("find", set()), ("transform", set()), ("motion_labels", {"deepaccident_devkit.motion"})],
 )
-def test_what_is_asked_for_brings_its_own_package_alone(used: str, imported: set[str]) -> None:
+def test_a_function_imports_only_its_own_package(used: str, imported: set[str]) -> None:
     code = (
         f"import sys; from deepaccident_devkit import DeepAccident; "
         f"DeepAccident.{used}; print(*sys.modules)"
     )
-    light = ("cv2", "scipy", "shapely") if imported else ()  # what that package itself may need
-    assert {*run(code).split()} & {*HEAVY} - {*light} == imported
+    # the package itself may need these
+    dependencies = {"cv2", "scipy", "shapely"} if imported else set()
+    modules = set(run_code(code).split())
+    assert modules & set(HEAVY_MODULES) - dependencies == imported
 
 
 def test_each_is_its_packages_own_and_in_place_after_its_first_use() -> None:
-    assert {"motion_labels", "findings", "render_sample", "render_replay", "describe"} < LATE.keys()
-    assert {name: getattr(DeepAccident, name) for name in LATE} == LATE
-    assert {name: vars(DeepAccident)[name] for name in LATE} == LATE
+    assert {
+        "motion_labels",
+        "findings",
+        "render_sample",
+        "render_replay",
+        "describe",
+    } < LATE_FUNCTIONS.keys()
+    assert {name: getattr(DeepAccident, name) for name in LATE_FUNCTIONS} == LATE_FUNCTIONS
+    assert {name: vars(DeepAccident)[name] for name in LATE_FUNCTIONS} == LATE_FUNCTIONS
 
 
-@pytest.mark.parametrize("name", LATE)
+@pytest.mark.parametrize("name", LATE_FUNCTIONS)
 def test_an_instance_binds_them(name: str) -> None:
     da = object.__new__(DeepAccident)
-    bound = getattr(da, name)
-    assert (bound.__self__, bound.__func__) == (da, LATE[name])
-    whole, shown = inspect.signature(LATE[name]), inspect.signature(bound)
-    assert [*shown.parameters.values()] == [*whole.parameters.values()][1:]
-    assert shown.return_annotation == whole.return_annotation
+    method = getattr(da, name)
+    assert method.__self__ is da
+    assert method.__func__ == LATE_FUNCTIONS[name]
+    function_signature = inspect.signature(LATE_FUNCTIONS[name])
+    method_signature = inspect.signature(method)
+    parameters = list(function_signature.parameters.values())
+    assert list(method_signature.parameters.values()) == parameters[1:]
+    assert method_signature.return_annotation == function_signature.return_annotation

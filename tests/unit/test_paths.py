@@ -1,10 +1,10 @@
-"""What callers give as paths: what is none is refused by the devkit's own errors."""
+"""What callers pass as paths; the devkit's own errors refuse what is not a path."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError, DatarootError, DeepAccidentError
@@ -17,8 +17,8 @@ from deepaccident_devkit.support.text import path_of
 from deepaccident_devkit.validation import validate_release
 
 
-class Named:
-    """A path object of anything."""
+class PathOfAnything:
+    """A path object that returns any object as its path."""
 
     def __init__(self, path: object) -> None:
         self._path = path
@@ -28,7 +28,7 @@ class Named:
 
 
 @pytest.mark.parametrize(
-    "given",
+    "path",
     [
         None,
         b"/data",
@@ -41,36 +41,35 @@ class Named:
         "\ud800",
         "~nobody-of-this-name/x",
         Path("a\0b"),
-        Named(b"a"),
+        PathOfAnything(b"a"),
     ],
 )
-def test_what_is_no_path_is_refused(given: Any, da: DeepAccident) -> None:
-    assert_refused(
-        (lambda: path_of(given), ConfigError, r"^expected a path, found "),
+def test_what_is_no_path_is_refused(path: Any, da: DeepAccident) -> None:
+    assert_raises(
+        (lambda: path_of(path), ConfigError, r"^expected a path, found "),
         (
-            lambda: DeepAccident("v1", given, verbose=False),
+            lambda: DeepAccident("v1", path, verbose=False),
             DatarootError,
             r"^dataroot: expected a path or a URL, found ",
         ),
     )
-    for refused in (
-        lambda: DeepAccident(
-            "v1", da.dataroot, index_dir=given if given is not None else "", verbose=False
-        ),
-        lambda: read_results(given),
-        lambda: ResultsWriter(given, "detection"),
-        lambda: read_bundle(given),
-        lambda: validate_release(given, workers=1),
-        lambda: make_release(given),
-        lambda: writable_folder(given),
-        lambda: write_label_files(da, given, []),
-        lambda: da.split_scenarios(given),
-        lambda: da.render_replay(None, given),
+    index_dir = "" if path is None else path
+    for call in (
+        lambda: DeepAccident("v1", da.dataroot, index_dir=index_dir, verbose=False),
+        lambda: read_results(path),
+        lambda: ResultsWriter(path, "detection"),
+        lambda: read_bundle(path),
+        lambda: validate_release(path, workers=1),
+        lambda: make_release(path),
+        lambda: writable_folder(path),
+        lambda: write_label_files(da, path, []),
+        lambda: da.split_scenarios(path),
+        lambda: da.render_replay(None, path),
     ):
         with pytest.raises(DeepAccidentError, match=r"expected|found"):
-            refused()
+            call()
 
 
 def test_paths_are_texts_and_path_objects() -> None:
     assert path_of("~/a\nb") == Path.home() / "a\nb"
-    assert path_of(Path("a")) == path_of(Named("a")) == Path("a")
+    assert path_of(Path("a")) == path_of(PathOfAnything("a")) == Path("a")

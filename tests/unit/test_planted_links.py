@@ -1,4 +1,4 @@
-"""Folders of a stranger: no link in them leads what is written or removed out of them."""
+"""Links that a stranger planted in a folder lead nothing that is written or removed out of it."""
 
 import math
 import os
@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from refusals import assert_refused
-from tiny_format import TinyFormat
+from support.expected_errors import assert_raises
+from support.tiny_format import TinyFormat
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import DeepAccidentError, OutputFolderError
@@ -28,95 +28,94 @@ Writer = Callable[[DeepAccident, Path], object]
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """Two scenarios with a camera."""
+    """A release of two scenarios with one camera."""
     root = tmp_path_factory.mktemp("small") / "release"
-    wanted = SmallRelease(
+    options = SmallRelease(
         splits=("train",), agents=("ego_vehicle",), frames=8, channels=("Camera_Front",)
     )
-    write_small_release(root, wanted)
+    write_small_release(root, options)
     return DeepAccident(dataroot=root, verbose=False)
 
 
-def an_export(dataset: DeepAccident, folder: Path) -> None:
+def make_export(dataset: DeepAccident, folder: Path) -> None:
     export_release(dataset, folder / EXPORT, TinyFormat(link="symbolic"), workers=1)
 
 
-def half_an_export(dataset: DeepAccident, folder: Path) -> None:
-    """One that was stopped at its second scenario."""
-    whole, left = TinyFormat.write, iter(range(1))
+def stop_export(dataset: DeepAccident, folder: Path) -> None:
+    """Make an export that is stopped at its second scenario."""
+    write_scenario = TinyFormat.write
+    num_written = 0
 
-    def write(self: TinyFormat, *arguments: Any) -> None:
-        whole(self, *arguments)
-        if next(left, None) is None:
+    def write_and_stop(self: TinyFormat, *arguments: Any) -> None:
+        nonlocal num_written
+        write_scenario(self, *arguments)
+        num_written += 1
+        if num_written == 2:
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TinyFormat, "write", write)
-        assert_refused((lambda: an_export(dataset, folder), KeyboardInterrupt, ()))
+        patch.setattr(TinyFormat, "write", write_and_stop)
+        assert_raises((lambda: make_export(dataset, folder), KeyboardInterrupt, ()))
 
 
-def labels(dataset: DeepAccident, folder: Path) -> None:
+def write_labels(dataset: DeepAccident, folder: Path) -> None:
     tokens = [f"{row['token']}/ego_vehicle/003" for row in dataset.scenario]
     config = MotionLabelConfig(future_frames=1, agents="available")
     write_label_files(dataset, folder / "out", tokens, config, workers=1)
 
 
-def a_release(_: DeepAccident, folder: Path, left: float = math.inf) -> None:
-    def record(job: RecordingJob) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
+def generate_release(_: DeepAccident, folder: Path, max_scenarios: float = math.inf) -> None:
+    num_recorded = 0
+
+    def record_or_stop(job: RecordingJob) -> None:
+        nonlocal num_recorded
+        num_recorded += 1
+        if num_recorded > max_scenarios:
             raise KeyboardInterrupt
+        agent_folder = job.root / job.folder.scenario_type / "ego_vehicle"
         for kind in ("label", "calib"):
-            write_bytes(
-                job.root / job.folder.scenario_type / "ego_vehicle" / kind / f"{job.plan.name}.txt",
-                b"recorded",
-            )
+            write_bytes(agent_folder / kind / f"{job.plan.name}.txt", b"recorded")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(generate, "record_scenario", record)
-        make_release(
-            folder / "out", SynthConfig(scenarios=2, frames=1, sensors=False, seed=7), workers=1
-        )
+        patch.setattr(generate, "record_scenario", record_or_stop)
+        config = SynthConfig(scenarios=2, frames=1, sensors=False, seed=7)
+        make_release(folder / "out", config, workers=1)
 
 
-def half_a_release(dataset: DeepAccident, folder: Path) -> None:
-    assert_refused((lambda: a_release(dataset, folder, 1), KeyboardInterrupt, ()))
+def stop_release(dataset: DeepAccident, folder: Path) -> None:
+    assert_raises((lambda: generate_release(dataset, folder, 1), KeyboardInterrupt, ()))
 
 
-def an_index(dataset: DeepAccident, folder: Path) -> None:
-    if not (folder / "release").exists():
-        shutil.copytree(
-            dataset.dataroot, folder / "release", ignore=shutil.ignore_patterns(".deepaccident")
-        )
-    opened = DeepAccident(dataroot=folder / "release", verbose=False)
-    for row in opened.scenario:
-        opened.interactions(row["token"])
-    FileStore(opened).get("one", "a.jpg", lambda: b"made")
+def make_index(dataset: DeepAccident, folder: Path) -> None:
+    root = folder / "release"
+    if not root.exists():
+        shutil.copytree(dataset.dataroot, root, ignore=shutil.ignore_patterns(".deepaccident"))
+    da = DeepAccident(dataroot=root, verbose=False)
+    for scenario in da.scenario:
+        da.interactions(scenario["token"])
+    FileStore(da).get("one", "a.jpg", lambda: b"made")
 
 
 WRITERS: dict[str, tuple[Writer, Writer]] = {
-    "an export": (half_an_export, an_export),
-    "labels": (labels, labels),
-    "a release": (half_a_release, a_release),
-    "an index": (an_index, an_index),
+    "an export": (stop_export, make_export),
+    "labels": (write_labels, write_labels),
+    "a release": (stop_release, generate_release),
+    "an index": (make_index, make_index),
 }
-"""What is made → what an earlier call left, and what is called then."""
-USERS_OWN = {"out", "release", "release/.deepaccident", "release/.deepaccident/v1"}
+"""What is made → the writer that leaves something, and the one that is called afterwards."""
+USER_FOLDERS = {"out", "release", "release/.deepaccident", "release/.deepaccident/v1"}
 """Folders that the user named, or may have put elsewhere."""
 
 
-def spots(folder: Path) -> Iterator[str]:
-    """Each folder, and one file of each."""
+def list_places(folder: Path) -> Iterator[str]:
+    """Yield each folder, and the first and last file of each."""
     for path, folders, files in os.walk(folder):
-        inside = Path(path).relative_to(folder)
-        yield from (
-            (inside / name).as_posix()
-            for name in [*folders, *sorted(files)[:1], *sorted(files)[-1:]]
-        )
+        relative_folder = Path(path).relative_to(folder)
+        for name in [*folders, *sorted(files)[:1], *sorted(files)[-1:]]:
+            yield (relative_folder / name).as_posix()
 
 
-def states(folder: Path) -> dict[str, tuple[int, bytes | None]]:
+def read_states(folder: Path) -> dict[str, tuple[int, bytes | None]]:
     return {
         str(path): (path.lstat().st_mtime_ns, path.read_bytes() if path.is_file() else None)
         for path in [folder, *folder.rglob("*")]
@@ -125,54 +124,59 @@ def states(folder: Path) -> dict[str, tuple[int, bytes | None]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dangling", [False, True], ids=["to something", "dangling"])
-@pytest.mark.parametrize("what", WRITERS)
+@pytest.mark.parametrize("product", WRITERS)
 def test_a_link_in_any_place_leads_nothing_out(
-    small: DeepAccident, tmp_path: Path, what: str, dangling: bool
+    small: DeepAccident, tmp_path: Path, product: str, dangling: bool
 ) -> None:
-    begin, go = WRITERS[what]
-    begun, done, outside, folder = (
-        tmp_path / name for name in ("begun", "done", "outside", "folder")
-    )
-    for each in (begun, outside):
-        each.mkdir()
+    begin, finish = WRITERS[product]
+    begun = tmp_path / "begun"
+    begun.mkdir()
     begin(small, begun)
-    shutil.copytree(begun, done, symlinks=True)
-    go(small, done)
-    places = {name: path / name for path in (done, begun) for name in spots(path)}
-    if what == "a release":
+    finished = tmp_path / "finished"
+    shutil.copytree(begun, finished, symlinks=True)
+    finish(small, finished)
+    places = {name: path / name for path in (finished, begun) for name in list_places(path)}
+    if product == "a release":
         places |= {
             name.replace("out", ".out.unfinished/release", 1): path for name, path in places.items()
         }
-    elif what == "an index":
+    elif product == "an index":
         places = {name: path for name, path in places.items() if "/.deepaccident/" in name}
-    refused = 0
-    for number, name in enumerate(sorted(places.keys() - USERS_OWN)):
+
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    folder = tmp_path / "folder"
+    num_refused = 0
+    for number, name in enumerate(sorted(places.keys() - USER_FOLDERS)):
+        target = outside / str(number)
         if not dangling:
-            precious_copy(places[name], outside / str(number))
+            copy_as_precious(places[name], target)
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(begun, folder, symlinks=True)
         remove_in(folder, name)
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).symlink_to(outside / str(number))
-        before = states(outside)
+        link = folder / name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(target)
+        before = read_states(outside)
         try:
-            go(small, folder)
-        except (
-            DeepAccidentError,
-            OSError,
-            ValueError,
-        ) as error:  # the last of a format that reads a stranger's part
-            refused += isinstance(error, OutputFolderError)
-        assert states(outside) == before, name
-    assert refused
+            finish(small, folder)
+        except (DeepAccidentError, OSError, ValueError) as error:
+            # a format that reads a stranger's part may raise ValueError
+            num_refused += isinstance(error, OutputFolderError)
+        assert read_states(outside) == before, name
+    assert num_refused
 
 
-def precious_copy(real: Path, target: Path) -> None:
-    """The same files and folders, of which each file is precious."""
-    shutil.copytree(real, target) if real.is_dir() else target.touch()
-    for path in (each for each in (target, *target.rglob("*")) if not each.is_dir()):
-        path.unlink()
-        path.write_bytes(PRECIOUS)
+def copy_as_precious(original: Path, target: Path) -> None:
+    """Copy the names of files and folders, with precious bytes in each file."""
+    if original.is_dir():
+        shutil.copytree(original, target)
+    else:
+        target.touch()
+    for path in (target, *target.rglob("*")):
+        if not path.is_dir():
+            path.unlink()
+            path.write_bytes(PRECIOUS)
 
 
 ATTACKS = {
@@ -199,56 +203,70 @@ ATTACKS = {
 def test_a_journal_removes_nothing_outside(
     small: DeepAccident, tmp_path: Path, attack: str, of_another: bool
 ) -> None:
-    """Its lines are paths of which an unfinished export removes those that it does not write
-    again.
-    """
-    half_an_export(small, tmp_path)
-    out, outside, line = tmp_path / EXPORT, tmp_path / "outside", ATTACKS[attack]
+    """Its lines are paths, which an unfinished export removes unless it writes them again."""
+    stop_export(small, tmp_path)
+    out = tmp_path / EXPORT
+    outside = tmp_path / "outside"
     outside.mkdir()
     (outside / "precious").write_bytes(PRECIOUS)
     (out / "linked").symlink_to(outside)
     (journal,) = (tmp_path / PARTS).glob("*normal*.paths")
-    content = line if isinstance(line, bytes) else line.format(outside=outside).encode()
-    (journal.with_name("another.paths") if of_another else journal).write_bytes(content + b"\0")
-    before = states(outside)
+    line = ATTACKS[attack]
+    if isinstance(line, str):
+        line = line.format(outside=outside).encode()
+    if of_another:
+        journal = journal.with_name("another.paths")
+    journal.write_bytes(line + b"\0")
+    before = read_states(outside)
     if attack == "a link to a folder":
-        told = ("linked: a symbolic link, which no devkit makes; remove",)
-        assert_refused((lambda: an_export(small, tmp_path), OutputFolderError, told))
+        message = ("linked: is a symbolic link, which the devkit never creates; remove",)
+        assert_raises((lambda: make_export(small, tmp_path), OutputFolderError, message))
     else:
-        an_export(small, tmp_path)
+        make_export(small, tmp_path)
         assert {path.name for path in out.iterdir()} >= {"tiny.manifest.json", "counts.json"}
         assert (out / "linked").is_symlink() == (attack != "a link")
-    assert states(outside) == before
+    assert read_states(outside) == before
 
 
 def test_a_journal_is_a_new_file(small: DeepAccident, tmp_path: Path) -> None:
-    """An export's files may be those of the release, by hard links: nothing is added to one."""
-    half_an_export(small, tmp_path)
+    """An export's files may be hard links to the release: nothing is appended to one."""
+    stop_export(small, tmp_path)
     (journal,) = (tmp_path / PARTS).glob("*normal*.paths")
     (tmp_path / "precious").write_bytes(PRECIOUS)
     journal.unlink()
     os.link(tmp_path / "precious", journal)
-    an_export(small, tmp_path)
+    make_export(small, tmp_path)
     assert (tmp_path / "precious").read_bytes() == PRECIOUS
 
 
 @pytest.mark.parametrize("path", ["/absolute", "..", "a/../b", "link/b", "a/link/b", "", "."])
 def test_what_leads_out_is_refused(tmp_path: Path, path: str) -> None:
-    root, outside, named = (tmp_path / name for name in ("root", "outside", "named"))
-    for folder in (root / "a", outside / "b"):
-        folder.mkdir(parents=True)
-    for link, target in ((root / "link", outside), (root / "a" / "link", outside), (named, root)):
-        link.symlink_to(target)
-    linked = ("link: a symbolic link, ", "; remove it, or give another folder than ")
-    assert_refused(
-        (lambda: place_in(root, path), OutputFolderError, r"a symbolic link|is no path below it"),
-        (lambda: remove_in(root, path), OutputFolderError, r"a symbolic link|is no path below it"),
-        (lambda: place_in(root, "link", opened=True), OutputFolderError, linked),
+    root = tmp_path / "root"
+    outside = tmp_path / "outside"
+    (root / "a").mkdir(parents=True)
+    (outside / "b").mkdir(parents=True)
+    (root / "link").symlink_to(outside)
+    (root / "a" / "link").symlink_to(outside)
+    linked_root = tmp_path / "linked"
+    linked_root.symlink_to(root)
+    message = ("link: is a symbolic link, ", "; remove it, or give another folder than ")
+    assert_raises(
+        (
+            lambda: place_in(root, path),
+            OutputFolderError,
+            r"a symbolic link|is not a path below it",
+        ),
+        (
+            lambda: remove_in(root, path),
+            OutputFolderError,
+            r"a symbolic link|is not a path below it",
+        ),
+        (lambda: place_in(root, "link", opened=True), OutputFolderError, message),
     )
-    assert (place_in(named, "a/b/c"), place_in(root, "link")) == (
-        named / "a" / "b" / "c",
-        root / "link",
-    )
+    assert place_in(linked_root, "a/b/c") == linked_root / "a" / "b" / "c"
+    assert place_in(root, "link") == root / "link"
+
     for name in ("link", "a", "not there", "a/not/there"):
         remove_in(root, name)
-    assert ([*root.iterdir()], (outside / "b").is_dir()) == ([], True)
+    assert list(root.iterdir()) == []
+    assert (outside / "b").is_dir()

@@ -1,6 +1,5 @@
-"""The campaign: files that strangers changed, processes that are killed, disks that are full.
-Nothing may go wrong.
+"""A campaign of files that strangers changed, of processes that are killed and of full disks.
 
 `PYTHONPATH=.ci/tools python -m campaign` from the top of the checkout runs all of it and writes its
-numbers into docs/validation.md.
+numbers into docs/validation.md. Nothing may go wrong.
 """

@@ -1,7 +1,6 @@
-"""The healthy files that cases change: small releases, an index, results, a bundle, labels,
-exports, nuScenes.
+"""The healthy files that cases change: releases, an index, results, bundles, labels and exports.
 
-With PyTorch also files of weights and a run of training.
+Where PyTorch is installed, there are also files of weights and a training run.
 """
 
 import json
@@ -12,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from nuscenes_dataroots import write_dataroot
-from packing import packed
+from support.nuscenes_dataroots import write_dataroot
+from support.zipped_releases import zip_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import (
@@ -41,17 +40,17 @@ from deepaccident_devkit.training.image_cache import CachedImages
 
 AGENTS: tuple[AgentName, ...] = ("ego_vehicle", "infrastructure")
 CHANNELS = ("Camera_Front", "lidar01", "BEV_instance_camera")
-HORIZON = 0.5
+HORIZON_S = 0.5
 LABELS = MotionLabelConfig(future_frames=1)
 EXPORT = OpenCood(without_clouds=True)
 SCHEDULER = "tcp://127.0.0.1:9"
-"""Where nobody listens."""
+"""Address at which no scheduler listens."""
 SETUPS = {
-    "motion": EvaluationSetup(task="motion", horizon=HORIZON),
-    "accident": EvaluationSetup(task="accident", protocol="boxes", horizon=HORIZON),
+    "motion": EvaluationSetup(task="motion", horizon=HORIZON_S),
+    "accident": EvaluationSetup(task="accident", protocol="boxes", horizon=HORIZON_S),
     "detection": EvaluationSetup(task="detection"),
-    "planning": EvaluationSetup(task="planning", protocol="clean", horizon=HORIZON),
-    "forecasting": EvaluationSetup(task="forecasting", protocol="clean", horizon=HORIZON),
+    "planning": EvaluationSetup(task="planning", protocol="clean", horizon=HORIZON_S),
+    "forecasting": EvaluationSetup(task="forecasting", protocol="clean", horizon=HORIZON_S),
 }
 
 
@@ -130,122 +129,132 @@ RECIPE = {
 HAS_TORCH = find_spec("torch") is not None
 
 
-class _Killed(OpenCood):
-    """Stopped when all scenarios are written."""
+class _InterruptedExport(OpenCood):
+    """Export that is interrupted when all scenarios are written."""
 
     def finish(self, *_: object) -> None:
         raise KeyboardInterrupt
 
 
 def make_healthy(folder: Path) -> Path:
-    """Make one of everything in a new folder; a few seconds. Those in `kept` stay as they are."""
-    for name, frames, agents, channels in (
+    """Write all healthy files into a new folder, which takes a few seconds; return the folder.
+
+    Files in its folder `kept` are never changed.
+    """
+    _write_releases(folder)
+    dataset = open_release(folder / "release", folder / "index")
+    sensors = open_release(folder / "sensors", folder / "index_of_sensors")
+    for task, setup in SETUPS.items():
+        results = folder / "results" / task
+        _write_results(dataset, results, task)
+        run = evaluate_results(dataset, results, setup, select_samples(task), workers=1)
+        run = run.broken_down(("all", "agent"), Resampling(resamples=20))
+        save_run(run, folder / "bundles" / task, include_results=True)
+    write_label_files(dataset, folder / "labels", list_tokens(dataset), LABELS, workers=1)
+    _write_texts(folder)
+    _write_exports(dataset, sensors, folder)
+    for method in ("stored", "deflated"):
+        zip_release(folder / "small", folder / "zips" / f"{method}.zip", method)
+    write_dataroot(folder / "road", keyframes=3, boxes=8)
+    if HAS_TORCH:
+        from campaign.healthy_weights import write_run, write_weight_files
+
+        write_weight_files(folder / "weights")
+        write_run(open_release(folder / "cameras", folder / "index_of_cameras"), folder / "run")
+    for name in ("bundles", "index"):
+        link_tree(folder / name, folder / "kept" / name)
+    return folder
+
+
+def open_release(root: Path, index_dir: Path) -> DeepAccident:
+    """Open a release with its index, which is made if it does not exist."""
+    return DeepAccident("v1", root, index_dir=index_dir, workers=1, verbose=False)
+
+
+def link_tree(healthy: Path, home: Path) -> Path:
+    """Copy a folder with hard links instead of files; return the copy.
+
+    Folders keep their times, by which an index recognises its release.
+    """
+    return Path(shutil.copytree(healthy, home, copy_function=_link, dirs_exist_ok=True))
+
+
+def select_samples(task: str) -> SampleSelection:
+    """Return the selection of samples of a task's results."""
+    # the infrastructure does not drive
+    agents = AGENTS[:1] if task in ("planning", "forecasting") else None
+    horizon = SETUPS[task].horizon
+    return SampleSelection(split="train", samples="all", agents=agents, horizon=horizon)
+
+
+def list_tokens(dataset: DeepAccident, task: str = "motion") -> list[str]:
+    """Return the tokens of the samples that a task's results predict."""
+    return list(select_samples(task).tokens(dataset))
+
+
+def _write_releases(folder: Path) -> None:
+    """Write small releases with and without sensors."""
+    releases = [
         ("small", 2, AGENTS, ()),
         ("sensors", 1, AGENTS[:1], CHANNELS),
         ("release", 6, AGENTS, ()),
-        *((("cameras", 4, AGENTS, CAMERAS),) if HAS_TORCH else ()),
-    ):
-        wanted = SmallRelease(splits=("train",), frames=frames, agents=agents, channels=channels)
-        write_small_release(folder / name, wanted)
-    dataset = opened(folder / "release", folder / "index")
-    sensors = opened(folder / "sensors", folder / "index_of_sensors")
-    for task in SETUPS:
-        _write_results(dataset, folder / "results" / task, task)
-    for task, setup in SETUPS.items():
-        run = evaluate_results(
-            dataset, folder / "results" / task, setup, selection(task), workers=1
-        )
-        run = run.broken_down(("all", "agent"), Resampling(resamples=20))
-        save_run(run, folder / "bundles" / task, include_results=True)
-    write_label_files(dataset, folder / "labels", tokens(dataset), LABELS, workers=1)
-    (folder / "specs").mkdir()
+    ]
+    if HAS_TORCH:
+        releases.append(("cameras", 4, AGENTS, CAMERAS))
+    for name, frames, agents, channels in releases:
+        release = SmallRelease(splits=("train",), frames=frames, agents=agents, channels=channels)
+        write_small_release(folder / name, release)
+
+
+def _write_texts(folder: Path) -> None:
+    """Write a scenario file, recipes of studies, and the file of a scheduler."""
+    for name in ("specs", "recipes", "schedulers"):
+        (folder / name).mkdir()
     (folder / "specs" / "crossing.yaml").write_text(design_text(1), encoding="utf-8")
-    (folder / "recipes").mkdir()
     for name in ("agents", "road"):
         shutil.copy(SHIPPED_RECIPES / f"{name}.yaml", folder / "recipes")
-    (folder / "recipes" / "every_key.yaml").write_text(
-        yaml.safe_dump(RECIPE, sort_keys=False), encoding="utf-8"
-    )
-    _write_exports(dataset, sensors, folder)
-    for method in ("stored", "deflated"):
-        packed(folder / "small", folder / "zips" / f"{method}.zip", method)
-    write_dataroot(folder / "road", keyframes=3, boxes=8)
-    (folder / "schedulers").mkdir()
-    told = {
+    recipe = yaml.safe_dump(RECIPE, sort_keys=False)
+    (folder / "recipes" / "every_key.yaml").write_text(recipe, encoding="utf-8")
+    scheduler = {
         "type": "Scheduler",
         "id": "Scheduler-1",
         "address": SCHEDULER,
         "services": {"dashboard": 8787},
         "workers": {},
     }
-    (folder / "schedulers" / "scheduler.json").write_text(json.dumps(told), encoding="utf-8")
-    if HAS_TORCH:
-        from campaign.healthy_weights import write_run, write_weight_files
-
-        write_weight_files(folder / "weights")
-        write_run(opened(folder / "cameras", folder / "index_of_cameras"), folder / "run")
-    for name in ("bundles", "index"):
-        copied(folder / name, folder / "kept" / name)
-    return folder
-
-
-def opened(root: Path, index_dir: Path) -> DeepAccident:
-    """A release by its index, which is made if it is not there."""
-    return DeepAccident("v1", root, index_dir=index_dir, workers=1, verbose=False)
-
-
-def copied(healthy: Path, home: Path) -> Path:
-    """A copy made of hard links, with the folders' times, by which an index knows its release."""
-    return Path(shutil.copytree(healthy, home, copy_function=_link, dirs_exist_ok=True))
-
-
-def selection(task: str) -> SampleSelection:
-    """The samples of the results of a task."""
-    agents = (
-        AGENTS[:1] if task in ("planning", "forecasting") else None
-    )  # the infrastructure does not drive
-    return SampleSelection(
-        split="train", samples="all", agents=agents, horizon=SETUPS[task].horizon
-    )
-
-
-def tokens(dataset: DeepAccident, task: str = "motion") -> list[str]:
-    """The samples that have a prediction."""
-    return list(selection(task).tokens(dataset))
+    text = json.dumps(scheduler)
+    (folder / "schedulers" / "scheduler.json").write_text(text, encoding="utf-8")
 
 
 def _write_exports(dataset: DeepAccident, sensors: DeepAccident, folder: Path) -> None:
-    """A complete export and one that was killed, questions with answers, and a cache of images."""
+    """Write a complete and an interrupted export, questions with answers, and an image cache."""
     export_release(dataset, folder / "exports" / "whole", EXPORT, workers=1)
     begun = folder / "exports" / "begun"
     with suppress(KeyboardInterrupt):
-        export_release(dataset, begun, _Killed(without_clouds=True), workers=1)
-    unfinished = begun / ".deepaccident-parts" / "kept" / "opencood"
-    max(unfinished.glob("*/done")).unlink()  # a unit of which some was written
-    (unfinished / "a_unit_of_before.paths").write_bytes(b"before/one.yaml\0before/two.yaml\0")
+        export_release(dataset, begun, _InterruptedExport(without_clouds=True), workers=1)
+    records = begun / ".deepaccident-parts" / "kept" / "opencood"
+    max(records.glob("*/done")).unlink()  # as if its unit were incomplete
+    (records / "a_unit_of_before.paths").write_bytes(b"before/one.yaml\0before/two.yaml\0")
     (begun / "before").mkdir()
     for name in ("one", "two"):
         (begun / "before" / f"{name}.yaml").write_bytes(b"written by the killed one\n")
+    questions = folder / "questions"
     windows = WindowRules(observe=0, ahead=1, stride=0.5)
-    export_release(dataset, folder / "questions", Questions(window=windows), workers=1)
-    truth = [
-        json.loads(line)
-        for line in (folder / "questions" / "truth.jsonl").read_bytes().splitlines()
-    ]
-    answers = [
-        {
-            "id": each["id"],
-            "accident": [0.9] * len(each["accident"]),
-            "who": list(each["actors"])[:2],
+    export_release(dataset, questions, Questions(window=windows), workers=1)
+    lines = []
+    for question_line in (questions / "truth.jsonl").read_bytes().splitlines():
+        question = json.loads(question_line)
+        answer = {
+            "id": question["id"],
+            "accident": [0.9] * len(question["accident"]),
+            "who": list(question["actors"])[:2],
             "where": [[1, 2], [3, 4]],
         }
-        for each in truth
-    ]
-    lines = "".join(f"{json.dumps(answer)}\n" for answer in answers)
-    (folder / "questions" / "answers.jsonl").write_text(lines, encoding="utf-8")
+        lines.append(f"{json.dumps(answer)}\n")
+    (questions / "answers.jsonl").write_text("".join(lines), encoding="utf-8")
     images = ImageConfig(resize=(18, 30), cameras=CHANNELS[:1])
-    cached = CachedImages(images=images, agents=AGENTS[:1], where=("length>=1",))
-    export_release(sensors, folder / "cache", cached, workers=1)
+    cache = CachedImages(images=images, agents=AGENTS[:1], where=("length>=1",))
+    export_release(sensors, folder / "cache", cache, workers=1)
 
 
 def _link(source: str, target: str) -> None:
@@ -253,37 +262,37 @@ def _link(source: str, target: str) -> None:
 
 
 def _write_results(dataset: DeepAccident, path: Path, task: str) -> None:
+    """Write a prediction for each sample of a task."""
     grid = LABELS.grid if task == "motion" else None
     path.parent.mkdir(exist_ok=True)
-    with ResultsWriter(
-        path, task, meta={"method": "a healthy one"}, grid=grid, step=HORIZON
-    ) as writer:  # type: ignore[arg-type]
-        for token in tokens(dataset, task):
-            writer.add(token, _prediction(dataset, token, task))
+    meta = {"method": "a healthy one"}
+    with ResultsWriter(path, task, meta=meta, grid=grid, step=HORIZON_S) as writer:  # type: ignore[arg-type]
+        for token in list_tokens(dataset, task):
+            writer.add(token, _predict(dataset, token, task))
 
 
-def _prediction(dataset: DeepAccident, token: str, task: str) -> object:
+def _predict(dataset: DeepAccident, token: str, task: str) -> object:
+    """Return a prediction for a sample, most of it made from the truth."""
     if task == "motion":
         label = dataset.motion_labels(token, LABELS).to_present("bilinear")
         return instances_of(label.instance, label.config.grid)
     if task == "detection":
         boxes = dataset.boxes(token)
         return DetectedBoxes(boxes=boxes, scores=np.linspace(0.1, 1.0, len(boxes)))
-    times = [0.1, HORIZON]
+    times = [0.1, HORIZON_S]
     if task == "planning":
-        plans = ([[1.0, 0.0], [5.0, 0.5]], [[0.5, 0.0], [2.0, 0.0]])
-        return [
-            Plan(times=times, path=path, score=1.0 - place, yaw=[0.0, 0.1])
-            for place, path in enumerate(plans)
-        ]
+        fast = Plan(times=times, path=[[1.0, 0.0], [5.0, 0.5]], score=1.0, yaw=[0.0, 0.1])
+        slow = Plan(times=times, path=[[0.5, 0.0], [2.0, 0.0]], score=0.0, yaw=[0.0, 0.1])
+        return [fast, slow]
     if task == "forecasting":
         paths = [[[1.0, 2.0], [3.0, 4.0]], [[1.0, 2.0], [1.0, 2.5]]]
-        actors = dataset.boxes(token).actor_id.tolist()
+        actors = [actor for actor in dataset.boxes(token).actor_id.tolist() if actor >= 0]
         return [
             Forecast(actor_id=actor, times=times, paths=paths, probabilities=[0.75, 0.25])
             for actor in actors
-            if actor >= 0
         ]
-    truth = accident_context(dataset, token, HORIZON).truth
-    true = None if truth is None else truth.accident
-    return [] if true is None else [Accident(positions=true.positions, time=true.time, score=0.5)]
+    truth = accident_context(dataset, token, HORIZON_S).truth
+    if truth is None or truth.accident is None:
+        return []
+    accident = truth.accident
+    return [Accident(positions=accident.positions, time=accident.time, score=0.5)]

@@ -1,9 +1,9 @@
-"""Files of weights in three formats, and a run of training; all of it needs PyTorch."""
+"""Files of weights in three formats, and a training run; all of it needs PyTorch."""
 
 from pathlib import Path
 
 import torch
-from torch_extra.model.small_model import RUN, small, trained
+from torch_extra.model.small_model import RUN, small_config, train_small_model
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.model.checkpoint import write_weights
@@ -22,29 +22,26 @@ TRAINING = TrainConfig(
 
 
 def small_network() -> V2XFormer:
-    """The network whose weights the files have."""
+    """Return the network that the files' weights belong to."""
     torch.manual_seed(0)
-    return V2XFormer(small())
+    return V2XFormer(small_config())
 
 
 def write_weight_files(folder: Path) -> None:
-    """Our own format, and both of PyTorch."""
+    """Write weights in the devkit's own format and in both formats of PyTorch."""
     folder.mkdir()
     state = small_network().state_dict()
-    write_weights(
-        folder / "own.safetensors",
-        state,
-        {"preset": "tiny", "fusion": None, "horizon": None, "step": 7},
-    )
+    notes = {"preset": "tiny", "fusion": None, "horizon": None, "step": 7}
+    write_weights(folder / "own.safetensors", state, notes)
     torch.save(state, folder / "new.pt")
     torch.save(state, folder / "old.pth", _use_new_zipfile_serialization=False)
 
 
 def write_run(dataset: DeepAccident, folder: Path) -> None:
-    """A run of one step, which is done."""
-    trained(dataset, folder, TRAINING)
+    """Write a training run of one step, which is complete but for its final weights."""
+    train_small_model(dataset, folder, TRAINING)
     for path in folder.glob("final.*"):
-        path.unlink()  # so that it is written from the state
+        path.unlink()  # resuming the run writes them from the training state
 
 
-__all__ = ["TRAINING", "small_network", "trained", "write_run", "write_weight_files"]
+__all__ = ["TRAINING", "small_network", "train_small_model", "write_run", "write_weight_files"]

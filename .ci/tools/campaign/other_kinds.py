@@ -1,9 +1,12 @@
-"""Kinds of files beside releases and results: of exports, questions and caches; a scheduler's
-address; zips.
+"""Kinds of files other than releases and results.
+
+They are the files of exports, questions and caches, recipes of studies, the address of a scheduler,
+and zipped releases.
 """
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from math import prod
 from pathlib import Path
@@ -13,9 +16,17 @@ from unittest.mock import patch
 import numpy as np
 
 from campaign import other_mutations, plain
-from campaign.healthy import AGENTS, CHANNELS, EXPORT, SCHEDULER, opened
-from campaign.kind import Action, Kind, Room, dataset_of
-from campaign.tables_of_releases import judge_tables, tables
+from campaign.healthy import AGENTS, CHANNELS, EXPORT, SCHEDULER, open_release
+from campaign.kind import (
+    Action,
+    Kind,
+    Output,
+    Workspace,
+    find_long_sentence,
+    open_dataset,
+    read_findings,
+)
+from campaign.tables_of_releases import judge_tables, read_tables
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import WorkerError
 from deepaccident_devkit.export.bulk import export_release
@@ -23,99 +34,122 @@ from deepaccident_devkit.export.questions import read_answers, results_of_answer
 from deepaccident_devkit.plugins.study import Recipe, read_recipe
 from deepaccident_devkit.support.parallel import cluster_executor, executors
 from deepaccident_devkit.training.image_cache import ImageCache
-from deepaccident_devkit.validation import validate_release
 
-assert other_mutations  # made for these
+assert other_mutations  # importing it registers the mutations for these kinds
+
+_JOURNALS = ".deepaccident-parts/kept/opencood/*.paths"
+_DONE_RECORDS = ".deepaccident-parts/kept/opencood/*/done"
+_SWEPT_KEYS = ("agents", "latency", "pose_noise", "packet_loss", "budget", "horizon")
+"""Keys of a recipe's row whose lists stand for one row for each value."""
 
 # ---- exports
 
 
-def _exported(room: Room) -> dict[str, bytes]:
-    """Run the export again: a killed one goes on, a complete one is compared."""
-    folder = _export(room)
-    export_release(dataset_of(room.home), folder, EXPORT, workers=1)
-    files = (path for path in folder.rglob("*.yaml") if path.is_file() and not path.is_symlink())
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+def _resume_export(workspace: Workspace) -> dict[str, bytes]:
+    """Run the export again, which resumes a killed one and compares a complete one."""
+    folder = _export_folder(workspace)
+    export_release(open_dataset(workspace.home), folder, EXPORT, workers=1)
+    return _read_yaml_files(folder)
 
 
-def _export(room: Room) -> Path:
-    return room.tree / room.victim.relative_to(room.tree).parts[0]
+def _export_folder(workspace: Workspace) -> Path:
+    path = workspace.changed_file.relative_to(workspace.folder)
+    return workspace.folder / path.parts[0]
 
 
-def _judge_exported(room: Room, read: Mapping[str, bytes]) -> str | None:
-    """The manifest tells of the settings and the scenarios, and files of a whole export have its
-    bytes.
+def _read_yaml_files(folder: Path) -> dict[str, bytes]:
+    """Return the contents of a folder's YAML files by their paths, without links."""
+    paths = [path for path in folder.rglob("*.yaml") if path.is_file() and not path.is_symlink()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
-    Which of them are there is not compared: records say that a unit is done, and are believed.
+
+def _judge_export(workspace: Workspace, files: Mapping[str, bytes]) -> str | None:
+    """Compare the manifest's settings and scenarios, and the bytes of files, with a whole export.
+
+    Files may be missing: the export trusts records that say that a unit is done.
     """
-    folder, whole = _export(room), room.home / "exports" / "whole"
-    told, expected = (plain.json_file(each / "opencood.manifest.json") for each in (folder, whole))
-    if (
-        told["settings"] != expected["settings"]
-        or told["release"]["scenarios"] != expected["release"]["scenarios"]
-    ):
-        return "other settings or scenarios"
-    files = {
-        path.relative_to(whole).as_posix(): path.read_bytes() for path in whole.rglob("*.yaml")
-    }
-    wrong = [name for name in read.keys() & files.keys() if read[name] != files[name]]
-    return f"{wrong[0]} differs from that of a whole export" if wrong else None
+    whole = workspace.home / "exports" / "whole"
+    manifest = plain.read_json(_export_folder(workspace) / "opencood.manifest.json")
+    expected = plain.read_json(whole / "opencood.manifest.json")
+    if manifest["settings"] != expected["settings"]:
+        return "other settings"
+    if manifest["release"]["scenarios"] != expected["release"]["scenarios"]:
+        return "other scenarios"
+    whole_files = _read_yaml_files(whole)
+    for name in files.keys() & whole_files.keys():
+        if files[name] != whole_files[name]:
+            return f"{name} differs from that of a whole export"
+    return None
 
 
 # ---- questions
 
 
-def _answered(room: Room) -> Any:
-    files = room.tree / "answers.jsonl", room.victim
-    results_of_answers(*files, room.scratch / "results.json")
-    return read_answers(*files)
+def _read_answers(workspace: Workspace) -> Any:
+    answers = workspace.folder / "answers.jsonl"
+    truth = workspace.changed_file
+    results_of_answers(answers, truth, workspace.scratch / "results.json")
+    return read_answers(answers, truth)
 
 
-def _judge_answers(room: Room, read: Any) -> str | None:
-    told = [json.loads(line) for line in room.victim.read_bytes().split(b"\n") if line.strip()]
-    asked = {line["id"]: line for line in told}
-    lines = [json.loads(line) for line in (room.tree / "answers.jsonl").read_bytes().splitlines()]
-    expected: dict[str, list[tuple[int, int]]] = {line["sample"]: [] for line in asked.values()}
-    for line in asked.values():
-        expected.setdefault(f"{line['sample'].rpartition('/')[0]}/{line['last_frame']:03d}", [])
-    for answer in lines:
-        question = asked[answer["id"]]
-        expected[question["sample"]].append(
-            tuple(question["actors"][name] for name in answer["who"])
-        )
-    found = {token: [each.ids for each in accidents] for token, accidents in read.accidents.items()}
-    return None if found == expected else "other samples or actors"
+def _judge_answers(workspace: Workspace, output: Any) -> str | None:
+    """Compare the actors of all answers, by the sample of their question."""
+    lines = workspace.changed_file.read_bytes().split(b"\n")
+    question_list = [json.loads(line) for line in lines if line.strip()]
+    questions = {question["id"]: question for question in question_list}
+    expected: dict[str, list[tuple[int, int]]] = {}
+    for question in questions.values():
+        recording = question["sample"].rpartition("/")[0]
+        expected[question["sample"]] = []
+        expected[f"{recording}/{question['last_frame']:03d}"] = []
+    for line in (workspace.folder / "answers.jsonl").read_bytes().splitlines():
+        answer = json.loads(line)
+        question = questions[answer["id"]]
+        ids = tuple(question["actors"][name] for name in answer["who"])
+        expected[question["sample"]].append(ids)
+    ids_by_sample = {}
+    for token, accidents in output.accidents.items():
+        ids_by_sample[token] = [accident.ids for accident in accidents]
+    if ids_by_sample == expected:
+        return None
+    return "other samples or actors"
 
 
 # ---- a cache of images
 
 
 @cache
-def _sensors(home: Path) -> DeepAccident:
-    return opened(home / "sensors", home / "index_of_sensors")
+def _open_sensors(home: Path) -> DeepAccident:
+    return open_release(home / "sensors", home / "index_of_sensors")
 
 
-def _cached(room: Room) -> dict[str, Any]:
-    dataset, images = _sensors(room.home), ImageCache(room.tree)
-    agents = [f"{each['token']}/{AGENTS[0]}" for each in dataset.scenario]
-    images.check_release(dataset, agents)
-    return {
-        agent: images.load(images.images, dataset, f"{agent}/001/{CHANNELS[0]}")[0].copy()
-        for agent in agents
-    }
+def _load_cached_images(workspace: Workspace) -> Output:
+    """Return the first image of each scenario from the cache."""
+    dataset = _open_sensors(workspace.home)
+    image_cache = ImageCache(workspace.folder)
+    agents = [f"{scenario['token']}/{AGENTS[0]}" for scenario in dataset.scenario]
+    image_cache.check_release(dataset, agents)
+    images = {}
+    for agent in agents:
+        token = f"{agent}/001/{CHANNELS[0]}"
+        image, *_ = image_cache.load(image_cache.images, dataset, token)
+        images[agent] = image.copy()
+    return images
 
 
-def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
-    settings = plain.json_file(room.tree / "cache.manifest.json")["settings"]
-    shape = (
-        settings["images"]["resize"]
-        if settings["images"]["crop"] is None
-        else settings["images"]["crop"][2:]
-    )
-    place = settings["agents"].index(AGENTS[0]), settings["images"]["cameras"].index(CHANNELS[0])
-    for agent, found in read.items():
-        path = room.tree / f"{agent.rpartition('/')[0].replace('/', '__')}.images"
-        if not np.array_equal(found, plain.cached_image(path, *place, *shape)):
+def _judge_cached_images(workspace: Workspace, images: Output) -> str | None:
+    settings = plain.read_json(workspace.folder / "cache.manifest.json")["settings"]
+    image_settings = settings["images"]
+    shape = image_settings["resize"]
+    if image_settings["crop"] is not None:
+        shape = image_settings["crop"][2:]
+    position = settings["agents"].index(AGENTS[0])
+    camera = image_settings["cameras"].index(CHANNELS[0])
+    for agent, image in images.items():
+        scenario = agent.rpartition("/")[0].replace("/", "__")
+        path = workspace.folder / f"{scenario}.images"
+        expected = plain.read_cached_image(path, position, camera, *shape)
+        if not np.array_equal(image, expected):
             return f"{agent}: other pixels than numpy reads"
     return None
 
@@ -123,117 +157,124 @@ def _judge_cached(room: Room, read: Mapping[str, Any]) -> str | None:
 # ---- the file of a scheduler
 
 
-def _scheduled(room: Room) -> str:
-    """Nobody listens at the healthy address, and it is right to say so."""
+def _connect(workspace: Workspace) -> str:
+    """Connect to a scheduler; return the healthy file's address where none listens, as expected."""
+    path = workspace.changed_file
     try:
         with (
             patch.object(executors, "ADDRESS_WAIT", 0.2),
-            cluster_executor(scheduler_file=room.victim),
+            cluster_executor(scheduler_file=path),
         ):
             return "a scheduler"
     except WorkerError:
-        same = room.victim.is_file() and room.victim.stat().st_size == room.healthy.stat().st_size
-        if same and room.victim.read_bytes() == room.healthy.read_bytes():
+        healthy_content = workspace.healthy_file.read_bytes()
+        is_same_size = path.is_file() and path.stat().st_size == len(healthy_content)
+        if is_same_size and path.read_bytes() == healthy_content:
             return SCHEDULER
         raise
 
 
-def _judge_scheduled(room: Room, read: str) -> str | None:
-    return None if read == plain.json_file(room.victim)["address"] else f"a connection: {read}"
+def _judge_address(workspace: Workspace, address: str) -> str | None:
+    expected = plain.read_json(workspace.changed_file)["address"]
+    if address == expected:
+        return None
+    return f"a connection: {address}"
 
 
 # ---- a release in an archive
 
 
-def _from_zip(room: Room) -> dict[str, Any]:
-    index = room.scratch / "index"
-    return tables(DeepAccident("v1", room.victim, index_dir=index, workers=1, verbose=False))
+def _read_zip(workspace: Workspace) -> Output:
+    return read_tables(open_release(workspace.changed_file, workspace.scratch / "index"))
 
 
-def _judge_zip(room: Room, read: Mapping[str, Any]) -> str | None:
-    """Unpacked without a look at checksums, the release says the same."""
-    unpacked = plain.unpacked(room.victim, room.scratch / "unpacked")
-    return judge_tables(
-        Room(room.home, unpacked, room.victim, room.scratch, room.outside, room.healthy), read
-    )
+def _judge_zip(workspace: Workspace, output: Output) -> str | None:
+    """Compare the tables with the unpacked files, whatever their checksums are."""
+    folder = plain.unpack(workspace.changed_file, workspace.scratch / "unpacked")
+    return judge_tables(replace(workspace, folder=folder), output)
 
 
-def _validated_zip(room: Room) -> list[str]:
-    return [
-        str(finding) for finding in validate_release(room.victim, workers=1, deep=True).findings
-    ]
+def _validate_zip(workspace: Workspace) -> list[str]:
+    return read_findings(workspace.changed_file, deep=True)
 
 
-def _judge_findings(room: Room, sentences: list[str]) -> str | None:
-    """`validate` tells of an archive that cannot be read, or of a member whose checksum is
-    another.
-    """
-    if long := next((each for each in sentences if len(each) > 2000), None):
-        return f"a sentence of {len(long)} characters"
-    if any(room.victim.name in each for each in sentences):
-        return None
-    damaged = [name for name, (_, right) in plain.members(room.victim).items() if not right]
-    untold = [
-        name for name in damaged if not any(name.rpartition("/")[2] in each for each in sentences)
-    ]
-    return f"no word of {untold[0]}, which is damaged" if untold else None
+def _judge_findings(workspace: Workspace, sentences: list[str]) -> str | None:
+    """Check that the findings name an unreadable archive, or all members with a wrong checksum."""
+    fault = find_long_sentence(sentences)
+    text = "\n".join(sentences)
+    if fault or workspace.changed_file.name in text:
+        return fault
+    for name, (_, is_right) in plain.read_members(workspace.changed_file).items():
+        if not is_right and name.rpartition("/")[2] not in text:
+            return f"no word of {name}, which is damaged"
+    return None
 
 
 # ---- recipes of studies
 
 
-def _judge_recipe(room: Room, read: Recipe) -> str | None:
-    """The same names in the same order, and a row for each value of the lists."""
-    said = plain.yaml_file(room.victim)
-    for part in ("title", "question"):
-        if getattr(read, part) != said[part]:
-            return f"another {part}"
-    for part in ("releases", "weights", "groups"):
-        if list(getattr(read, part)) != list(said.get(part, {})):
-            return f"other {part}"
-    keys = ("agents", "latency", "pose_noise", "packet_loss", "budget", "horizon")
-    lists = [[row[key] for key in keys if isinstance(row.get(key), list)] for row in said["rows"]]
-    return (
-        None
-        if len(read.rows) == sum(prod(map(len, each)) for each in lists)
-        else "another number of rows"
-    )
+def _judge_recipe(workspace: Workspace, recipe: Recipe) -> str | None:
+    """Check names and their order, and that there is a row for each value of the lists."""
+    content = plain.read_yaml(workspace.changed_file)
+    for name in ("title", "question"):
+        if getattr(recipe, name) != content[name]:
+            return f"another {name}"
+    for name in ("releases", "weights", "groups"):
+        if list(getattr(recipe, name)) != list(content.get(name, {})):
+            return f"other {name}"
+    row_count = 0
+    for row in content["rows"]:
+        values = [row.get(key) for key in _SWEPT_KEYS]
+        row_count += prod(len(value) for value in values if isinstance(value, list))
+    if len(recipe.rows) == row_count:
+        return None
+    return "another number of rows"
 
 
-_EXPORTED = Action(_exported, _judge_exported)
-_CACHED = Action(_cached, _judge_cached)
-_JOURNALS = ".deepaccident-parts/kept/opencood/*.paths"
-_DONE = ".deepaccident-parts/kept/opencood/*/done"
+_EXPORT_ACTION = Action(_resume_export, _judge_export)
+_CACHE_ACTION = Action(_load_cached_images, _judge_cached_images)
 KINDS = (
     Kind(
         "export's manifest",
         "manifest",
         "exports",
         "*/opencood.manifest.json",
-        (_EXPORTED,),
+        (_EXPORT_ACTION,),
         writes=True,
     ),
     Kind(
-        "export's journals", "journal", "exports", f"begun/{_JOURNALS}", (_EXPORTED,), writes=True
+        "export's journals",
+        "journal",
+        "exports",
+        f"begun/{_JOURNALS}",
+        (_EXPORT_ACTION,),
+        writes=True,
     ),
-    Kind("export's done records", "record", "exports", f"begun/{_DONE}", (_EXPORTED,), writes=True),
+    Kind(
+        "export's done records",
+        "record",
+        "exports",
+        f"begun/{_DONE_RECORDS}",
+        (_EXPORT_ACTION,),
+        writes=True,
+    ),
     Kind(
         "questions' truth",
         "lines",
         "questions",
         "truth.jsonl",
-        (Action(_answered, _judge_answers),),
+        (Action(_read_answers, _judge_answers),),
     ),
-    Kind("images cache's list", "manifest", "cache", "cache.manifest.json", (_CACHED,)),
-    Kind("images cache", "images", "cache", "*.images", (_CACHED,)),
+    Kind("images cache's list", "manifest", "cache", "cache.manifest.json", (_CACHE_ACTION,)),
+    Kind("images cache", "images", "cache", "*.images", (_CACHE_ACTION,)),
     Kind(
         "study recipes",
         "recipe",
         "recipes",
         "*.yaml",
         (
-            Action(lambda room: read_recipe(str(room.victim)), _judge_recipe),
-            Action(lambda room: read_recipe(str(room.victim), smoke=True)),
+            Action(lambda workspace: read_recipe(str(workspace.changed_file)), _judge_recipe),
+            Action(lambda workspace: read_recipe(str(workspace.changed_file), smoke=True)),
         ),
     ),
     Kind(
@@ -241,13 +282,13 @@ KINDS = (
         "address",
         "schedulers",
         "scheduler.json",
-        (Action(_scheduled, _judge_scheduled),),
+        (Action(_connect, _judge_address),),
     ),
     Kind(
         "zip of a release",
         "zip",
         "zips",
         "*.zip",
-        (Action(_from_zip, _judge_zip), Action(_validated_zip, _judge_findings)),
+        (Action(_read_zip, _judge_zip), Action(_validate_zip, _judge_findings)),
     ),
 )

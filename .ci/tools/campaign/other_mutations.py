@@ -1,4 +1,4 @@
-"""What strangers do to what exports leave, to truth files, caches, addresses and archives."""
+"""Mutations of exports, recipes, questions, caches, addresses of schedulers and archives."""
 
 import io
 import json
@@ -14,81 +14,110 @@ import yaml
 
 from campaign.mutations import (
     ODD_NAMES,
+    JsonObject,
     Rng,
-    any_of,
-    by_content,
-    by_path,
-    containers,
-    outside_of,
-    replace,
-    squeezed,
+    choose,
+    choose_container,
+    choose_index,
+    choose_place,
+    content_mutation,
+    deflate_with_zeros,
+    find_outside_folder,
+    list_places,
+    nest_deeply,
+    path_mutation,
+    read_members,
+    replace_bytes,
+    replace_file,
 )
 
-_EXPORTED = ("manifest", "journal", "record")
-_LONG = 5_000_000
+_EXPORT_FILES = ("manifest", "journal", "record")
+_LONG_TEXT_BYTES = 5_000_000
+_IMAGES_HEADER_BYTES = 24
+_DIRECTORY_ENTRY_BYTES = 46
+"""Length of an entry of a zip directory without its name, extra field and comment."""
+Member = tuple[zipfile.ZipInfo, bytes]
+"""Entry in the directory of an archive, and the unpacked bytes."""
 
 
 # ---- exports: links and paths that lead out
 
 
-def export_of(path: Path) -> Path:
-    """The folder of the export that a file belongs to."""
-    return next(folder for folder in path.parents if any(folder.glob("*.manifest.json")))
+def find_export(path: Path) -> Path:
+    """Return the folder of the export that a file belongs to."""
+    for folder in path.parents:
+        if any(folder.glob("*.manifest.json")):
+            return folder
+    raise LookupError(path)
 
 
-@by_path("links", *_EXPORTED)
+@path_mutation("links", *_EXPORT_FILES)
 def link_out_of_the_export(path: Path, rng: Rng) -> None:
-    """Something below the export is a link to a folder or a file outside."""
-    places = [each for each in sorted(export_of(path).rglob("*")) if each != path]
-    place, outside = any_of(rng, places), outside_of(path)
-    aside = outside.with_name("aside")
-    place.rename(aside)
-    place.symlink_to(
-        any_of(rng, (outside, outside / "kept.txt", outside / "folder", outside / "new"))
-    )
+    """Replace something below the export by a link to a folder or a file outside."""
+    paths = [other for other in sorted(find_export(path).rglob("*")) if other != path]
+    link = choose(rng, paths)
+    outside = find_outside_folder(path)
+    link.rename(outside.with_name("aside"))
+    targets = (outside, outside / "kept.txt", outside / "folder", outside / "new")
+    link.symlink_to(choose(rng, targets))
 
 
-@by_path("links", *_EXPORTED, "images")
+@path_mutation("links", *_EXPORT_FILES, "images")
 def temporary_link_out(path: Path, rng: Rng) -> None:
-    """A temporary name of a dead process leads outside."""
-    outside = outside_of(path)
-    left = next(outside.glob(".*.tmp"))
-    place = any_of(rng, [path.parent, *(each for each in path.parents if each.name == "begun")])
-    (place / left.name).symlink_to(any_of(rng, (outside, outside / "kept.txt", outside / "folder")))
+    """Add a link to the outside, under a temporary name of a dead process."""
+    outside = find_outside_folder(path)
+    dead_file = next(outside.glob(".*.tmp"))
+    export_folders = [folder for folder in path.parents if folder.name == "begun"]
+    folder = choose(rng, [path.parent, *export_folders])
+    targets = (outside, outside / "kept.txt", outside / "folder")
+    (folder / dead_file.name).symlink_to(choose(rng, targets))
 
 
-def _ways_out(path: Path) -> tuple[str, ...]:
-    root, outside = export_of(path), outside_of(path)
-    away = os.path.relpath(outside, root)
-    link = root / "linked"
-    link.symlink_to(outside)
+def _paths_outside(path: Path) -> tuple[str, ...]:
+    """Return paths that lead out of the export of a file, some of them by a new link."""
+    export = find_export(path)
+    outside = find_outside_folder(path)
+    relative = os.path.relpath(outside, export)
+    (export / "linked").symlink_to(outside)
     return (
-        *(f"{away}/{name}" for name in ("kept.txt", "folder", "folder/inner.txt", ".", "")),
-        *(f"{outside}/{name}" for name in ("kept.txt", "folder", "")),
-        *(f"linked/{name}" for name in ("kept.txt", "folder", "folder/inner.txt")),
-        *(
-            f"a/../{away}/kept.txt",
-            f"./{away}",
-            "..",
-            "../..",
-            "linked",
-            f"//{outside}/kept.txt",
-            f"{away}//folder",
-        ),
+        f"{relative}/kept.txt",
+        f"{relative}/folder",
+        f"{relative}/folder/inner.txt",
+        f"{relative}/.",
+        f"{relative}/",
+        f"{outside}/kept.txt",
+        f"{outside}/folder",
+        f"{outside}/",
+        "linked/kept.txt",
+        "linked/folder",
+        "linked/folder/inner.txt",
+        f"a/../{relative}/kept.txt",
+        f"./{relative}",
+        "..",
+        "../..",
+        "linked",
+        f"//{outside}/kept.txt",
+        f"{relative}//folder",
     )
 
 
-@by_path("links", "journal")
+def _join_journal(paths: list[str]) -> bytes:
+    return "".join(f"{path}\0" for path in paths).encode("utf-8", "surrogatepass")
+
+
+@path_mutation("links", "journal")
 def journal_that_leads_out(path: Path, rng: Rng) -> None:
-    ways = _ways_out(path)
-    lines = [any_of(rng, ways) for _ in range(int(rng.integers(1, 6)))]
-    before = path.read_bytes() if rng.integers(2) else b""
-    replace(path, before + "".join(f"{line}\0" for line in lines).encode())
+    paths = _paths_outside(path)
+    count = rng.integers(1, 6)
+    lines = [choose(rng, paths) for _ in range(count)]
+    begin = path.read_bytes() if rng.integers(2) else b""
+    replace_file(path, begin + _join_journal(lines))
 
 
-@by_content("names", "journal")
+@content_mutation("names", "journal")
 def journal_of_odd_names(content: bytes, rng: Rng) -> bytes:
-    odd = (
+    options = (
+        *ODD_NAMES,
         "",
         ".",
         "/",
@@ -101,54 +130,45 @@ def journal_of_odd_names(content: bytes, rng: Rng) -> bytes:
         ".deepaccident-parts",
         "*",
     )
-    names = [any_of(rng, (*ODD_NAMES, *odd)) for _ in range(int(rng.integers(1, 9)))]
-    return content + "".join(f"{name}\0" for name in names).encode("utf-8", "surrogatepass")
+    count = rng.integers(1, 9)
+    names = [choose(rng, options) for _ in range(count)]
+    return content + _join_journal(names)
 
 
-@by_content("bombs", "journal")
+@content_mutation("bombs", "journal")
 def journal_of_many_or_long_paths(content: bytes, rng: Rng) -> bytes:
-    deep = b"a/" * 100_000
-    return content + any_of(
-        rng,
-        (b"x" * _LONG, b"x/y\0" * 20_000, b"\0" * _LONG, deep, deep + b"\0", b"x" * _LONG + b"\0"),
-    )
+    name = b"x" * _LONG_TEXT_BYTES
+    deep_path = b"a/" * 100_000
+    no_paths = b"\0" * _LONG_TEXT_BYTES
+    options = (name, b"x/y\0" * 20_000, no_paths, deep_path, deep_path + b"\0", name + b"\0")
+    return content + choose(rng, options)
 
 
-@by_content("numbers", "journal")
+@content_mutation("numbers", "journal")
 def journal_without_ends(content: bytes, rng: Rng) -> bytes:
-    return any_of(
-        rng,
-        (
-            content.replace(b"\0", b"\n"),
-            content.rstrip(b"\0"),
-            content.replace(b"\0", b"\0\0"),
-            b"\0" + content,
-        ),
+    options = (
+        content.replace(b"\0", b"\n"),
+        content.rstrip(b"\0"),
+        content.replace(b"\0", b"\0\0"),
+        b"\0" + content,
     )
+    return choose(rng, options)
 
 
-@by_content("types", "journal")
+@content_mutation("types", "journal")
 def journal_of_another_unit(content: bytes, rng: Rng) -> bytes:
-    """It is no text, or says the same in another order, or twice."""
+    """Write the paths in another order, twice or in another encoding, or write no paths."""
     paths = content.split(b"\0")[:-1]
     rng.shuffle(paths)  # type: ignore[arg-type]
-    turned = b"".join(each + b"\0" for each in paths)
-    return any_of(
-        rng,
-        (
-            turned,
-            content + content,
-            content.decode().encode("utf-16"),
-            b"\xff\xfe\0" + content,
-            b"[]",
-            b"{}",
-        ),
-    )
+    shuffled = b"".join(path + b"\0" for path in paths)
+    other_encoding = content.decode().encode("utf-16")
+    options = (shuffled, content * 2, other_encoding, b"\xff\xfe\0" + content, b"[]", b"{}")
+    return choose(rng, options)
 
 
 # ---- recipes of studies
 
-_ODD = (
+_ODD_VALUES = (
     None,
     True,
     False,
@@ -169,139 +189,119 @@ _ODD = (
     [[1]],
     {},
 )
-"""In the place of a value."""
-_MANY = 3_000
+"""Values that replace others."""
+_MANY_ENTRIES = 3_000
 
 
-def _recipe(content: bytes) -> Any:
-    """The tree of a recipe, and all places of values in it: what they are inside of, and their
-    key.
-    """
-    tree = yaml.safe_load(content)
-    places = [
-        (inside, key)
-        for inside in containers(tree)
-        for key in (list(inside) if isinstance(inside, dict) else range(len(inside)))
-    ]
-    return tree, places
-
-
-def _yaml(tree: Any) -> bytes:
+def _dump_recipe(tree: Any) -> bytes:
     return yaml.safe_dump(tree, sort_keys=False).encode("utf-8", "surrogatepass")
 
 
-@by_content("types", "recipe")
+@content_mutation("types", "recipe")
 def recipe_value_of_another_type(content: bytes, rng: Rng) -> bytes:
-    tree, places = _recipe(content)
-    for _ in range(int(rng.integers(1, 4))):
-        inside, key = any_of(rng, places)
-        inside[key] = any_of(rng, _ODD)
-    return _yaml(tree)
+    tree = yaml.safe_load(content)
+    places = list_places(tree)
+    for _ in range(rng.integers(1, 4)):
+        container, key = choose(rng, places)
+        container[key] = choose(rng, _ODD_VALUES)
+    return _dump_recipe(tree)
 
 
-@by_content("types", "recipe")
+@content_mutation("types", "recipe")
 def recipe_key_added_or_left_out(content: bytes, rng: Rng) -> bytes:
-    """Keys that recipes know, where they do not belong."""
-    tree, places = _recipe(content)
-    known = sorted(
-        {str(key) for _, key in places}
-        | {"mix", "also_split", "file", "spec", "validation", "over", "name"}
-    )
-    inside = any_of(rng, [each for each in containers(tree) if each and isinstance(each, dict)])
+    """Remove a key, or add one that recipes know to a place where it does not belong."""
+    tree = yaml.safe_load(content)
+    keys = {str(key) for _, key in list_places(tree)}
+    keys |= {"mix", "also_split", "file", "spec", "validation", "over", "name"}
+    container = choose_container(rng, tree, dict)
     if rng.integers(2):
-        inside[any_of(rng, known)] = any_of(rng, (*_ODD, "test", "train", {"release": "test"}))
+        value = choose(rng, (*_ODD_VALUES, "test", "train", {"release": "test"}))
+        container[choose(rng, sorted(keys))] = value
     else:
-        del inside[any_of(rng, list(inside))]
-    return _yaml(tree)
+        del container[choose(rng, list(container))]
+    return _dump_recipe(tree)
 
 
-@by_content("numbers", "recipe")
+@content_mutation("numbers", "recipe")
 def recipe_number_beyond_bounds(content: bytes, rng: Rng) -> bytes:
-    tree, places = _recipe(content)
-    numbers = [(inside, key) for inside, key in places if isinstance(inside[key], int | float)]
-    inside, key = any_of(rng, numbers)
-    inside[key] = any_of(
-        rng, (0, -1, 1e9, -1e9, 1e300, 10**12, 10**40, 0.1 + 1e-9, math.inf, -math.inf, math.nan)
-    )
-    return _yaml(tree)
+    tree = yaml.safe_load(content)
+    container, key = choose_place(rng, tree, int | float)
+    numbers = (0, -1, 1e9, -1e9, 1e300, 10**12, 10**40, 0.1 + 1e-9, math.inf, -math.inf, math.nan)
+    container[key] = choose(rng, numbers)
+    return _dump_recipe(tree)
 
 
-@by_content("bombs", "recipe")
+@content_mutation("bombs", "recipe")
 def recipe_multiplied(content: bytes, rng: Rng) -> bytes:
-    """Lists in several keys of a row, each with many values."""
-    tree, _ = _recipe(content)
-    count = any_of(rng, (10, 100, 1000))
-    lists = {
-        key: [float(each) for each in range(count)]
-        for key in ("latency", "pose_noise", "packet_loss", "horizon")
-    }
-    row = {"name": "{latency} {agents}", "baseline": "standing", "agents": ["all"] * count, **lists}
-    tree["rows"] = any_of(rng, ([row], [*tree["rows"], row], [row] * 20))
-    return _yaml(tree)
+    """Give several keys of a row lists of many values each."""
+    tree = yaml.safe_load(content)
+    count = choose(rng, (10, 100, 1000))
+    row = {"name": "{latency} {agents}", "baseline": "standing", "agents": ["all"] * count}
+    for key in ("latency", "pose_noise", "packet_loss", "horizon"):
+        row[key] = [float(value) for value in range(count)]
+    tree["rows"] = choose(rng, ([row], [*tree["rows"], row], [row] * 20))
+    return _dump_recipe(tree)
 
 
-@by_content("bombs", "recipe")
+@content_mutation("bombs", "recipe")
 def recipe_of_many(content: bytes, rng: Rng) -> bytes:
-    """Thousands of rows, weights, releases, groups, pairs or seeds, or one that is very long."""
-    tree, _ = _recipe(content)
-    row, name = tree["rows"][-1], any_of(rng, ("a", "\u202e", "n" * 20))
-    part, value = any_of(
-        rng,
-        (
-            ("rows", [{**row, "name": f"{name}{each}"} for each in range(_MANY)]),
-            ("weights", {f"{name}{each}": {"file": "tiny"} for each in range(_MANY)}),
-            (
-                "releases",
-                {
-                    **tree["releases"],
-                    **{f"{name}{each}": {"scenarios": 2} for each in range(_MANY)},
-                },
-            ),
-            ("groups", {f"{name}{each}": ["town=Town03"] for each in range(_MANY)}),
-            ("compare", [[row["name"], row["name"]]] * _MANY),
-            ("seeds", list(range(_MANY))),
-            ("by", ["impact_step"] * _MANY),
-            ("title", name * 50_000),
-            ("test", {**tree["test"], "where": [f"town={name * 30_000}"]}),
-            ("rows", [{**row, "name": name * 4_000}] * 10),
-        ),
+    """Add thousands of rows, weights, releases, groups, pairs or seeds, or a very long text."""
+    tree = yaml.safe_load(content)
+    row = tree["rows"][-1]
+    name = choose(rng, ("a", "\u202e", "n" * 20))
+    names = [f"{name}{number}" for number in range(_MANY_ENTRIES)]
+    releases = {release: {"scenarios": 2} for release in names}
+    options = (
+        ("rows", [{**row, "name": row_name} for row_name in names]),
+        ("weights", {weights: {"file": "tiny"} for weights in names}),
+        ("releases", {**tree["releases"], **releases}),
+        ("groups", {group: ["town=Town03"] for group in names}),
+        ("compare", [[row["name"], row["name"]]] * _MANY_ENTRIES),
+        ("seeds", list(range(_MANY_ENTRIES))),
+        ("by", ["impact_step"] * _MANY_ENTRIES),
+        ("title", name * 50_000),
+        ("test", {**tree["test"], "where": [f"town={name * 30_000}"]}),
+        ("rows", [{**row, "name": name * 4_000}] * 10),
     )
-    return _yaml({**tree, part: value})
+    key, value = choose(rng, options)
+    return _dump_recipe({**tree, key: value})
 
 
-@by_content("names", "recipe")
+@content_mutation("names", "recipe")
 def recipe_name_that_is_not_there(content: bytes, rng: Rng) -> bytes:
-    """A text becomes another one: in capital letters, that of something else, or an odd one."""
-    tree, places = _recipe(content)
-    texts = [(inside, key) for inside, key in places if isinstance(inside[key], str)]
-    inside, key = any_of(rng, texts)
-    other, name = any_of(rng, texts)
-    inside[key] = any_of(rng, (inside[key].upper(), other[name], f"{inside[key]} ", *ODD_NAMES))
-    return _yaml(tree)
+    """Replace a text by its capital letters, by that of something else, or by an odd name."""
+    tree = yaml.safe_load(content)
+    container, key = choose_place(rng, tree, str)
+    other_container, other_key = choose_place(rng, tree, str)
+    text = container[key]
+    other_text = other_container[other_key]
+    container[key] = choose(rng, (text.upper(), other_text, f"{text} ", *ODD_NAMES))
+    return _dump_recipe(tree)
 
 
 # ---- JSON: settings, notes, addresses
 
 
-@by_content("bombs", "manifest", "record")
+@content_mutation("bombs", "manifest", "record")
 def long_setting(content: bytes, rng: Rng) -> bytes:
-    """A value or a key of 5 MB, with what moves a terminal's cursor and turns letters."""
+    """Write a value or a key of 5 MB, perhaps of control characters."""
     tree = json.loads(content)
-    inside = any_of(rng, [each for each in containers(tree) if isinstance(each, dict) and each])
-    text = any_of(rng, ("x", "\x1b[2J", "\u202e", "\x9b1m", "<b>")) * (_LONG // 4)
-    name = any_of(rng, list(inside))
+    container = choose_container(rng, tree, dict)
+    text = choose(rng, ("x", "\x1b[2J", "\u202e", "\x9b1m", "<b>")) * (_LONG_TEXT_BYTES // 4)
+    key = choose(rng, list(container))
     if rng.integers(2):
-        inside[name] = any_of(rng, (text, [text], {text: text}))
+        container[key] = choose(rng, (text, [text], {text: text}))
     else:
-        inside[text] = inside.pop(name)
+        container[text] = container.pop(key)
     return json.dumps(tree, ensure_ascii=bool(rng.integers(2))).encode()
 
 
-@by_content("names", "manifest", "record")
+@content_mutation("names", "manifest", "record")
 def scenario_with_another_name(content: bytes, rng: Rng) -> bytes:
-    """A scenario's token is another one, or leads elsewhere."""
-    token = next((each for each in content.split(b'"') if b"scenario0" in each), b"scenarios")
-    odd = (
+    """Replace a scenario's token by another one, which may lead elsewhere."""
+    texts = content.split(b'"')
+    token = next((text for text in texts if b"scenario0" in text), b"scenarios")
+    names = (
         b"../../outside/kept",
         b"/etc/passwd",
         b"..",
@@ -311,24 +311,24 @@ def scenario_with_another_name(content: bytes, rng: Rng) -> bytes:
         b"type1/x",
         b"x" * 5000,
     )
-    return content.replace(token, any_of(rng, odd))
+    return content.replace(token, choose(rng, names))
 
 
-@by_content("bombs", "address")
+@content_mutation("bombs", "address")
 def long_address(_content: bytes, rng: Rng) -> bytes:
-    """An address of 50 MB, or a list of many."""
-    text = any_of(rng, ("9", "x", "[", "%", "\x1b[2J", "\u202e"))
-    long = f"tcp://127.0.0.1:{text * (50_000_000 // len(text))}"
-    address = any_of(rng, (long, long, [long[:100]] * 100_000, "://" * 100_000))
-    return json.dumps(
-        {"type": "Scheduler", "address": address}, ensure_ascii=bool(rng.integers(2))
-    ).encode()
+    """Return an address of 50 MB, or a list of many addresses."""
+    text = choose(rng, ("9", "x", "[", "%", "\x1b[2J", "\u202e"))
+    count = 50_000_000 // len(text)
+    long = f"tcp://127.0.0.1:{text * count}"
+    address = choose(rng, (long, long, [long[:100]] * 100_000, "://" * 100_000))
+    tree = {"type": "Scheduler", "address": address}
+    return json.dumps(tree, ensure_ascii=bool(rng.integers(2))).encode()
 
 
-@by_content("types", "address")
+@content_mutation("types", "address")
 def address_of_another_kind(content: bytes, rng: Rng) -> bytes:
     tree = json.loads(content)
-    odd = (
+    addresses = (
         1,
         None,
         True,
@@ -341,26 +341,26 @@ def address_of_another_kind(content: bytes, rng: Rng) -> bytes:
         "tcp://",
         "tcp://127.0.0.1",
         "inproc://1/2/3",
-    )
-    more = (
         "file:///etc/passwd",
         "tls://127.0.0.1:1",
         "ucx://127.0.0.1:1",
         "ws://127.0.0.1:1",
         "tcp://127.0.0.1:99999",
+        "tcp://127.0.0.1:-1",
+        "tcp://[::1]:1",
+        "tcp://a b:1",
+        "x://y\n\x1b[31m",
     )
-    tree["address"] = any_of(
-        rng, (*odd, *more, "tcp://127.0.0.1:-1", "tcp://[::1]:1", "tcp://a b:1", "x://y\n\x1b[31m")
-    )
+    tree["address"] = choose(rng, addresses)
     return json.dumps(tree).encode()
 
 
 # ---- lines of JSON
 
 
-@by_content("types", "lines")
+@content_mutation("types", "lines")
 def line_of_other_values(content: bytes, rng: Rng) -> bytes:
-    odd = (
+    values = (
         None,
         True,
         -1,
@@ -378,305 +378,312 @@ def line_of_other_values(content: bytes, rng: Rng) -> bytes:
         [None],
         list(range(5000)),
     )
-    return _one_line(
-        content, rng, lambda line: line.__setitem__(any_of(rng, list(line)), any_of(rng, odd))
-    )
+
+    def edit(line: JsonObject) -> None:
+        key = choose(rng, list(line))
+        line[key] = choose(rng, values)
+
+    return _edit_line(content, rng, edit)
 
 
-@by_content("types", "lines")
+@content_mutation("types", "lines")
 def line_without_a_key(content: bytes, rng: Rng) -> bytes:
-    return _one_line(content, rng, lambda line: line.pop(any_of(rng, list(line))))
+    def edit(line: JsonObject) -> None:
+        del line[choose(rng, list(line))]
+
+    return _edit_line(content, rng, edit)
 
 
-@by_content("types", "lines")
+@content_mutation("types", "lines")
 def line_that_is_no_object(content: bytes, rng: Rng) -> bytes:
     lines = content.splitlines(keepends=True)
-    lines[int(rng.integers(len(lines)))] = (
-        any_of(rng, (b"[]", b"null", b"1", b'"x"', b"{", b"{}{}", b"NaN", b"[" * 50)) + b"\n"
-    )
+    line = choose(rng, (b"[]", b"null", b"1", b'"x"', b"{", b"{}{}", b"NaN", b"[" * 50))
+    lines[choose_index(rng, lines)] = line + b"\n"
     return b"".join(lines)
 
 
-@by_content("bombs", "lines")
+@content_mutation("bombs", "lines")
 def line_of_deep_nesting(content: bytes, rng: Rng) -> bytes:
-    depth = any_of(rng, (900, 5000, 200_000))
-    nest = any_of(
-        rng, (b"[" * depth + b"]" * depth, b'{"a":' * depth + b"1" + b"}" * depth, b"[" * depth)
-    )
-    return content + any_of(rng, (nest, b'{"id": ' + nest + b"}")) + b"\n"
+    nested = nest_deeply(rng)
+    return content + choose(rng, (nested, b'{"id": ' + nested + b"}")) + b"\n"
 
 
-@by_content("bombs", "lines")
+@content_mutation("bombs", "lines")
 def line_of_long_texts(content: bytes, rng: Rng) -> bytes:
-    text = any_of(rng, ("x", "\x1b[2J", "\u202e", "<b>")) * (_LONG // 4)
+    text = choose(rng, ("x", "\x1b[2J", "\u202e", "<b>")) * (_LONG_TEXT_BYTES // 4)
 
-    def edit(line: dict[str, Any]) -> None:
-        name = any_of(rng, list(line))
-        line[any_of(rng, (name, text))] = any_of(rng, (text, [text], {text: 1}, line[name]))
+    def edit(line: JsonObject) -> None:
+        key = choose(rng, list(line))
+        value = choose(rng, (text, [text], {text: 1}, line[key]))
+        line[choose(rng, (key, text))] = value
 
-    return _one_line(content, rng, edit)
+    return _edit_line(content, rng, edit)
 
 
-@by_content("names", "lines")
+@content_mutation("names", "lines")
 def line_with_an_odd_name(content: bytes, rng: Rng) -> bytes:
-    def edit(line: dict[str, Any]) -> None:
-        texts = [name for name, value in line.items() if isinstance(value, str)]
-        line[any_of(rng, texts)] = any_of(
-            rng, (*ODD_NAMES, "a/b/c/d", "a/b/ego_vehicle/000", "a/b/ego_vehicle/٠٠١")
-        )
+    names = (*ODD_NAMES, "a/b/c/d", "a/b/ego_vehicle/000", "a/b/ego_vehicle/٠٠١")
 
-    return _one_line(content, rng, edit)
+    def edit(line: JsonObject) -> None:
+        keys = [key for key, value in line.items() if isinstance(value, str)]
+        name = choose(rng, names)
+        line[choose(rng, keys)] = name
+
+    return _edit_line(content, rng, edit)
 
 
-def _one_line(content: bytes, rng: Rng, edit: Callable[[dict[str, Any]], object]) -> bytes:
+def _edit_line(content: bytes, rng: Rng, edit: Callable[[JsonObject], object]) -> bytes:
+    """Return lines of JSON in which one line is edited."""
     lines = content.splitlines()
-    number = int(rng.integers(len(lines)))
-    tree = json.loads(lines[number])
+    position = choose_index(rng, lines)
+    tree = json.loads(lines[position])
     edit(tree)
-    lines[number] = json.dumps(tree).encode("utf-8", "surrogatepass")
+    lines[position] = json.dumps(tree).encode("utf-8", "surrogatepass")
     return b"\n".join(lines) + b"\n"
 
 
 # ---- files of cached images
 
 
-@by_content("numbers", "images")
+@content_mutation("numbers", "images")
 def images_of_another_count(content: bytes, rng: Rng) -> bytes:
-    """The head has other numbers of rows and cameras."""
-    odd = (0, 1, 2, 3, 6, -1, 1 << 20, 1 << 31, 1 << 40, (1 << 63) - 1, -(1 << 63))
-    return content[:8] + struct.pack("<qq", any_of(rng, odd), any_of(rng, odd)) + content[24:]
+    """Write other numbers of rows and cameras into the header."""
+    counts = (0, 1, 2, 3, 6, -1, 1 << 20, 1 << 31, 1 << 40, (1 << 63) - 1, -(1 << 63))
+    rows = choose(rng, counts)
+    cameras = choose(rng, counts)
+    header = struct.pack("<qq", rows, cameras)
+    return replace_bytes(content, 8, _IMAGES_HEADER_BYTES, header)
 
 
-@by_content("types", "images")
+@content_mutation("types", "images")
 def images_elsewhere(content: bytes, rng: Rng) -> bytes:
-    """The table says another beginning or length of an image."""
+    """Write another begin or length of an image into the table."""
     size = len(content)
-    odd = (0, 1, -1, size, size - 1, size + 1, 1 << 40, (1 << 63) - 1, -(1 << 63), 24)
-    place = 24 + 8 * int(rng.integers(max((struct.unpack("<q", content[24:32])[0] - 24) // 8, 1)))
-    return content[:place] + struct.pack("<q", any_of(rng, odd)) + content[place + 8 :]
+    numbers = (0, 1, -1, size, size - 1, size + 1, 1 << 40, (1 << 63) - 1, -(1 << 63), 24)
+    (first_begin,) = struct.unpack_from("<q", content, _IMAGES_HEADER_BYTES)
+    number_count = (first_begin - _IMAGES_HEADER_BYTES) // 8
+    begin = _IMAGES_HEADER_BYTES + 8 * int(rng.integers(max(number_count, 1)))
+    number = struct.pack("<q", choose(rng, numbers))
+    return replace_bytes(content, begin, begin + 8, number)
 
 
-@by_content("types", "images")
+@content_mutation("types", "images")
 def images_of_another_form(content: bytes, rng: Rng) -> bytes:
-    return any_of(rng, (b"DAimagex", b"", b"PK\3\4", b"\x93NUMPY\1\0", content[:8])) + any_of(
-        rng, (content, content[8:])
-    )
+    begin = choose(rng, (b"DAimagex", b"", b"PK\3\4", b"\x93NUMPY\1\0", content[:8]))
+    return begin + choose(rng, (content, content[8:]))
 
 
-@by_content("bombs", "images")
+@content_mutation("bombs", "images")
 def images_without_end(content: bytes, rng: Rng) -> bytes:
-    """A table of millions of rows, whose bytes may be there."""
-    rows = any_of(rng, (1_000_000, 5_000_000, 1 << 33))
-    there = bytes(16 * rows) if rows == 1_000_000 else bytes(1000)
-    return content[:8] + struct.pack("<qq", rows, 1) + there + content[24:]
+    """Announce a table of millions of rows, with or without its bytes."""
+    rows = choose(rng, (1_000_000, 5_000_000, 1 << 33))
+    table = bytes(16 * rows if rows == 1_000_000 else 1000)
+    header = struct.pack("<qq", rows, 1)
+    return replace_bytes(content, 8, _IMAGES_HEADER_BYTES, header + table)
 
 
-@by_path("links", "images")
+@path_mutation("links", "images")
 def images_of_another_scenario_in_a_link(path: Path, rng: Rng) -> None:
     path.unlink()
-    path.symlink_to(outside_of(path) / any_of(rng, ("kept.txt", "folder", "none")))
+    name = choose(rng, ("kept.txt", "folder", "none"))
+    path.symlink_to(find_outside_folder(path) / name)
 
 
-@by_path("names", "images")
+@path_mutation("names", "images")
 def images_beside_odd_names(path: Path, rng: Rng) -> None:
     for name in ODD_NAMES[:6]:
-        (path.parent / f"{name.replace('/', '_')[:200]}.images").write_bytes(
-            path.read_bytes()[: int(rng.integers(99))]
-        )
+        neighbour = path.with_name(f"{name.replace('/', '_')[:200]}.images")
+        neighbour.write_bytes(path.read_bytes()[: rng.integers(99)])
 
 
 # ---- archives of releases
 
 
-def zipped(path: Path, change: Callable[[list[tuple[zipfile.ZipInfo, bytes]]], object]) -> None:
-    """Pack an archive again with its members changed."""
+def edit_members(path: Path, edit: Callable[[list[Member]], object]) -> None:
+    """Pack an archive again with its members edited."""
     with zipfile.ZipFile(path) as archive:
         members = [(entry, archive.read(entry)) for entry in archive.infolist()]
-    change(members)
+    edit(members)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for entry, member in members:
             archive.writestr(entry, member, entry.compress_type)
-    replace(path, buffer.getvalue())
+    replace_file(path, buffer.getvalue())
 
 
-@by_path("names", "zip", "pt")
+@path_mutation("names", "zip", "pt")
 def member_elsewhere(path: Path, rng: Rng) -> None:
-    """A member's name has backslashes, leads out of the archive, or is odd."""
+    """Give a member a name with backslashes, one that leads out of the archive, or an odd one."""
 
-    def change(members: list[Any]) -> None:
-        entry = members[int(rng.integers(len(members)))][0]
+    def edit(members: list[Member]) -> None:
+        entry, _ = choose(rng, members)
         name = entry.filename
         last = name.rpartition("/")[2]
-        ways = (
+        names = (
             name.replace("/", "\\"),
             f"../../outside/{last}",
             f"/{name}",
             f"C:\\{last}",
             f"a/../{name}",
             f"./{name}",
+            f"{name}/",
+            name.upper(),
+            name.replace("/", "//"),
+            *ODD_NAMES,
         )
-        entry.filename = any_of(
-            rng, (*ways, f"{name}/", name.upper(), name.replace("/", "//"), *ODD_NAMES)
-        )
+        entry.filename = choose(rng, names)
 
-    zipped(path, change)
+    edit_members(path, edit)
 
 
-@by_path("names", "zip")
+@path_mutation("names", "zip")
 def all_members_elsewhere(path: Path, rng: Rng) -> None:
-    way = any_of(
-        rng,
-        (
-            lambda name: name.replace("/", "\\"),
-            lambda name: f"../{name}",
-            lambda name: f"/{name}",
-            lambda name: f"\x1b[31m/{name}",
-        ),
+    rename_options = (
+        lambda name: name.replace("/", "\\"),
+        lambda name: f"../{name}",
+        lambda name: f"/{name}",
+        lambda name: f"\x1b[31m/{name}",
     )
+    rename = choose(rng, rename_options)
 
-    def change(members: list[Any]) -> None:
+    def edit(members: list[Member]) -> None:
         for entry, _ in members:
-            entry.filename = way(entry.filename)
+            entry.filename = rename(entry.filename)
 
-    zipped(path, change)
+    edit_members(path, edit)
 
 
-@by_path("links", "zip", "pt")
+@path_mutation("links", "zip", "pt")
 def member_is_a_link(path: Path, rng: Rng) -> None:
-    def change(members: list[Any]) -> None:
-        number = int(rng.integers(len(members)))
-        entry, _ = members[number]
-        entry.external_attr = any_of(rng, (0o120777, 0o060666, 0o010666, 0o040755)) << 16
-        members[number] = (
-            entry,
-            any_of(rng, (b"/etc/passwd", b"../../outside/kept.txt", b"/dev/zero")),
-        )
+    def edit(members: list[Member]) -> None:
+        position = choose_index(rng, members)
+        entry, _ = members[position]
+        entry.external_attr = choose(rng, (0o120777, 0o060666, 0o010666, 0o040755)) << 16
+        target = choose(rng, (b"/etc/passwd", b"../../outside/kept.txt", b"/dev/zero"))
+        members[position] = (entry, target)
 
-    zipped(path, change)
+    edit_members(path, edit)
 
 
-@by_path("types", "zip", "pt")
+@path_mutation("types", "zip", "pt")
 def member_twice(path: Path, rng: Rng) -> None:
-    def change(members: list[Any]) -> None:
-        entry, member = members[int(rng.integers(len(members)))]
+    def edit(members: list[Member]) -> None:
+        entry, member = choose(rng, members)
         name = entry.filename
-        odd = (
-            (f"./{name}", f"x/{name}") if path.suffix == ".zip" else ()
-        )  # PyTorch reads no file with both
-        again = zipfile.ZipInfo(any_of(rng, (name, name, *odd)))
-        members.insert(
-            int(rng.integers(len(members))), (again, any_of(rng, (member, b"", member[:-9])))
-        )
+        names = [name, name]
+        if path.suffix == ".zip":  # PyTorch reads no file with both
+            names += [f"./{name}", f"x/{name}"]
+        new_entry = zipfile.ZipInfo(choose(rng, names))
+        position = choose_index(rng, members)
+        members.insert(position, (new_entry, choose(rng, (member, b"", member[:-9]))))
 
-    zipped(path, change)
+    edit_members(path, edit)
 
 
-@by_path("types", "zip")
+@path_mutation("types", "zip")
 def member_of_another_method(path: Path, rng: Rng) -> None:
-    method = any_of(
-        rng, (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-    )
+    methods = (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+    method = choose(rng, methods)
 
-    def change(members: list[Any]) -> None:
-        members[int(rng.integers(len(members)))][0].compress_type = method
+    def edit(members: list[Member]) -> None:
+        entry, _ = choose(rng, members)
+        entry.compress_type = method
 
-    zipped(path, change)
+    edit_members(path, edit)
 
 
-@by_content("types", "zip", "pt")
+@content_mutation("types", "zip", "pt")
 def directory_entry_that_lies(content: bytes, rng: Rng) -> bytes:
-    """Flags (encrypted), method, checksum, sizes, or the place of a member are others: overlapping,
-    beyond, zip64.
+    """Change the flags, method, checksum, sizes or offset in an entry of the directory.
+
+    Members may then be encrypted, overlap, lie beyond the end, or need zip64.
     """
-    offset, form = any_of(
-        rng,
-        (
-            (8, "<H"),
-            (10, "<H"),
-            (16, "<I"),
-            (20, "<I"),
-            (24, "<I"),
-            (28, "<H"),
-            (30, "<H"),
-            (42, "<I"),
-        ),
+    fields = (
+        (8, "<H"),
+        (10, "<H"),
+        (16, "<I"),
+        (20, "<I"),
+        (24, "<I"),
+        (28, "<H"),
+        (30, "<H"),
+        (42, "<I"),
     )
-    places = _entries(content)
-    place = any_of(rng, places)
-    other = struct.unpack_from(form, content, any_of(rng, places) + offset)[0]
-    odd = (
-        (1, 0, 8, 99, 0xFFFF, 2049)
-        if form == "<H"
-        else (0, 1, other, 0xFFFFFFFF, 0xFFFFFFFE, 0x7FFFFFFF, len(content))
-    )
+    offset, number_format = choose(rng, fields)
+    entries = _find_directory_entries(content)
+    begin = choose(rng, entries)
+    other_begin = choose(rng, entries)
+    (other_number,) = struct.unpack_from(number_format, content, other_begin + offset)
+    if number_format == "<H":
+        numbers = (1, 0, 8, 99, 0xFFFF, 2049)
+    else:
+        numbers = (0, 1, other_number, 0xFFFFFFFF, 0xFFFFFFFE, 0x7FFFFFFF, len(content))
     changed = bytearray(content)
-    struct.pack_into(form, changed, place + offset, any_of(rng, odd))
+    struct.pack_into(number_format, changed, begin + offset, choose(rng, numbers))
     return bytes(changed)
 
 
-@by_content("numbers", "zip", "pt")
+@content_mutation("numbers", "zip", "pt")
 def end_that_lies(content: bytes, rng: Rng) -> bytes:
-    """The archive's end has other numbers, or a zip64 end that lies."""
+    """Write other numbers into the archive's end, or add a zip64 end with wrong numbers."""
     end = content.rfind(b"PK\5\6")
     numbers = (0, 1, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF, 1 << 40, end, len(content))
     if rng.integers(2):
+        fields = ((4, "<H"), (8, "<H"), (10, "<H"), (12, "<I"), (16, "<I"), (20, "<H"))
+        offset, number_format = choose(rng, fields)
+        number = choose(rng, numbers) & (0xFFFF if number_format == "<H" else 0xFFFFFFFF)
         changed = bytearray(content)
-        offset, form = any_of(
-            rng, ((4, "<H"), (8, "<H"), (10, "<H"), (12, "<I"), (16, "<I"), (20, "<H"))
-        )
-        struct.pack_into(
-            form,
-            changed,
-            end + offset,
-            any_of(rng, numbers) & (0xFFFF if form == "<H" else 0xFFFFFFFF),
-        )
+        struct.pack_into(number_format, changed, end + offset, number)
         return bytes(changed)
-    lies = [any_of(rng, numbers) for _ in range(4)]
-    large = struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 45, 45, 0, 0, *lies)
-    locator = struct.pack("<4sIQI", b"PK\6\7", 0, any_of(rng, (end, 0, 1 << 40)), 1)
+    wrong_numbers = [choose(rng, numbers) for _ in range(4)]
+    zip64_end = struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 45, 45, 0, 0, *wrong_numbers)
+    locator = struct.pack("<4sIQI", b"PK\6\7", 0, choose(rng, (end, 0, 1 << 40)), 1)
     tail = content[end:]
-    ended = tail[:8] + b"\xff\xff\xff\xff" + b"\xff" * 8 + tail[20:] if rng.integers(2) else tail
-    return content[:end] + large + locator + ended
+    if rng.integers(2):
+        tail = replace_bytes(tail, 8, 20, b"\xff" * 12)
+    return content[:end] + zip64_end + locator + tail
 
 
-@by_path("bombs", "zip", "pt")
+@path_mutation("bombs", "zip", "pt")
 def member_that_unpacks_to_much(path: Path, rng: Rng) -> None:
-    """900 MB of zeros in the place of a member; the directory may say the size of before."""
-    with zipfile.ZipFile(path) as archive:
-        members = {entry.filename: archive.read(entry) for entry in archive.infolist()}
-    name = any_of(rng, list(members))
-    packed, checksum, size = squeezed(b"")
-    lie = any_of(rng, (size, len(members[name]), 1000))
+    """Replace a member by 900 MB of zeros; the directory may state another size."""
+    members = read_members(path.read_bytes())
+    name = choose(rng, list(members))
+    deflated, checksum, size = deflate_with_zeros(b"")
+    stated_size = choose(rng, (size, len(members[name]), 1000))
+    members[name] = deflated
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for each, member in members.items():
-            archive.writestr(each, packed if each == name else member)
+        for member_name, member in members.items():
+            archive.writestr(member_name, member)
         entry = archive.getinfo(name)
-        entry.compress_type, entry.CRC, entry.file_size = zipfile.ZIP_DEFLATED, checksum, lie
-    replace(path, buffer.getvalue())
+        entry.compress_type = zipfile.ZIP_DEFLATED
+        entry.CRC = checksum
+        entry.file_size = stated_size
+    replace_file(path, buffer.getvalue())
 
 
-@by_path("bombs", "zip")
+@path_mutation("bombs", "zip")
 def many_members(path: Path, rng: Rng) -> None:
-    """50,000 empty ones, of a release or not; or names of 60,000 characters."""
-    count, length = any_of(rng, ((50_000, 1), (100, 60_000)))
+    """Add 50,000 empty members, in a release or not, or 100 with names of 60,000 characters."""
+    count, length = choose(rng, ((50_000, 1), (100, 60_000)))
     with zipfile.ZipFile(path) as archive:
-        first = archive.namelist()[0].rpartition("/")[0]
-    way = any_of(rng, (f"{first}/", "", f"{first}/x/"))
+        first_folder = archive.namelist()[0].rpartition("/")[0]
+    folder = choose(rng, (f"{first_folder}/", "", f"{first_folder}/x/"))
     buffer = io.BytesIO(path.read_bytes())
     with zipfile.ZipFile(buffer, "a") as archive:
         for number in range(count):
-            archive.writestr(f"{way}{'x' * length}{number:03d}.txt", b"")
-    replace(path, buffer.getvalue())
+            archive.writestr(f"{folder}{'x' * length}{number:03d}.txt", b"")
+    replace_file(path, buffer.getvalue())
 
 
-def _entries(content: bytes) -> list[int]:
-    """Where the entries of an archive's directory begin."""
+def _find_directory_entries(content: bytes) -> list[int]:
+    """Return the positions at which the entries of an archive's directory begin."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        place, count = archive.start_dir, len(archive.infolist())
-    places = []
+        position = archive.start_dir
+        count = len(archive.infolist())
+    positions = []
     for _ in range(count):
-        places.append(place)
-        place += 46 + sum(struct.unpack_from("<HHH", content, place + 28))
-    return places
+        positions.append(position)
+        lengths = struct.unpack_from("<HHH", content, position + 28)
+        position += _DIRECTORY_ENTRY_BYTES + sum(lengths)
+    return positions

@@ -1,55 +1,54 @@
-"""Bad readers, one for each way to fail: the campaign must notice each."""
+"""Bad readers, one for each way to fail; the campaign must notice each of them."""
 
 import os
 import signal
 import time
-from pathlib import Path
 from typing import Any, NoReturn
 
-from campaign.kind import Action, Kind, Room
+from campaign.kind import Action, Kind, Read, Workspace
 from campaign.mutations import MARKER
 from deepaccident_devkit.errors import DeepAccidentError, ReleaseError
 
 
-def _hangs(_room: Room) -> None:
-    until = time.process_time() + 60
-    while time.process_time() < until:
+def _hang(_workspace: Workspace) -> None:
+    end = time.process_time() + 60
+    while time.process_time() < end:
         pass
 
 
-def _writes_outside(room: Room) -> None:
-    (room.outside / "new.txt").write_bytes(b"")
+def _write_outside(workspace: Workspace) -> None:
+    (workspace.outside / "new.txt").write_bytes(b"")
 
 
-def _takes_memory(_room: Room) -> int:
+def _take_memory(_workspace: Workspace) -> int:
     return len(bytearray(400 << 20))
 
 
-def _asks_for_memory(_room: Room) -> int:
+def _request_memory(workspace: Workspace) -> int:
     try:
         return len(bytearray(1 << 40))
     except MemoryError as error:
-        raise ReleaseError(f"{_room.victim}: too large") from error
+        raise ReleaseError(f"{workspace.changed_file}: too large") from error
 
 
-def _raises_another(room: Room) -> NoReturn:
-    raise KeyError(room.victim)
+def _raise_foreign_error(workspace: Workspace) -> NoReturn:
+    raise KeyError(workspace.changed_file)
 
 
-def _raises(error: DeepAccidentError) -> NoReturn:
+def _raise(error: DeepAccidentError) -> NoReturn:
     raise error
 
 
-def _dies(_room: Room) -> None:
+def _crash(_workspace: Workspace) -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
-def _runs_code(room: Room) -> None:
-    (room.victim.parent / MARKER).mkdir()
+def _run_code(workspace: Workspace) -> None:
+    (workspace.changed_file.parent / MARKER).mkdir()
 
 
-class _AsItIsError(ReleaseError):
-    """Says its whole message, and shortens and escapes nothing."""
+class _VerbatimError(ReleaseError):
+    """Error that neither shortens nor escapes its message."""
 
     def __init__(self, message: str) -> None:
         super().__init__()
@@ -59,44 +58,57 @@ class _AsItIsError(ReleaseError):
         return self._message
 
 
-def _unless_healthy(read: Any) -> Any:
-    """Healthy files are read well: only the file's changed content is met by the fault."""
-    return lambda room: (
-        "healthy" if room.victim.read_bytes() == room.healthy.read_bytes() else read(room)
-    )
+def _fail_if_changed(read: Read) -> Action:
+    """Return an action that reads healthy files well, and changed ones with a bad reader."""
+
+    def read_if_changed(workspace: Workspace) -> Any:
+        content = workspace.changed_file.read_bytes()
+        if content == workspace.healthy_file.read_bytes():
+            return "healthy"
+        return read(workspace)
+
+    return Action(read_if_changed)
 
 
-_READERS = {
-    "hang": Action(_unless_healthy(_hangs)),
-    "memory": Action(_unless_healthy(_takes_memory)),
-    "memory, asked for": Action(_unless_healthy(_asks_for_memory)),
-    "foreign": Action(_unless_healthy(_raises_another)),
-    "message": Action(
-        _unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: {'x' * 2000}")))
+def _read_bytes(workspace: Workspace) -> bytes:
+    return workspace.changed_file.read_bytes()
+
+
+def _judge_bytes(workspace: Workspace, output: bytes) -> str | None:
+    if output == workspace.healthy_file.read_bytes():
+        return None
+    return "other bytes"
+
+
+def _judge_words(_workspace: Workspace, output: bytes) -> str | None:
+    if len(output.decode().split()) > 1:
+        return None
+    return "few"
+
+
+_ACTIONS = {
+    "hang": _fail_if_changed(_hang),
+    "memory": _fail_if_changed(_take_memory),
+    "memory, asked for": _fail_if_changed(_request_memory),
+    "foreign": _fail_if_changed(_raise_foreign_error),
+    "message": _fail_if_changed(
+        lambda workspace: _raise(_VerbatimError(f"{workspace.changed_file}: {'x' * 2000}"))
     ),
-    "message, nameless": Action(
-        _unless_healthy(lambda _: _raises(ReleaseError("something is wrong")))
+    "message, nameless": _fail_if_changed(lambda _: _raise(ReleaseError("something is wrong"))),
+    "crash": _fail_if_changed(_crash),
+    "message, of a terminal": _fail_if_changed(
+        lambda workspace: _raise(_VerbatimError(f"{workspace.changed_file}: \x1b[2J"))
     ),
-    "crash": Action(_unless_healthy(_dies)),
-    "message, of a terminal": Action(
-        _unless_healthy(lambda room: _raises(_AsItIsError(f"{room.victim}: \x1b[2J")))
+    "outside": _fail_if_changed(_write_outside),
+    "code": _fail_if_changed(_run_code),
+    "wrong": Action(_read_bytes, _judge_bytes),
+    "wrong, too lenient": Action(_read_bytes, _judge_words),
+    "refused": _fail_if_changed(
+        lambda workspace: _raise(ReleaseError(f"{workspace.changed_file}: damaged"))
     ),
-    "outside": Action(_unless_healthy(_writes_outside)),
-    "code": Action(_unless_healthy(_runs_code)),
-    "wrong": Action(
-        lambda room: Path(room.victim).read_bytes(),
-        lambda room, read: None if read == room.healthy.read_bytes() else "other bytes",
-    ),
-    "wrong, too lenient": Action(
-        lambda room: Path(room.victim).read_bytes(),
-        lambda _, read: None if len(read.decode().split()) > 1 else "few",
-    ),
-    "refused": Action(
-        _unless_healthy(lambda room: _raises(ReleaseError(f"{room.victim}: damaged")))
-    ),
-    "read": Action(lambda room: room.victim.read_bytes()),
+    "read": Action(_read_bytes),
 }
 KINDS = {
-    name: Kind(name, "text", "small", "train.txt", (action,)) for name, action in _READERS.items()
+    name: Kind(name, "text", "small", "train.txt", (action,)) for name, action in _ACTIONS.items()
 }
-"""By the verdict that each should get, and more words where a verdict has several."""
+"""Kinds named after the verdict that they should get, with more words if several share one."""

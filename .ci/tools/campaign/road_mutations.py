@@ -1,11 +1,8 @@
-"""What strangers do to nuScenes' tables: rows that lead nowhere or in a circle, twice the same
-token, odd numbers.
-"""
+"""Mutations of nuScenes' tables: broken or circular tokens, duplicates and odd numbers."""
 
 import json
-from typing import Any
 
-from campaign.mutations import Rng, any_of, by_content
+from campaign.mutations import JsonObject, Rng, choose, content_mutation
 
 _TOKENS = (
     "next",
@@ -19,74 +16,83 @@ _TOKENS = (
 _NUMBERS = (0, -1, 1e308, -1e308, 1e-300, float("nan"), float("inf"), 2**53 + 1)
 
 
-def _rows(content: bytes) -> list[dict[str, Any]]:
-    """The rows of a table; of a list of splits none."""
+def _read_rows(content: bytes) -> list[JsonObject]:
+    """Return the rows of a table; a list of splits has none."""
     rows = json.loads(content)
-    return rows if isinstance(rows, list) else []
+    if isinstance(rows, list):
+        return rows
+    return []
 
 
-def _dumped(content: bytes, rows: list[dict[str, Any]]) -> bytes:
-    return json.dumps(rows).encode() if rows else content + b" "
+def _write_rows(content: bytes, rows: list[JsonObject]) -> bytes:
+    """Return a table of rows; the old content and a space if there are none."""
+    if rows:
+        return json.dumps(rows).encode()
+    return content + b" "
 
 
-@by_content("types", "tables")
+@content_mutation("types", "tables")
 def row_that_leads_elsewhere(content: bytes, rng: Rng) -> bytes:
-    """A token is that of another row, of its own row, of none, or empty."""
-    rows = _rows(content)
-    places = [
-        (row, name) for row in rows for name in row if name in _TOKENS or name.endswith("_token")
-    ]
+    """Replace a token by that of another row or of its own row, an unknown or an empty one."""
+    rows = _read_rows(content)
+    places = []
+    for row in rows:
+        names = [name for name in row if name in _TOKENS or name.endswith("_token")]
+        places += [(row, name) for name in names]
     if places:
-        row, name = any_of(rng, places)
-        row[name] = any_of(
-            rng, (row["token"], any_of(rng, rows)["token"], any_of(rng, rows)[name], "nowhere", "")
-        )
-    return _dumped(content, rows)
+        row, name = choose(rng, places)
+        other_token = choose(rng, rows)["token"]
+        same_column = choose(rng, rows)[name]
+        row[name] = choose(rng, (row["token"], other_token, same_column, "nowhere", ""))
+    return _write_rows(content, rows)
 
 
-@by_content("types", "tables")
+@content_mutation("types", "tables")
 def rows_in_a_circle(content: bytes, rng: Rng) -> bytes:
-    """The chain of a row's followers leads back."""
-    rows = [row for row in _rows(content) if "next" in row]
+    """Let a row's chain of followers lead back to it."""
+    rows = [row for row in _read_rows(content) if "next" in row]
     if not rows:
         return content + b" "
-    first, last = any_of(rng, rows), any_of(rng, rows)
-    last["next"], first["prev"] = first["token"], last["token"]
+    first = choose(rng, rows)
+    last = choose(rng, rows)
+    last["next"] = first["token"]
+    first["prev"] = last["token"]
     return json.dumps(rows).encode()
 
 
-@by_content("names", "tables")
+@content_mutation("names", "tables")
 def token_or_name_twice(content: bytes, rng: Rng) -> bytes:
-    rows = _rows(content)
+    """Give a row the token or the name of another one; perhaps repeat a row."""
+    rows = _read_rows(content)
     if rows:
-        one, other = any_of(rng, rows), any_of(rng, rows)
-        name = any_of(rng, [each for each in ("token", "name") if each in one])
-        other[name] = one[name]
-    return _dumped(content, [*rows, dict(any_of(rng, rows))] if rows and rng.integers(2) else rows)
+        source = choose(rng, rows)
+        target = choose(rng, rows)
+        name = choose(rng, [name for name in ("token", "name") if name in source])
+        target[name] = source[name]
+        if rng.integers(2):
+            rows = [*rows, choose(rng, rows)]
+    return _write_rows(content, rows)
 
 
-@by_content("numbers", "tables")
+@content_mutation("numbers", "tables")
 def numbers_of_a_row(content: bytes, rng: Rng) -> bytes:
-    """A vector or a number of one row, or of all rows, is zero, huge, tiny, negative or none."""
-    rows = _rows(content)
-    names = sorted(
-        {
-            name
-            for row in rows
-            for name, value in row.items()
-            if isinstance(value, list | int | float)
-        }
-    )
+    """Set a vector or a number of one row or all rows to a value such as zero, infinity or NaN."""
+    rows = _read_rows(content)
+    names: set[str] = set()
+    for row in rows:
+        names |= {name for name, value in row.items() if isinstance(value, list | int | float)}
     if names:
-        name, value = any_of(rng, names), any_of(rng, _NUMBERS)
-        for row in rows if rng.integers(2) else [any_of(rng, rows)]:
-            row[name] = [value for _ in row[name]] if isinstance(row[name], list) else value
-    return _dumped(content, rows)
+        name = choose(rng, sorted(names))
+        number = choose(rng, _NUMBERS)
+        for row in rows if rng.integers(2) else [choose(rng, rows)]:
+            row[name] = [number for _ in row[name]] if isinstance(row[name], list) else number
+    return _write_rows(content, rows)
 
 
-@by_content("types", "tables")
+@content_mutation("types", "tables")
 def row_lost(content: bytes, rng: Rng) -> bytes:
-    rows = _rows(content)
+    """Remove a row."""
+    rows = _read_rows(content)
     if rows:
-        rows.pop(int(rng.integers(len(rows))))
-    return json.dumps(rows).encode() if rows else b"[]"
+        rows.pop(rng.integers(len(rows)))
+    return json.dumps(rows).encode()

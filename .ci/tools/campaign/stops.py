@@ -1,5 +1,6 @@
-"""Every verb that writes, killed at any moment or on a full disk, then run again: as if nothing had
-happened.
+"""Every command that writes: killed at any moment or stopped by a full disk, then run again.
+
+The output of the second run must be as if nothing had happened.
 """
 
 import json
@@ -11,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import killed
 import numpy as np
+from support import stopped_index_process
 
 SCENARIO = "type1_subtype1_accident/Town03_type001_subtype0001_scenario00001"
-_IMPORTED = (
+_IMPORTED_MODULES = (
     "matplotlib.pyplot",
     "scipy.optimize",
     "shapely",
@@ -31,18 +32,19 @@ class Verb:
     """A command that writes.
 
     Attributes:
-        name: in the table.
-        words: its arguments; {home} is the folder of healthy files, {out} a new folder.
-        progress: a file that is whole at each moment, and says how far the work is.
+        name: Name in the table.
+        arguments: Arguments, separated by spaces; {home} is the folder of healthy files, {out} a
+            new folder.
+        progress: File that is complete at any moment, and records how far the work is.
     """
 
     name: str
-    words: str
+    arguments: str
     progress: str = ""
 
-    def words_for(self, home: Path, out: Path) -> list[str]:
-        """Its arguments for a folder to write into."""
-        return [word.format(home=home, out=out) for word in self.words.split()]
+    def format_arguments(self, home: Path, out: Path) -> list[str]:
+        """Return the arguments for a folder to write into."""
+        return [word.format(home=home, out=out) for word in self.arguments.split()]
 
 
 _RELEASE = "{home}/release --index-dir {home}/index --workers 1"
@@ -88,10 +90,10 @@ VERBS = (
     *(
         Verb(
             f"export {name}",
-            f"export {name} {_RELEASE} --out {{out}}/{name}{own}",
+            f"export {name} {_RELEASE} --out {{out}}/{name}{options}",
             progress=f"{name}/{name}.manifest.json",
         )
-        for name, own in {
+        for name, options in {
             "opencood": " --without-clouds",
             "nuscenes": "",
             "parquet": "",
@@ -123,8 +125,12 @@ VERBS = (
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """One verb that is stopped once: after a share of its time, or at a share of its largest
-    file.
+    """One command that is stopped once.
+
+    Attributes:
+        verb: Name of the command.
+        kind: `kill` or `full disk`.
+        share: Share of the command's time, or of its largest file, at which it is stopped.
     """
 
     verb: str
@@ -133,14 +139,15 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True)
-class Stopped:
-    """What became of it; `fault` is empty if nothing is wrong."""
+class StopOutcome:
+    """The outcome of a stop; `fault` is empty if nothing is wrong."""
 
     stop: Stop
     fault: str = ""
 
     def __str__(self) -> str:
-        return f"{self.stop.verb} / {self.stop.kind} at {self.stop.share:.3f}: {self.fault}"
+        stop = self.stop
+        return f"{stop.verb} / {stop.kind} at {stop.share:.3f}: {self.fault}"
 
     @property
     def failed(self) -> bool:
@@ -148,98 +155,106 @@ class Stopped:
 
 
 @dataclass(frozen=True, slots=True)
-class _Healthy:
-    """An undisturbed run: its seconds and its files."""
+class _HealthyRun:
+    """The duration in seconds and the files of an undisturbed run."""
 
     seconds: float
     files: Mapping[str, bytes]
 
 
-def drawn_stops(kills: int, seed: int) -> list[Stop]:
-    """So many kills, the verbs by turns, at moments by chance; and for each verb four sizes of a
-    full disk.
+def draw_stops(kills: int, seed: int) -> list[Stop]:
+    """Draw kills at random moments, and add four sizes of a full disk for each command.
+
+    Args:
+        kills: Number of kills, for which the commands take turns.
+        seed: Seed of the moments.
     """
     rng = np.random.default_rng(seed)
-    moments = [
-        Stop(VERBS[number % len(VERBS)].name, "kill", float(rng.uniform(0.0, 1.05)))
-        for number in range(kills)
-    ]
-    return moments + [
-        Stop(verb.name, "full disk", share) for verb in VERBS for share in (0.0, 0.01, 0.5, 0.999)
-    ]
+    stops = []
+    for number in range(kills):
+        verb = VERBS[number % len(VERBS)]
+        stops.append(Stop(verb.name, "kill", float(rng.uniform(0.0, 1.05))))
+    for verb in VERBS:
+        stops += [Stop(verb.name, "full disk", share) for share in (0.0, 0.01, 0.5, 0.999)]
+    return stops
 
 
 class Stopper:
-    """Runs verbs, stops them, and runs them again."""
+    """Runs commands, stops them, and runs them again."""
 
     def __init__(self, home: Path, folder: Path, server: "subprocess.Popen[str]") -> None:
         self._home, self._folder, self._server = home, folder, server
-        self._healthy: dict[str, _Healthy] = {}
+        self._healthy_runs: dict[str, _HealthyRun] = {}
         self._count = 0
 
-    def stopped(self, stop: Stop) -> Stopped:
-        """Stop a verb as told; compare what is there afterwards, and after the next run."""
-        verb = next(each for each in VERBS if each.name == stop.verb)
-        healthy = self._undisturbed(verb)
-        out = self._new_folder()
-        largest = max(map(len, healthy.files.values()))
-        how = (
-            {"delay": stop.share * healthy.seconds}
-            if stop.kind == "kill"
-            else {"limit": int(stop.share * largest)}
-        )
-        first = self._run(verb, out, **how)
-        faults = [
-            *(_told(first) if stop.kind == "full disk" else ()),
-            *_unwhole(files_in(out), healthy.files, verb.progress),
-        ]
-        if stop.kind == "kill" and not faults and files_in(out) == healthy.files:
-            return Stopped(
-                stop, ""
-            )  # killed when all was written; some verbs refuse to write it again
-        again = self._run(verb, out)
-        if again["status"] != 0:
-            faults.append(f"the next run: status {again['status']}: {again['message'][-300:]}")
-        faults += _differences(files_in(out), healthy.files)
-        return Stopped(stop, "; ".join(faults))
+    def run(self, stop: Stop) -> StopOutcome:
+        """Stop a command; compare its files after the stop and after the next run."""
+        verb = next(verb for verb in VERBS if verb.name == stop.verb)
+        healthy_run = self._run_undisturbed(verb)
+        healthy_files = healthy_run.files
+        out = self._make_folder()
+        if stop.kind == "kill":
+            self._run_command(verb, out, delay=stop.share * healthy_run.seconds)
+            faults = []
+        else:
+            largest = max(map(len, healthy_files.values()))
+            run = self._run_command(verb, out, limit=int(stop.share * largest))
+            faults = list(_find_disk_faults(run))
+        faults += _find_unfinished_files(read_files(out), healthy_files, verb.progress)
+        if stop.kind == "kill" and not faults and read_files(out) == healthy_files:
+            # killed when all was written; some commands refuse to write it again
+            return StopOutcome(stop)
+        next_run = self._run_command(verb, out)
+        if next_run["status"] != 0:
+            message = next_run["message"][-300:]
+            faults.append(f"the next run: status {next_run['status']}: {message}")
+        faults += _find_differences(read_files(out), healthy_files)
+        return StopOutcome(stop, "; ".join(faults))
 
-    def _undisturbed(self, verb: Verb) -> _Healthy:
-        if verb.name not in self._healthy:
+    def _run_undisturbed(self, verb: Verb) -> _HealthyRun:
+        """Return an undisturbed run of a command; two runs must write the same files."""
+        if verb.name not in self._healthy_runs:
             runs = []
-            for _ in range(2):  # a verb whose runs differ by themselves is none to compare with
-                out = self._new_folder()
-                run = self._run(verb, out)
+            for _ in range(2):
+                out = self._make_folder()
+                run = self._run_command(verb, out)
                 assert run["status"] == 0, (verb.name, run["message"])
-                runs.append(_Healthy(run["seconds"], files_in(out)))
-            assert runs[0].files == runs[1].files, verb.name
-            self._healthy[verb.name] = runs[1]
-        return self._healthy[verb.name]
+                runs.append(_HealthyRun(run["seconds"], read_files(out)))
+            first, second = runs
+            assert first.files == second.files, verb.name
+            self._healthy_runs[verb.name] = second
+        return self._healthy_runs[verb.name]
 
-    def _new_folder(self) -> Path:
-        """Of the same length of name each time, in case that a file holds it."""
+    def _make_folder(self) -> Path:
+        """Make a new folder; all names have the same length, in case a file holds them."""
         self._count += 1
         folder = self._folder / f"{self._count:05d}"
         folder.mkdir(parents=True)
         return folder
 
-    def _run(self, verb: Verb, out: Path, **how: Any) -> dict[str, Any]:
+    def _run_command(self, verb: Verb, out: Path, **stop: float) -> dict[str, Any]:
+        """Run a command in a process of the server; return its status, message and duration."""
         assert self._server.stdin
         assert self._server.stdout
-        self._server.stdin.write(
-            json.dumps({"words": verb.words_for(self._home, out), **how}) + "\n"
-        )
+        request = {"words": verb.format_arguments(self._home, out), **stop}
+        self._server.stdin.write(json.dumps(request) + "\n")
         self._server.stdin.flush()
         answer: dict[str, Any] = json.loads(self._server.stdout.readline())
         return answer
 
 
 @contextmanager
-def stopper(home: Path, folder: Path) -> Iterator[Stopper]:
-    """A server of processes to stop, for the healthy files in `home`; outputs go into `folder`."""
-    command = [sys.executable, "-W", "ignore", killed.__file__, *_IMPORTED]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as server:
+def open_stopper(home: Path, folder: Path) -> Iterator[Stopper]:
+    """Start a server of processes that can be stopped.
+
+    Args:
+        home: Folder of healthy files.
+        folder: Folder for the outputs of the commands.
+    """
+    module = stopped_index_process.__file__
+    command = [sys.executable, "-W", "ignore", module, *_IMPORTED_MODULES]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as server:
         try:
             yield Stopper(home, folder, server)
         finally:
@@ -248,28 +263,32 @@ def stopper(home: Path, folder: Path) -> Iterator[Stopper]:
 
 
 def run_stops(
-    stops: list[Stop], home: Path, folder: Path, tell: Callable[[Stopped], object] = lambda _: None
-) -> list[Stopped]:
-    """What became of each stop."""
-    found = []
-    with stopper(home, folder) as runner:
+    stops: list[Stop],
+    home: Path,
+    folder: Path,
+    report: Callable[[StopOutcome], object] = lambda _: None,
+) -> list[StopOutcome]:
+    """Run stops and return their outcomes; `report` is called with each of them."""
+    outcomes = []
+    with open_stopper(home, folder) as stopper:
         for stop in stops:
-            found.append(runner.stopped(stop))
-            tell(found[-1])
-    return found
+            outcome = stopper.run(stop)
+            outcomes.append(outcome)
+            report(outcome)
+    return outcomes
 
 
-def files_in(folder: Path) -> dict[str, bytes]:
-    """Path → content of all files of a folder, hidden ones too."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+def read_files(folder: Path) -> dict[str, bytes]:
+    """Return the contents of all files of a folder by their paths, including hidden files."""
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
-def _told(run: Mapping[str, Any]) -> Iterator[str]:
-    """A full disk is one line and status 2; or the run needed no more room than there was."""
+def _find_disk_faults(run: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a fault unless a run on a full disk ends with status 2 and one line of error.
+
+    A run that needed no more space than there was may end with status 0.
+    """
     if run["status"] == 0:
         return
     lines = [line for line in run["message"].splitlines() if line.startswith("error: ")]
@@ -277,26 +296,34 @@ def _told(run: Mapping[str, Any]) -> Iterator[str]:
         yield f"status {run['status']}: {run['message'][-300:]}"
 
 
-def _unwhole(
-    found: Mapping[str, bytes], healthy: Mapping[str, bytes], progress: str
+def _find_unfinished_files(
+    files: Mapping[str, bytes], healthy_files: Mapping[str, bytes], progress: str
 ) -> Iterator[str]:
-    """Files under a final name that are not those of an undisturbed run; what an evaluation resumes
-    from has none.
+    """Yield a fault for each file that has its final name but not its final content.
+
+    The file of the progress must be complete JSON. Temporary files may hold anything.
     """
-    for name, content in found.items():
-        own = any(
-            part.startswith(".") or part.endswith(".unfinished") or part == "locks"
-            for part in name.split("/")
-        )
+    for name, content in files.items():
         if name == progress:
             json.loads(content)
-        elif not own and healthy.get(name) != content:
+        elif not _is_temporary(name) and healthy_files.get(name) != content:
             yield f"{name} is not whole"
 
 
-def _differences(found: Mapping[str, bytes], healthy: Mapping[str, bytes]) -> Iterator[str]:
-    for name in sorted(found.keys() | healthy.keys()):
-        if name not in healthy:
+def _is_temporary(name: str) -> bool:
+    """Return whether a file is hidden, unfinished or a lock, or lies in such a folder."""
+    parts = name.split("/")
+    if "locks" in parts:
+        return True
+    return any(part.startswith(".") or part.endswith(".unfinished") for part in parts)
+
+
+def _find_differences(
+    files: Mapping[str, bytes], healthy_files: Mapping[str, bytes]
+) -> Iterator[str]:
+    """Yield a fault for each file that is left over, missing or different."""
+    for name in sorted(files.keys() | healthy_files.keys()):
+        if name not in healthy_files:
             yield f"{name} is left over"
-        elif found.get(name) != healthy[name]:
+        elif files.get(name) != healthy_files[name]:
             yield f"{name} is unequal"

@@ -1,85 +1,101 @@
-"""What the tables of a small release say, compared with its files as they are read here."""
+"""Comparison of the tables of a small release with its files, as plain readers see them."""
 
-from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from campaign import plain
-from campaign.kind import Room
+from campaign.kind import Output, Workspace
 from deepaccident_devkit import DeepAccident
 
-
-def tables(dataset: DeepAccident) -> dict[str, Any]:
-    """All that the tables say of small files, by the token of the sample or scenario."""
-    read: dict[str, Any] = {
-        each["token"]: (
-            each["velocity"],
-            dataset.boxes(each["token"], frame="lidar", velocity="label"),
-            pose,
-        )
-        for each, pose in zip(dataset.sample, dataset.columns("ego_pose")["matrix"], strict=True)
-    }
-    return read | {each["token"]: each for each in dataset.scenario}
+_ANGLE_TOLERANCE = 1e-6
+"""Distance between two directions on the unit circle."""
 
 
-def judge_tables(room: Room, read: Mapping[str, Any]) -> str | None:
-    """Compare the scenarios that were read with their files."""
-    for token, value in read.items():
+def read_tables(dataset: DeepAccident) -> Output:
+    """Return all that the tables hold of small files, by the token of the sample or scenario."""
+    output: dict[str, Any] = {}
+    poses = dataset.columns("ego_pose")["matrix"]
+    for sample, pose in zip(dataset.sample, poses, strict=True):
+        boxes = dataset.boxes(sample["token"], frame="lidar", velocity="label")
+        output[sample["token"]] = (sample["velocity"], boxes, pose)
+    return output | {scenario["token"]: scenario for scenario in dataset.scenario}
+
+
+def judge_tables(workspace: Workspace, output: Output) -> str | None:
+    """Compare the samples and scenarios that were read with their files."""
+    for token, value in output.items():
         scenario_type, name, *sample = token.split("/")
-        folder = room.tree / scenario_type
-        if not sample:
-            meta = folder / "meta" / f"{name}.txt"
-            fault = (
-                _meta_fault(value, plain.meta(meta)) if meta.is_file() else _known(value["weather"])
-            )
+        folder = workspace.folder / scenario_type
+        if sample:
+            agent, frame = sample
+            fault = _find_sample_fault(value, folder / agent, f"{name}/{name}_{frame}")
         else:
-            stem = f"{name}/{name}_{sample[1]}"
-            velocity, boxes, pose = value
-            label = folder / sample[0] / "label" / f"{stem}.txt"
-            fault = (
-                _label_fault(velocity, boxes, *plain.label(label))
-                if label.is_file()
-                else _known(velocity)
-            )
-            calib = plain.calib(folder / sample[0] / "calib" / f"{stem}.pkl")
-            flipped = plain.LEFT_TO_RIGHT @ calib["ego_to_world"] @ plain.LEFT_TO_RIGHT
-            fault = fault or (None if np.array_equal(pose, flipped.ravel()) else "ego_to_world")
+            fault = _find_scenario_fault(value, folder / "meta" / f"{name}.txt")
         if fault:
             return f"{token}: {fault}"
     return None
 
 
-def _known(value: Any) -> str | None:
-    """A fault if something is known of a file that is not there."""
-    return None if value is None else f"{value}, though the file is not there"
+def _find_sample_fault(sample: tuple[Any, Any, Any], agent_folder: Path, stem: str) -> str | None:
+    """Compare velocity, boxes and pose with the label and calib files."""
+    velocity, boxes, pose = sample
+    label = agent_folder / "label" / f"{stem}.txt"
+    if label.is_file():
+        fault = _find_label_fault(velocity, boxes, *plain.read_label(label))
+    else:
+        fault = _find_missing_file_fault(velocity)
+    calib = plain.read_calib(agent_folder / "calib" / f"{stem}.pkl")
+    expected_pose = plain.LEFT_TO_RIGHT @ calib["ego_to_world"] @ plain.LEFT_TO_RIGHT
+    if fault is None and not np.array_equal(pose, expected_pose.ravel()):
+        return "ego_to_world"
+    return fault
 
 
-def _label_fault(
-    velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list[tuple[Any, ...]]
+def _find_label_fault(
+    velocity: Any, boxes: Any, speed: tuple[float, ...], rows: list[plain.LabelRow]
 ) -> str | None:
     if not np.array_equal(velocity, [speed[0], -speed[1]], equal_nan=True):
         return f"speed {velocity} and not {speed}"
     if len(boxes) != len(rows):
         return f"{len(boxes)} boxes and not {len(rows)}"
     for box, row in zip(boxes, rows, strict=True):
-        same = np.array_equal([*box.center, *box.size], [row[1], -row[2], *row[3:7]])
-        turn = abs(np.exp(1j * box.yaw) - np.exp(-1j * row[7]))
+        category, x, y, z, *size, yaw, _, _, actor_id, point_count, is_visible = row
+        is_same_place = np.array_equal([*box.center, *box.size], [x, -y, z, *size])
+        turn = abs(np.exp(1j * box.yaw) - np.exp(-1j * yaw))
         facts = (box.category, box.actor_id, box.num_lidar_pts, box.camera_visible)
-        if not same or turn > 1e-6 or facts != (row[0], *row[10:]):
+        expected_facts = (category, actor_id, point_count, is_visible)
+        if not is_same_place or turn > _ANGLE_TOLERANCE or facts != expected_facts:
             return f"{box!r} and not {row}"
     return None
 
 
-def _meta_fault(scenario: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
-    first, collision = said["first"], scenario["collision"]
-    expected = (
-        None if "-1" in (first[1], first[3]) else ([int(first[1]), int(first[3])], float(first[5]))
-    )
-    found = None if collision is None else (collision["ids"], collision["impact"])
-    if expected != found:
-        return f"collision {found} and not {expected}"
-    if f"{scenario['weather']}{scenario['time_of_day'] or ''}" != first[0]:
-        return f"weather {scenario['weather']} and not {first[0]}"
-    road = (scenario["road_type"] or "", said.get("road_type", ""))
-    return None if road[0] == road[1] else f"road type {road[0]} and not {road[1]}"
+def _find_scenario_fault(scenario: Output, path: Path) -> str | None:
+    """Compare a scenario with its meta file."""
+    if not path.is_file():
+        return _find_missing_file_fault(scenario["weather"])
+    meta = plain.read_meta(path)
+    words = meta["first"]
+    expected = None
+    if "-1" not in (words[1], words[3]):
+        expected = ([int(words[1]), int(words[3])], float(words[5]))
+    collision = scenario["collision"]
+    if collision is not None:
+        collision = (collision["ids"], collision["impact"])
+    if expected != collision:
+        return f"collision {collision} and not {expected}"
+    if f"{scenario['weather']}{scenario['time_of_day'] or ''}" != words[0]:
+        return f"weather {scenario['weather']} and not {words[0]}"
+    road_type = scenario["road_type"] or ""
+    expected_type = meta.get("road_type", "")
+    if road_type == expected_type:
+        return None
+    return f"road type {road_type} and not {expected_type}"
+
+
+def _find_missing_file_fault(value: Any) -> str | None:
+    """Return a fault if a value is known although its file does not exist."""
+    if value is None:
+        return None
+    return f"{value}, though the file is not there"

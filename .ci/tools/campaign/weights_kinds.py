@@ -1,4 +1,4 @@
-"""Kinds of files that PyTorch is needed for: weights in three formats, and the state of a run."""
+"""Kinds of files that need PyTorch: weights in three formats, and the state of a training run."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -8,94 +8,106 @@ from typing import Any
 import numpy as np
 
 from campaign import plain, weights_mutations
-from campaign.healthy import opened
-from campaign.kind import Action, Kind, Room
+from campaign.healthy import open_release
+from campaign.kind import Action, Kind, Output, Workspace
 
-assert weights_mutations  # made for these
+assert weights_mutations  # importing it registers the mutations for these kinds
 
 
 @cache
-def _network() -> Any:
+def _make_network() -> Any:
+    """Return a network that all cases share."""
     from campaign.healthy_weights import small_network
 
     return small_network()
 
 
-def _read(room: Room) -> dict[str, Any]:
+def _read_weights(workspace: Workspace) -> Output:
     from deepaccident_devkit.plugins.model.checkpoint import read_weights
 
-    return dict(read_weights(room.victim).tensors)
+    return dict(read_weights(workspace.changed_file).tensors)
 
 
-def _loaded(room: Room) -> dict[str, Any]:
-    """Put into a network, as `predict` does it; it has the healthy ones before."""
+def _load_weights(workspace: Workspace) -> Output:
+    """Load weights into a network that has the healthy ones, as `predict` does."""
     import torch
 
     from deepaccident_devkit.plugins.model.checkpoint import load_weights, read_weights
 
     torch.manual_seed(0)
-    network = _network()
-    done = load_weights(network, read_weights(room.victim), whole=True)
+    network = _make_network()
+    report = load_weights(network, read_weights(workspace.changed_file), whole=True)
     state = network.state_dict()
-    done.to_text()
-    return {name: state[name] for name in done.loaded}
+    report.to_text()
+    return {name: state[name] for name in report.loaded}
 
 
-def _judge(room: Room, read: Mapping[str, Any]) -> str | None:
-    if room.victim.suffix == ".safetensors":
-        return _same(read, plain.safetensors(room.victim)[0])
-    return _same(read, plain.checkpoint(room.victim))
+def _judge_weights(workspace: Workspace, tensors: Output) -> str | None:
+    path = workspace.changed_file
+    if path.suffix == ".safetensors":
+        expected, _ = plain.read_safetensors(path)
+    else:
+        expected = plain.read_checkpoint(path)
+    return _find_tensor_fault(tensors, expected)
 
 
-def _same(read: Mapping[str, Any], said: Mapping[str, Any]) -> str | None:
-    """A tensor that differs from a plain reader's; float16 and the like are widened, and names may
-    lose a beginning.
+def _find_tensor_fault(
+    tensors: Output, expected_tensors: Mapping[str, plain.FlatTensor]
+) -> str | None:
+    """Return the first tensor that differs from what a plain reader reads.
+
+    Types such as float16 may be widened, and names may have lost a prefix.
     """
-    for name, tensor in read.items():
+    for name, tensor in tensors.items():
         names = (name, f"module.{name}", name.removeprefix("img_backbone."))
-        there = next((said[each] for each in names if each in said), None)
-        if there is None:
+        known_names = [known_name for known_name in names if known_name in expected_tensors]
+        if not known_names:
             return f"{name[:100]} is not in the file"
-        (shape, found), (same, expected) = (
-            tensor if isinstance(tensor, tuple) else plain.flat(tensor),
-            there,
-        )
-        if shape != same or not np.array_equal(
-            found, expected.astype(found.dtype), equal_nan=found.dtype.kind == "f"
-        ):
+        shape, numbers = tensor if isinstance(tensor, tuple) else plain.flatten(tensor)
+        expected_shape, expected_numbers = expected_tensors[known_names[0]]
+        expected_numbers = expected_numbers.astype(numbers.dtype)
+        is_float = numbers.dtype.kind == "f"
+        is_same = np.array_equal(numbers, expected_numbers, equal_nan=is_float)
+        if shape != expected_shape or not is_same:
             return f"{name[:100]} has another shape or other numbers"
     return None
 
 
-def _resumed(room: Room) -> dict[str, Any]:
-    """Go on with the run, which was at its end: its last weights come out of the state."""
-    from campaign.healthy_weights import TRAINING, trained
+def _resume_run(workspace: Workspace) -> Output:
+    """Resume a complete run, which writes the weights of its state; return them."""
+    from campaign.healthy_weights import TRAINING, train_small_model
 
-    return plain.safetensors(trained(_cameras(room.home), room.tree, TRAINING))[0]
+    dataset = _open_cameras(workspace.home)
+    tensors, _ = plain.read_safetensors(train_small_model(dataset, workspace.folder, TRAINING))
+    return tensors
 
 
 @cache
-def _cameras(home: Path) -> Any:
-    return opened(home / "cameras", home / "index_of_cameras")
+def _open_cameras(home: Path) -> Any:
+    return open_release(home / "cameras", home / "index_of_cameras")
 
 
-def _judge_resumed(room: Room, read: Mapping[str, Any]) -> str | None:
-    if not room.victim.is_file() or plain.safetensors(room.victim)[1].get("step") != 1:
+def _judge_run(workspace: Workspace, tensors: Output) -> str | None:
+    if not workspace.changed_file.is_file():
+        return None
+    expected_tensors, notes = plain.read_safetensors(workspace.changed_file)
+    if notes.get("step") != 1:
         return None  # it began again, and took a step
-    return _same(read, plain.safetensors(room.victim)[0])
+    return _find_tensor_fault(tensors, expected_tensors)
 
 
-_WEIGHTS = (Action(_read, _judge), Action(_loaded, _judge))
+_WEIGHT_ACTIONS = (Action(_read_weights, _judge_weights), Action(_load_weights, _judge_weights))
+_RUN_ACTION = Action(_resume_run, _judge_run)
 KINDS = (
-    Kind("weights", "safetensors", "weights", "*.safetensors", _WEIGHTS, "torch"),
-    Kind("weights of PyTorch", "pt", "weights", "*.pt", _WEIGHTS, "torch"),
-    Kind("weights of old PyTorch", "pth", "weights", "*.pth", _WEIGHTS, "torch"),
+    Kind("weights", "safetensors", "weights", "*.safetensors", _WEIGHT_ACTIONS, "torch"),
+    Kind("weights of PyTorch", "pt", "weights", "*.pt", _WEIGHT_ACTIONS, "torch"),
+    Kind("weights of old PyTorch", "pth", "weights", "*.pth", _WEIGHT_ACTIONS, "torch"),
     Kind(
         "training state",
         "safetensors",
         "run",
         "last.safetensors",
-        (Action(_resumed, _judge_resumed),),
+        (_RUN_ACTION,),
         "torch",
         writes=True,
     ),

@@ -10,5 +10,5 @@ Mutated (`mutants`) are comparisons, arithmetic, signs, numbers, booleans, condi
 raised values, statements that can be left out, keyword arguments, and functions with a twin such
 as `min` and `max`. Not mutated are texts (strings, docstrings, error messages, f-strings),
 annotations, decorators and imports, nor the arguments `strict`, `dtype`, `copy` and `encoding`,
-whose effect no value shows on one machine.
+which have no effect on values on one machine.
 """

@@ -287,28 +287,31 @@ def _tests_to_measure(
     items: Sequence[pytest.Item], records: Mapping[str, Any]
 ) -> list[pytest.Item]:
     """Return the tests without a record, and others that make the remaining session fixtures."""
-    chosen, fixtures = set(), set()
+    chosen_items, fixtures = set(), set()
     durations = {name: record["seconds"] for name, record in records.items()}
     for item in sorted(items, key=lambda item: durations.get(item.nodeid, 0.0)):
         item_fixtures = _session_fixtures(item)
         if item.nodeid not in records or not item_fixtures <= fixtures:
-            chosen.add(item)
+            chosen_items.add(item)
             fixtures |= item_fixtures
-    return [item for item in items if item in chosen]
+    return [item for item in items if item in chosen_items]
 
 
 def _outcome(status: int) -> str:
     """Return the outcome that the wait status of a fork means."""
     if os.WIFSIGNALED(status):
         is_late = os.WTERMSIG(status) in {signal.SIGPROF, signal.SIGALRM}
-        return "timed out" if is_late else "killed"
+        if is_late:
+            return "timed out"
+        return "killed"
     outcomes = {_SURVIVED: "survived", _KILLED: "killed", _NOT_PLANTED: "not planted"}
     return outcomes[os.WEXITSTATUS(status)]
 
 
 def _module_name(path: str) -> str:
     """Return the module name of a file below the package's folder."""
-    return ".".join((PACKAGE.name, *Path(path).with_suffix("").parts)).removesuffix(".__init__")
+    parts = (PACKAGE.name, *Path(path).with_suffix("").parts)
+    return ".".join(parts).removesuffix(".__init__")
 
 
 def _caches() -> list[Any]:
@@ -335,7 +338,8 @@ def _session_fixtures(item: pytest.Item) -> set[str]:
 
 def _test_prefixes(area: str) -> tuple[str, ...]:
     """Return the beginnings of the paths of an area's tests, relative to the repository."""
-    return (*(f"tests/{path}" for path in TESTS[area].split()), f"{PACKAGE.name}/{area}")
+    prefixes = [f"tests/{path}" for path in TESTS[area].split()]
+    return (*prefixes, f"{PACKAGE.name}/{area}")
 
 
 def _area_of(path: str) -> str:

@@ -64,7 +64,7 @@ class Mutant:
         line: Line of the change.
         span: First and last line of the outermost function around it; None outside of functions.
         change: Old and new code.
-        source: Fingerprint of the file, which tells results of another version apart.
+        source: Fingerprint of the file, which distinguishes results of another version.
     """
 
     path: str
@@ -194,7 +194,8 @@ def _augmented(node: ast.AugAssign) -> Iterator[ast.AST]:
 
 
 def _logic(node: ast.BoolOp) -> Iterator[ast.AST]:
-    yield _with(node, op=ast.Or() if isinstance(node.op, ast.And) else ast.And())
+    other_operator = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+    yield _with(node, op=other_operator)
 
 
 def _sign(node: ast.UnaryOp) -> Iterator[ast.AST]:

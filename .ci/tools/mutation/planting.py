@@ -102,7 +102,9 @@ def _adapt_function(old: FunctionType, new: FunctionType) -> bool:
 
 def _changed_value(old: Any, new: Any) -> Any:
     """Return the new value if both are plain and differ, otherwise the old object."""
-    return new if _differ(old, new) else old
+    if _differ(old, new):
+        return new
+    return old
 
 
 def _adapt_class(old: type, new: type, home: str) -> bool:

@@ -1,6 +1,4 @@
-"""Accuracy of predicted accidents, by three protocols: the task `accident`."""
-
-from __future__ import annotations
+"""Accuracy of predicted accidents under three protocols: the task `accident`."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
@@ -61,12 +59,12 @@ AccidentProtocol = ReleasedAccidents | PaperAccidents | BoxAccidents
 PROTOCOLS: Final[Mapping[str, AccidentProtocol]] = MappingProxyType(
     {"released": ReleasedAccidents(), "paper": PaperAccidents(), "boxes": BoxAccidents()}
 )
-"""`released` is what the released code computes, `paper` what the paper's text describes, and
-`boxes` compares with the labels themselves and not with rasters."""
+"""`released` computes what the released code computes, `paper` computes what the paper's text
+describes, and `boxes` compares with the boxes of the labels instead of rasters."""
 
 
 class AccidentEvaluator(Evaluator[AccidentResult]):
-    """Accident prediction accuracy and the errors of the accidents that are foreseen.
+    """Evaluator of accidents: prediction accuracy (APA), and the errors of foreseen accidents.
 
     >>> evaluator = AccidentEvaluator(protocol="released")
     >>> len(evaluator)
@@ -85,13 +83,14 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The protocol and its choices."""
-        return {"protocol": type(self.protocol).__name__, "choices": asdict(self.protocol)}
+        """Names and values of the settings: the protocol and its fields."""
+        protocol_name = type(self.protocol).__name__
+        return {"protocol": protocol_name, "choices": asdict(self.protocol)}
 
     def truth(
         self, dataset: Dataset, token: str, form: Any, horizon: float, /
     ) -> tuple[MotionLabels | None, AccidentContext]:
-        """Return the labels that the protocol compares with, None for none, and the context."""
+        """Return the labels that the protocol compares with (None for `boxes`), and the context."""
         return compared_facts(dataset, token, self.protocol, form, horizon)
 
     def update(
@@ -106,42 +105,47 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         Args:
             token: Token of the sample.
             prediction: Prediction of a model.
-            label: Motion labels of the sample, each frame in its own frame or all at the present.
-                Labels in their own frames are warped to the present with bilinear centres, as the
-                released evaluation does. The protocol `boxes` needs none.
-            context: Other facts on the sample, from `accident_context`, with the truth of `boxes`;
-                None for nothing.
+            label: Motion labels of the sample. Each frame is in its own ego frame, or all are in
+                the current one. In the former case they are warped to the current ego frame with
+                bilinear centres, as the released evaluation does. `boxes` does not need labels.
+            context: Other facts about the sample, from `accident_context`; it contains the truth
+                that `boxes` compares with. None if nothing else is known.
 
         Raises:
-            EvaluationError: the protocol cannot evaluate such a prediction or label, or the sample
-                came before with other counts.
+            EvaluationError: If the protocol cannot evaluate this kind of prediction or label, or
+                the sample was counted before with other counts.
         """
         checked_facts(label, context)
-        counts = self.protocol.counts(
-            checked_prediction(prediction), label, context or AccidentContext()
-        )
+        prediction = checked_prediction(prediction)
+        counts = self.protocol.counts(prediction, label, context or AccidentContext())
         self.add(token, dict(counts))
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
-        """Return the metrics of some samples' counts, in any order."""
+        """Compute the metrics from the counts of samples, in any order."""
         return self.protocol.result(counts)
 
     def sample_row(self, token: str) -> dict[str, Any]:
-        """Return whether an accident comes, cases by distance, and errors at the largest one."""
+        """Return a sample's row: positive or not, cases by distance, errors at the largest one.
+
+        `truth` is the kind of pair that the truth names, one of `NAMED`.
+        """
         result = self.compute([token])
-        truth = next((name for name, count in result.truths.items() if count), None)
-        row: dict[str, Any] = {"positive": bool(result.positives), "truth": truth}
-        for distance, within in result.within.items():
+        row: dict[str, Any] = {"positive": bool(result.positives), "truth": None}
+        for pair_kind, count in result.truths.items():
+            if count:
+                row["truth"] = pair_kind
+                break
+        for distance, accidents_within in result.within.items():
             for case in ("tp", "fp", "fn"):
-                row[f"{case}_{distance:g}m"] = getattr(within, case)
-        widest = result.within[max(result.within)]
+                row[f"{case}_{distance:g}m"] = getattr(accidents_within, case)
+        largest_distance = max(result.within)
         for name in ("position_error", "time_error", "id_error"):
-            error = getattr(widest, name)
+            error = getattr(result.within[largest_distance], name)
             row[name] = None if error is None else float(error)
         return row
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Return fewer counts with the same result."""
+        """Merge the counts into fewer ones that lead to the same result."""
         return self.protocol.pooled(counts)
 
 
@@ -151,16 +155,17 @@ def compared_accidents(
     context: AccidentContext,
     protocol: AccidentProtocol,
 ) -> ComparedAccidents:
-    """Return the accidents that a protocol sees in a prediction and in the truth.
+    """Find the accidents in a prediction and in the truth, by the rules of a protocol.
 
     Args:
         prediction: Prediction of a model, of a kind that `protocol.counts` accepts.
-        label: Motion labels of the sample, where the protocol compares with labels.
-        context: Other facts on the sample.
-        protocol: Rules by which accidents are seen.
+        label: Motion labels of the sample; None if the protocol does not need them.
+        context: Other facts about the sample.
+        protocol: Rules for finding accidents.
 
     Raises:
-        EvaluationError: the prediction is neither motion nor accidents, or the protocol lacks its
-            truth.
+        EvaluationError: If the prediction is neither motion nor accidents, or the truth that the
+            protocol needs is missing.
     """
-    return protocol.compared(checked_prediction(prediction), label, context)
+    prediction = checked_prediction(prediction)
+    return protocol.compared(prediction, label, context)

@@ -1,11 +1,9 @@
-"""Accident metrics for users of alarms: compared with what happens, not with rasters (`boxes`).
+"""Accident metrics for users of alarms: the protocol `boxes` compares with boxes, not with rasters.
 
-The truth is the pair and the moment that the scenario's meta file names, at the positions of the
-labels. Every alarm counts, the truth does not help to choose one, and an alarm that a recording
-cannot refute is not judged.
+The meta file of the scenario names the true pair and time; the labels provide the positions. Every
+alarm counts: none is selected with the help of the truth. An alarm that the recording cannot refute
+is not judged.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
@@ -20,14 +18,14 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     AccidentResult,
     Alarm,
     ComparedAccidents,
+    add_tallies,
     alarms_tally,
     average_precision,
+    classify_pair,
     exact_parts,
-    foreseen,
     hit_of,
-    named,
+    make_alarm,
     tally_result,
-    united,
 )
 from deepaccident_devkit.evaluation.alarms import (
     Pair,
@@ -51,35 +49,36 @@ from deepaccident_devkit.evaluation.truth import (
 )
 from deepaccident_devkit.motion import MotionLabels
 
-# Reasons why nothing of a sample counts, keys of its counts.
+# Keys of a sample's counts that say why the sample does not count at all.
 _SKIP_REASONS = ("at_impact", "unplaced")
-# Keys of the numbers of alarms and samples that do not count.
+# Keys of the numbers of alarms, and of samples, that do not count.
 _UNCOUNTED = ("unjudged", "beyond", *_SKIP_REASONS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxAccidentResult(AccidentResult):
-    """Accident metrics, and numbers on alarms at the distance `ERRORS_AT`.
+    """Accident metrics, including alarm metrics, at the allowed distance `ERRORS_AT`.
 
-    Without any accident to foresee APA and the accuracies are NaN, and the false alarm rate shows
-    how good predictions are.
+    If there is no accident to foresee, APA and the accuracies are NaN; then the false alarm rate
+    shows how good the predictions are.
 
     Attributes:
-        precision: Share of the alarms that foresee a true accident; None without alarms.
-        recall: Share of the true accidents that are foreseen; None without any.
-        average_precision: Mean of the precision over the recall, alarms from the surest on; None
-            likewise.
+        precision: Share of the alarms that foresee a true accident; None if there are no alarms.
+        recall: Share of the true accidents that are foreseen; None if there are none.
+        average_precision: Area under precision over recall, with alarms in descending order of
+            score; None if there are no true accidents.
         false_alarm_rate: Share of the samples without a coming accident that raise an alarm; None
-            without any.
-        lateness: Seconds, mean over the true positives by which the predicted moment is later than
-            the true one, negative if it is earlier; None without any.
-        unjudged: Alarms that nothing can refute: no accident is known, and they are for a time
-            after the recording.
-        beyond: Alarms for later than the horizon, which do not count.
-        at_impact: Samples at the impact itself, where nothing can be foreseen any more; they are
-            left out of all other numbers.
-        unplaced: Samples before an accident without a label of both actors (meta names one
-            that has none, or one twice); left out likewise.
+            if there are no such samples.
+        lateness: Predicted minus true accident time, averaged over the true positives, seconds;
+            negative if predictions are too early, None if there are no true positives.
+        unjudged: Number of alarms that nothing can refute, because no accident is known and they
+            predict one after the recording's end.
+        beyond: Number of alarms that predict an accident beyond the horizon; these are ignored.
+        at_impact: Number of samples at the impact itself, where there is nothing left to foresee;
+            they are left out of all other numbers.
+        unplaced: Number of samples before an accident whose two actors are not both labelled (the
+            meta file names an actor without a label, or the same actor twice); they are left out of
+            all other numbers, too.
     """
 
     precision: float | None
@@ -95,22 +94,24 @@ class BoxAccidentResult(AccidentResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxAccidents:
-    """Accident metrics against the labels' boxes.
+    """Rules of accident metrics that compare with the boxes of the labels.
 
-    A list of `Accident`s is a list of alarms: each is true or false, and the surest one that is
-    near enough to the true accident (the earliest of equally sure ones) is the true positive. K
-    motion predictions are one alarm, scored by the share of them that have an accident. The
-    mean sample (the last) gives place and time, or if it has no accident, the first sample that has
-    one. They are not cut at the recording's end, which a model cannot know. An alarm for later than
-    the horizon does not count, and at the impact itself there is nothing to foresee.
+    Each `Accident` is an alarm. The highest-scoring alarm close enough to the true accident is the
+    true positive (ties: the earliest); all others are false positives.
 
-    An alarm that the recording cannot refute is left out and counted separately. If nobody is near
-    enough to an explicit accident without `ids`, it names the wrong actors.
+    K motion predictions are a single alarm. Its score is the share of the predictions that contain
+    an accident. The mean prediction (the last) sets the positions and the time; if it contains no
+    accident, the first prediction that contains one does.
+
+    Predictions are not cut at the recording's end, which a model cannot know. Alarms that predict
+    an accident beyond the horizon do not count. Samples at the impact are skipped. An alarm that
+    the recording cannot refute is left out and counted separately. An explicit accident without
+    `ids` names the wrong actors if no actors are close enough to its positions.
 
     Attributes:
-        reading: How an accident is read off maps. By the paper's 1 m, the default, traffic side by
-            side collides, since neighbouring cells are 0.5 m apart; at 0.5 m a square contact is
-            missed.
+        reading: How an accident is read off maps. At the paper's 1 m, the default, vehicles driving
+            side by side count as colliding, since neighbouring cells are 0.5 m apart; at 0.5 m, a
+            head-on contact of two straight edges is missed.
     """
 
     reading: AccidentReading = field(default_factory=AccidentReading)
@@ -118,40 +119,41 @@ class BoxAccidents:
     def counts(
         self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext
     ) -> Counts:
-        """Return what one sample adds.
+        """Count one sample.
 
         Args:
-            prediction: Motion in maps, or explicit accidents; an empty list for no alarm.
-            label: Labels that define how far apart in time maps are and where instances lie within
-                their cells; None for the released convention.
+            prediction: Motion in maps, or explicit accidents; an empty list means no alarm.
+            label: Labels that define the time between maps, and where instances lie within their
+                cells; None for the released convention.
             context: Context with `truth`, from `accident_context(dataset, sample, horizon)`.
 
         Returns:
-            `positive`: whether an accident comes; `named`: the actors that the boxes bring nearer
-            to each other than the danger distance (one of `NAMED`); `alarms`: the surest first;
-            `unjudged` and `beyond`: numbers of alarms that were left out, and that do not count;
-            `at_impact` and `unplaced`: whether the impact is now, or comes but cannot be compared
-            with, so that nothing else of the sample counts.
+            `positive`: whether an accident comes; `named`: kind of the nearest pair of boxes within
+            the danger distance (one of `NAMED`); `alarms`: the judged alarms, in descending order
+            of score; `unjudged`: number of alarms that the recording cannot refute; `beyond`:
+            number of alarms that predict an accident beyond the horizon; `at_impact`: whether the
+            sample is at the impact; `unplaced`: whether the coming accident has no known positions.
+            If one of the last two is True, nothing else of the sample counts.
 
         Raises:
-            EvaluationError: the context has no truth, or the prediction is neither maps nor
+            EvaluationError: If the context has no truth, or the prediction is neither maps nor
                 accidents.
         """
-        truth = _truth_of(context)
-        raised = named_alarms(checked_prediction(prediction), label, truth, self.reading)
-        within = within_horizon(raised, truth)
-        judged = []
-        for accident, ids in within:
-            # without an accident to come the recording refutes alarms up to its end only
-            is_refutable = accident.time <= float(truth.time[-1]) + TIME_TOLERANCE_S
-            if truth.accident is not None or is_refutable:
-                judged.append(_alarm(accident, ids, truth))
+        truth = _checked_truth(context)
+        all_alarms = named_alarms(checked_prediction(prediction), label, truth, self.reading)
+        alarms_within_horizon = within_horizon(all_alarms, truth)
+        recording_end = float(truth.time[-1]) + TIME_TOLERANCE_S
+        judged_alarms = []
+        for accident, ids in alarms_within_horizon:
+            # if no accident comes, the recording only refutes alarms up to its end
+            if truth.accident is not None or accident.time <= recording_end:
+                judged_alarms.append(_alarm(accident, ids, truth))
         return {
             "positive": truth.accident is not None,
-            "named": named(truth.nearest_pair(self.reading.danger_distance), context),
-            "alarms": judged,
-            "unjudged": len(within) - len(judged),
-            "beyond": len(raised) - len(within),
+            "named": classify_pair(truth.nearest_pair(self.reading.danger_distance), context),
+            "alarms": judged_alarms,
+            "unjudged": len(alarms_within_horizon) - len(judged_alarms),
+            "beyond": len(all_alarms) - len(alarms_within_horizon),
             "at_impact": truth.accident is not None and truth.accident.time < TIME_TOLERANCE_S,
             "unplaced": truth.is_unplaced,
         }
@@ -162,8 +164,12 @@ class BoxAccidents:
         label: MotionLabels | None,
         context: AccidentContext,
     ) -> ComparedAccidents:
-        """Return the accidents that the protocol sees; raises EvaluationError."""
-        truth = _truth_of(context)
+        """Find the accidents in a prediction and in the truth.
+
+        Raises:
+            EvaluationError: If the context has no truth.
+        """
+        truth = _checked_truth(context)
         alarms = named_alarms(prediction, label, truth, self.reading)
         return ComparedAccidents(
             true=truth.accident,
@@ -172,80 +178,86 @@ class BoxAccidents:
         )
 
     def result(self, counts: Collection[Counts]) -> BoxAccidentResult:
-        """Return the metrics of some samples' counts, in any order."""
-        sums = _united(counts)
-        base = tally_result(sums["tally"], ERRORS_AT)
-        if not base.positives:
-            within = {}
-            for distance, cases in base.within.items():
-                within[distance] = replace(cases, accuracy=math.nan)
-            base = replace(base, apa=math.nan, within=within)
-        values = {field.name: getattr(base, field.name) for field in fields(AccidentResult)}
-        values["notes"] = (*base.notes, *not_counted_notes(sums["unplaced"], sums["beyond"]))
-        cases = base.within[ERRORS_AT]
+        """Compute the metrics from the counts of samples, in any order."""
+        sums = _sum_counts(counts)
+        result = tally_result(sums["tally"], ERRORS_AT)
         area = None
-        if base.positives:
+        if result.positives:
             alarms = np.array(sums["alarms"], dtype=np.float64).reshape(-1, 2)
-            area = average_precision(alarms[:, 0], alarms[:, 1], base.positives)
+            area = average_precision(alarms[:, 0], alarms[:, 1], result.positives)
+        else:
+            within = {}
+            for distance, accidents in result.within.items():
+                within[distance] = replace(accidents, accuracy=math.nan)
+            result = replace(result, apa=math.nan, within=within)
+        values = {field.name: getattr(result, field.name) for field in fields(AccidentResult)}
+        values["notes"] = (*result.notes, *not_counted_notes(sums["unplaced"], sums["beyond"]))
+        values |= {name: sums[name] for name in _UNCOUNTED}
+        tp = result.within[ERRORS_AT].tp
+        fp = result.within[ERRORS_AT].fp
         return BoxAccidentResult(
             **values,
-            precision=_share(cases.tp, cases.tp + cases.fp),
-            recall=_share(cases.tp, base.positives),
+            precision=_share(tp, tp + fp),
+            recall=_share(tp, result.positives),
             average_precision=area,
-            false_alarm_rate=_share(sums["false_samples"], base.negatives),
-            lateness=_share(math.fsum(sums["lateness"]), cases.tp),
-            **{name: sums[name] for name in _UNCOUNTED},
+            false_alarm_rate=_share(sums["false_samples"], result.negatives),
+            lateness=_share(math.fsum(sums["lateness"]), tp),
         )
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        """Return the sums of all counts, which have the same result, with alarms one by one."""
-        return [_united(counts)]
+        """Sum all counts, which leads to the same result; alarms stay separate."""
+        return [_sum_counts(counts)]
 
 
-def _united(counts: Collection[Counts]) -> dict[str, Any]:
-    """Return what samples add, `pooled` ones among them.
+def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
+    """Sum the counts of samples, or sums that `pooled` returned.
 
     Returns:
-        `tally`; `alarms`: [score, whether it is right] of each; `lateness`: terms of the summed
-        lateness of the right alarms; `false_samples`: samples that raise an alarm without a coming
-        accident; and the numbers of `_UNCOUNTED`.
+        `tally`; `alarms`: [score, whether it is correct] of each alarm; `lateness`: floats whose
+        exact sum is the summed lateness of the correct alarms; `false_samples`: number of samples
+        that raise an alarm although no accident comes; and the numbers in `_UNCOUNTED`.
     """
-    parts = []
+    terms = []
     for sample in counts:
-        # runs of earlier versions refused unplaced samples, and so have no such number
+        # earlier versions rejected unplaced samples, so their runs lack this number
         complete = {"unplaced": 0, **sample}
-        parts.append(complete if "tally" in complete else _tallied(complete))
+        terms.append(complete if "tally" in complete else _sample_terms(complete))
     sums: dict[str, Any] = {
-        "tally": united(part["tally"] for part in parts),
-        "alarms": [alarm for part in parts for alarm in part["alarms"]],
-        "lateness": exact_parts(part["lateness"] for part in parts),
+        "tally": add_tallies(term["tally"] for term in terms),
+        "alarms": [alarm for term in terms for alarm in term["alarms"]],
+        "lateness": exact_parts(term["lateness"] for term in terms),
     }
     for name in ("false_samples", *_UNCOUNTED):
-        sums[name] = sum(part[name] for part in parts)
+        sums[name] = sum(term[name] for term in terms)
     return sums
 
 
-def _tallied(sample: Counts) -> dict[str, Any]:
-    """Return what one sample adds, in the form of `_united`."""
-    if any(sample[name] for name in _SKIP_REASONS):
-        skipped: dict[str, Any] = {"tally": united([]), "alarms": [], "lateness": []}
-        skipped |= dict.fromkeys(("false_samples", *_UNCOUNTED), 0)
-        return skipped | {name: int(sample[name]) for name in _SKIP_REASONS}
+def is_skipped(sample: Counts) -> bool:
+    """Return whether a sample does not count at all."""
+    return any(sample.get(name) for name in _SKIP_REASONS)
+
+
+def _sample_terms(sample: Counts) -> dict[str, Any]:
+    """Return what one sample adds to the sums of `_sum_counts`."""
+    terms: dict[str, Any] = dict.fromkeys(("false_samples", *_UNCOUNTED), 0)
+    if is_skipped(sample):
+        for name in _SKIP_REASONS:
+            terms[name] = int(sample[name])
+        return terms | {"tally": add_tallies([]), "alarms": [], "lateness": []}
     alarms: Sequence[Alarm] = sample["alarms"]
     hit = hit_of(alarms, ERRORS_AT) if sample["positive"] else None
-    return {
+    return terms | {
         "tally": alarms_tally(sample, alarms),
         "alarms": [[alarm["score"], alarm is hit] for alarm in alarms],
         "lateness": [] if hit is None else [hit["time"]],
         "false_samples": int(bool(alarms) and not sample["positive"]),
         "unjudged": sample["unjudged"],
         "beyond": sample["beyond"],
-        **dict.fromkeys(_SKIP_REASONS, 0),
     }
 
 
-def _truth_of(context: AccidentContext) -> BoxTruth:
-    """Return the truth of the boxes; raises EvaluationError if there is none."""
+def _checked_truth(context: AccidentContext) -> BoxTruth:
+    """Return the context's truth; raise EvaluationError if it has none."""
     if not isinstance(context.truth, BoxTruth):
         raise EvaluationError(
             "context: the accident protocol 'boxes' needs its truth, the labels' boxes; give "
@@ -255,18 +267,21 @@ def _truth_of(context: AccidentContext) -> BoxTruth:
 
 
 def _alarm(accident: Accident, ids: Pair, truth: BoxTruth) -> dict[str, Any]:
-    """Return an alarm compared with the true accident, if there is one."""
-    true = truth.accident
-    if true is None:
-        return foreseen(score=accident.score)
-    return foreseen(
-        position=position_difference(accident.positions, true.positions),
-        time=accident.time - true.time,
-        id_error=None if true.ids is None else int(set(ids) != set(true.ids)),
+    """Build an alarm, with its differences from the true accident if there is one."""
+    true_accident = truth.accident
+    if true_accident is None:
+        return make_alarm(score=accident.score)
+    id_error = None
+    if true_accident.ids is not None:
+        id_error = int(set(ids) != set(true_accident.ids))
+    return make_alarm(
+        position=position_difference(accident.positions, true_accident.positions),
+        time=accident.time - true_accident.time,
+        id_error=id_error,
         score=accident.score,
     )
 
 
 def _share(part: float, total: float) -> float | None:
-    """Return `part / total`; None if there is nothing to count."""
+    """Return `part / total`; None if the total is 0."""
     return part / total if total else None

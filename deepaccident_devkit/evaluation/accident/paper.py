@@ -1,13 +1,11 @@
-"""Accident metrics as the paper describes them, or where it is silent, as in the released code.
+"""Accident metrics as the paper describes them (protocol `paper`).
 
-The protocol `paper`; docs/protocols.md lists which rule comes from which source.
+Where the paper is silent, the rules in docs/protocols.md apply.
 """
-
-from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident.scoring import (
@@ -16,15 +14,15 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     Alarm,
     ComparedAccidents,
     actor_of,
+    add_tallies,
     alarms_tally,
-    foreseen,
-    named,
+    classify_pair,
+    make_alarm,
     tally_result,
-    united,
 )
 from deepaccident_devkit.evaluation.alarms import (
     MATCH_DISTANCE,
-    by_sureness,
+    alarm_sort_key,
     nearest_two,
     position_difference,
 )
@@ -44,65 +42,67 @@ from deepaccident_devkit.evaluation.predictions import (
     checked_prediction,
     compared_frames,
     first_frames,
-    frames_there,
     labels_at_present,
+    num_recorded_frames,
 )
 from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.motion import MotionHeads, MotionLabels
 from deepaccident_devkit.support.arrays import AnyArray
-from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.text import counted, settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SampleChoice = Literal["best", "mean_first"]
-_NO_LABEL: Final = "label: the accident protocol 'paper' needs the sample's motion labels"
-# Forms of a prediction that are not heads: key in the counts → words in the notes.
-_FORMS: Final[Mapping[str, str]] = {
+_NO_LABEL = "label: the accident protocol 'paper' needs the sample's motion labels"
+# Kinds of predictions other than heads: key in the counts → words in the notes.
+_FORMS: Mapping[str, str] = {
     "instance_maps": "instance maps",
     "explicit": "explicit accidents",
 }
-_SAMPLE_CHOICES: Final[tuple[SampleChoice, ...]] = get_args(SampleChoice)
+_SAMPLE_CHOICES: tuple[SampleChoice, ...] = get_args(SampleChoice)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperAccidents:
-    """The accident metrics of the paper's text.
+    """Rules of accident metrics that follow the paper's text.
 
-    An accident of any of the K predictions counts as predicted. Its positions are at its own
-    moment.
+    An accident in any of the K predictions counts as predicted. Its positions are taken at the
+    predicted time of the accident.
 
     Attributes:
-        reading: How an accident is read off maps, in the truth and in the prediction alike.
-        sample_choice: Which of several predictions with an accident is compared: the `best`,
-            with positions nearest to the truth (as the released code; the first of equal ones), or
-            `mean_first`: that of the mean sample, otherwise the first, which does not use the
-            truth. Both are counted; this one is the result, the other is in `beside`.
+        reading: How an accident is read off maps, both in the truth and in the prediction.
+        sample_choice: Which prediction is compared if several contain an accident. `best`, like the
+            released code, takes the one whose positions are nearest to the truth (ties: the first).
+            `mean_first` does not use the truth: it takes the mean prediction or, if it contains
+            no accident, the first prediction that does. Both choices are counted: the chosen one is
+            the result, and the other is in its `beside`.
     """
 
     labels: ClassVar[str] = "released"
-    """Label protocol of the truth; labels of others are refused."""
+    """Name of the protocol that the labels must follow; others are rejected."""
     reading: AccidentReading = field(default_factory=AccidentReading)
     sample_choice: SampleChoice = "best"
 
     def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError."""
+        """Check the fields; raise ChoiceError if `sample_choice` is not a known name."""
         settle_choices(self, {"sample_choice": _SAMPLE_CHOICES})
 
     def counts(
         self, prediction: Prediction, label: MotionLabels | None, context: AccidentContext
     ) -> Counts:
-        """Return what one sample adds.
+        """Count one sample.
 
-        For heads the truth is the labels as heads, through the same grouping and linking; for
-        instance maps or explicit accidents it is the labels' warped instance map.
+        For heads, the truth is the labels converted to heads, after the same grouping and linking.
+        For instance maps or explicit accidents, it is the warped instance map of the labels.
 
         Returns:
-            `positive`: whether the truth has an accident; `named`: the actors that it names (one of
-            `NAMED`); `instance_maps` and `explicit`: whether the prediction is of that form; `best`
-            and `mean_first`: the alarm that each choice compares, or None.
+            `positive`: whether the truth contains an accident; `named`: the kind of pair that
+            collides in the truth (one of `NAMED`); `instance_maps` and `explicit`: whether the
+            prediction is of this kind; `best` and `mean_first`: the alarm that each choice
+            compares, None if no prediction contains an accident.
 
         Raises:
-            EvaluationError: the prediction is neither motion nor accidents, there are no labels or
-                labels of another protocol, another grid, or too few frames.
+            EvaluationError: If the prediction is neither motion nor accidents, or if the labels are
+                missing, follow another protocol, or have another grid or too few frames.
         """
         if label is None:
             raise EvaluationError(_NO_LABEL)
@@ -112,28 +112,36 @@ class PaperAccidents:
         label = labels_at_present(label)
         maps = self.truth_map(checked, label, frames)
         truth = map_accident(maps, label.config.grid, rules, self.reading)
-        seconds = label.config.step * FRAME_PERIOD
+        step = label.config.step * FRAME_PERIOD
         contact = truth.contact
         actors = None
         if contact is not None:
-            true_maps = [maps[contact.frame] == identity for identity in contact.ids]
-            actors = [actor_of(cells, contact.frame, label, context) for cells in true_maps]
-        alarms: list[Alarm | None] = []
+            masks = [maps[contact.frame] == identity for identity in contact.ids]
+            actors = [actor_of(mask, contact.frame, label, context) for mask in masks]
+        alarms: list[Alarm] = []
+        mean_alarm = None
+        has_instance_maps = False
+        is_explicit = not isinstance(checked, MotionOutput)
         if isinstance(checked, MotionOutput):
+            has_instance_maps = checked.instances is not None
+            # the mean prediction is the last one
             for accident in predicted_accidents(checked, rules, self.reading, frames):
-                alarms.append(_alarm(accident, truth, seconds) if accident.contact else None)
+                mean_alarm = None
+                if accident.contact is not None:
+                    mean_alarm = _alarm(accident, truth, step)
+                    alarms.append(mean_alarm)
         else:
-            for explicit in surest_within(checked, (frames - 0.5) * seconds):
-                alarms.append(explicit_alarm(explicit, truth, actors, seconds=seconds))
-        mean_first = (alarm for alarm in (*alarms[-1:], *alarms[:-1]) if alarm)
+            for explicit_accident in surest_within(checked, (frames - 0.5) * step):
+                alarms.append(explicit_alarm(explicit_accident, truth, actors, seconds=step))
+        first_alarm = alarms[0] if alarms else None
         return {
             "positive": contact is not None,
-            "named": named(actors, context),
-            "instance_maps": isinstance(checked, MotionOutput) and checked.instances is not None,
-            "explicit": not isinstance(checked, MotionOutput),
-            # the first with the least difference of positions; without a truth the first of all
-            "best": min(filter(None, alarms), key=_position_or_zero, default=None),
-            "mean_first": next(mean_first, None),
+            "named": classify_pair(actors, context),
+            "instance_maps": has_instance_maps,
+            "explicit": is_explicit,
+            # smallest position error (ties: the first); without a true accident, the first alarm
+            "best": min(alarms, key=_position_or_zero, default=None),
+            "mean_first": mean_alarm or first_alarm,
         }
 
     def compared(
@@ -142,102 +150,109 @@ class PaperAccidents:
         label: MotionLabels | None,
         _context: AccidentContext,
     ) -> ComparedAccidents:
-        """Return the accidents that the protocol sees; raises EvaluationError."""
+        """Find the accidents in a prediction and in the truth.
+
+        Raises:
+            EvaluationError: If there are no labels.
+        """
         if label is None:
             raise EvaluationError(_NO_LABEL)
         config = label.config
-        frames = frames_there(label)
-        seconds = config.step * FRAME_PERIOD
+        frames = num_recorded_frames(label)
+        step = config.step * FRAME_PERIOD
         maps = self.truth_map(prediction, labels_at_present(label), frames)
         truth = map_accident(maps, config.grid, config.rules, self.reading)
-        true = truth.explicit(seconds)
-        if not isinstance(prediction, MotionOutput):
-            predicted = surest_within(prediction, (frames - 0.5) * seconds)
-            return ComparedAccidents(true=true, predicted=tuple(predicted))
+        true_accident = truth.explicit(step)
         alarms = []
-        for accident in predicted_accidents(prediction, config.rules, self.reading, frames):
-            explicit = accident.explicit(seconds)
-            if explicit is not None:
-                alarms.append(explicit)
-        return ComparedAccidents(true=true, predicted=tuple(alarms))
+        if isinstance(prediction, MotionOutput):
+            for accident in predicted_accidents(prediction, config.rules, self.reading, frames):
+                explicit_accident = accident.explicit(step)
+                if explicit_accident is not None:
+                    alarms.append(explicit_accident)
+        else:
+            alarms = surest_within(prediction, (frames - 0.5) * step)
+        return ComparedAccidents(true=true_accident, predicted=tuple(alarms))
 
     def result(self, counts: Collection[Counts]) -> AccidentResult:
-        """Return the metrics of some samples' counts, in any order."""
-        tallies = _united(counts)
-        result = tally_result(tallies[self.sample_choice], ERRORS_AT)
-        beside = {}
+        """Compute the metrics from the counts of samples, in any order."""
+        sums = _sum_counts(counts)
+        result = tally_result(sums[self.sample_choice], ERRORS_AT)
+        other_results = {}
         for sample_choice in _SAMPLE_CHOICES:
             if sample_choice != self.sample_choice:
-                other = tally_result(tallies[sample_choice], ERRORS_AT)
-                beside[f"sample_choice={sample_choice}"] = other
+                other_result = tally_result(sums[sample_choice], ERRORS_AT)
+                other_results[f"sample_choice={sample_choice}"] = other_result
+        predictions = counted(result.samples, "prediction")
         notes = []
         for form, words in _FORMS.items():
-            if tallies[form]:
+            if sums[form]:
                 notes.append(
-                    f"{tallies[form]} of {result.samples} predictions were given as {words}: their "
-                    "truth is the labels' instance map, not the released grouping and linking of "
-                    "the labels"
+                    f"given as {words}: {sums[form]} of {predictions}. Their truth is the labels' "
+                    "instance map, not the released grouping and linking of the labels"
                 )
-        return replace(result, notes=tuple(notes), beside=beside)
+        return replace(result, notes=tuple(notes), beside=other_results)
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
-        """Return the sums of all counts, which have the same result."""
-        return [{"tallies": _united(counts)}]
+        """Sum all counts, which leads to the same result."""
+        return [{"tallies": _sum_counts(counts)}]
 
     def truth_map(
         self, prediction: MotionOutput | list[Accident], label: MotionLabels, frames: int
     ) -> AnyArray:
         """Return the true instances that a prediction is compared with, shape (T, H, W).
 
-        They are in the orientation of the labels, which must be at the present.
+        They have the orientation of the labels, which must be in the current ego frame.
         """
         if not isinstance(prediction, MotionOutput) or prediction.heads is None:
             return label.instance[:frames]
-        return instances_of_heads(first_frames(MotionHeads.from_labels(label), frames))
+        label_heads = first_frames(MotionHeads.from_labels(label), frames)
+        return instances_of_heads(label_heads)
 
 
-def _united(counts: Collection[Counts]) -> dict[str, Any]:
-    """Return the tally of each choice of a sample, and the number of predictions of each form."""
-    tallies = []
+def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
+    """Sum the tallies of each sample choice, and count the predictions of each kind."""
+    terms = []
     for sample in counts:
-        tallies.append(sample["tallies"] if "tallies" in sample else _tallies(sample))
+        terms.append(sample["tallies"] if "tallies" in sample else _sample_terms(sample))
     sums: dict[str, Any] = {}
     for sample_choice in _SAMPLE_CHOICES:
-        sums[sample_choice] = united(tally[sample_choice] for tally in tallies)
+        sums[sample_choice] = add_tallies(term[sample_choice] for term in terms)
     for form in _FORMS:
-        sums[form] = sum(tally[form] for tally in tallies)
+        sums[form] = sum(term[form] for term in terms)
     return sums
 
 
-def _tallies(sample: Counts) -> dict[str, Any]:
-    """Return the tally of one sample for each choice, and its form."""
-    tallies: dict[str, Any] = {}
+def _sample_terms(sample: Counts) -> dict[str, Any]:
+    """Return what one sample adds to the sums of `_sum_counts`."""
+    terms: dict[str, Any] = {}
     for sample_choice in _SAMPLE_CHOICES:
-        alarms = [sample[sample_choice]] if sample[sample_choice] else []
-        tallies[sample_choice] = alarms_tally(sample, alarms)
+        alarm = sample[sample_choice]
+        terms[sample_choice] = alarms_tally(sample, [alarm] if alarm else [])
     for form in _FORMS:
-        tallies[form] = int(sample[form])
-    return tallies
+        terms[form] = int(sample[form])
+    return terms
 
 
 def _position_or_zero(alarm: Alarm) -> float:
-    """Return an alarm's difference of positions; 0 without a truth."""
+    """Return an alarm's position error, metres; 0 if there is no true accident."""
     return alarm["position"] or 0.0
 
 
 def _alarm(predicted: InstanceAccident, truth: InstanceAccident, seconds: float) -> Alarm:
-    """Return a predicted accident compared with the true one, if there is one.
+    """Compare the accident in a prediction's maps with the one in the labels' maps.
+
+    If either is missing, the differences in the alarm are None.
 
     Args:
         predicted: Accident read off the maps of a prediction.
         truth: Accident read off the maps of the labels.
-        seconds: Seconds from frame to frame.
+        seconds: Seconds from one frame to the next.
     """
     if predicted.contact is None or truth.contact is None:
-        return foreseen()
-    match = match_tracks(predicted.tracks, truth.tracks, MATCH_DISTANCE)
-    matched_ids = {match.get(identity) for identity in predicted.contact.ids}
-    return foreseen(
+        return make_alarm()
+    true_ids = match_tracks(predicted.tracks, truth.tracks, MATCH_DISTANCE)
+    matched_ids = {true_ids.get(identity) for identity in predicted.contact.ids}
+    return make_alarm(
         position=position_difference(predicted.positions, truth.positions),
         time=(predicted.contact.frame - truth.contact.frame) * seconds,
         id_error=int(matched_ids != set(truth.contact.ids)),
@@ -245,13 +260,17 @@ def _alarm(predicted: InstanceAccident, truth: InstanceAccident, seconds: float)
 
 
 def surest_within(accidents: Sequence[Accident], latest: float) -> list[Accident]:
-    """Return the surest explicit accident, since maps show one at most; empty without any.
+    """Return a list with the highest-scoring accident up to a time, or an empty list.
 
-    The earliest of equally sure ones counts. Accidents later than `latest` seconds, the labels'
-    last frame in the recording and half a step, are left out, like the frames of maps.
+    Only one is kept, as maps show at most one (ties: the earliest).
+
+    Args:
+        accidents: Explicit accidents.
+        latest: Time of the last labelled frame of the recording plus half a step, seconds; later
+            accidents are left out, like later frames of maps.
     """
-    within = [accident for accident in accidents if accident.time <= latest]
-    return sorted(within, key=by_sureness)[:1]
+    early_accidents = [accident for accident in accidents if accident.time <= latest]
+    return sorted(early_accidents, key=alarm_sort_key)[:1]
 
 
 def explicit_alarm(
@@ -261,18 +280,20 @@ def explicit_alarm(
     *,
     seconds: float,
 ) -> Alarm:
-    """Return a predicted accident compared with the true one, if there is one.
+    """Compare an explicit predicted accident with the accident in the labels' maps.
+
+    If there is no true accident, the differences in the alarm are None.
 
     Args:
-        predicted: Accident in the present ego frame, like the truth.
+        predicted: Accident in the current ego frame, like the truth.
         truth: Accident read off the labels' maps.
-        actors: Actor ids of the two true instances, None for one that is not known; None without a
+        actors: Actor ids of the two true instances, None for an unknown id; None if there is no
             true accident.
-        seconds: Seconds from frame to frame of the maps.
+        seconds: Seconds from one map to the next.
     """
     if truth.contact is None:
-        return foreseen()
-    return foreseen(
+        return make_alarm()
+    return make_alarm(
         position=position_difference(predicted.positions, truth.positions),
         time=predicted.time - truth.contact.frame * seconds,
         id_error=_id_error(predicted, truth, actors, seconds),
@@ -285,16 +306,21 @@ def _id_error(
     actors: Sequence[int | None] | None,
     seconds: float,
 ) -> int | None:
-    """Return 1 if other actors than the two true ones are named; None if their ids are not known.
+    """Return 0 if the prediction names the two true actors, otherwise 1; None if unknown.
 
-    Without `ids` an accident names the instances nearest to its positions, up to `MATCH_DISTANCE`.
+    An accident without `ids` names the instances nearest to its positions, up to `MATCH_DISTANCE`.
+    It is unknown if there is no true accident, or an actor id is needed but unknown.
     """
     if truth.contact is None or actors is None:
         return None
-    if predicted.ids is not None:
-        return None if None in actors else int(set(predicted.ids) != set(actors))
-    frame = min(round(predicted.time / seconds), len(truth.tracks.center) - 1)
-    nearest = nearest_two(
-        predicted.positions, truth.tracks.identity, truth.tracks.center[frame], MATCH_DISTANCE
-    )
-    return int(set(nearest) != set(truth.contact.ids))
+    if predicted.ids is None:
+        last_frame = len(truth.tracks.center) - 1
+        frame = min(round(predicted.time / seconds), last_frame)
+        centers = truth.tracks.center[frame]
+        nearest_ids = nearest_two(
+            predicted.positions, truth.tracks.identity, centers, MATCH_DISTANCE
+        )
+        return int(set(nearest_ids) != set(truth.contact.ids))
+    if None in actors:
+        return None
+    return int(set(predicted.ids) != set(actors))

@@ -1,4 +1,4 @@
-"""From foreseen and true accidents to counts, tallies and results, for all protocols."""
+"""Counts, tallies and results of accident metrics, shared by all protocols."""
 
 from __future__ import annotations
 
@@ -21,45 +21,44 @@ from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.support.arrays import BoolArray, ShortRepr
 
 DISTANCES: Final = (5.0, 10.0, 15.0)
-"""The largest position differences of a predicted accident, metres."""
-# The actors that the truth of a sample names: the pair of the meta file, another pair, nobody; or
-# the pair is unknown.
+"""Allowed position errors of a predicted accident, metres."""
+# Which pair collides in the truth of a sample: the pair of the meta file, another pair, none, or a
+# pair with an unknown id.
 NAMED: Final = ("meta", "another", "none", "unknown")
-# Metres: in `paper` and `boxes` the errors are means over the true positives within this distance.
+# In `paper` and `boxes`, errors are averaged over the true positives within this distance, metres.
 ERRORS_AT: Final = 10.0
 ACCIDENT_ERRORS: Final = ("id", "position", "time")
-_CASES: Final = ("tp", "fp", "fn")
-# Length of the numbers of one distance in a tally: cases, then known errors.
-_NUMBERS_PER_DISTANCE: Final = len(_CASES) + len(ACCIDENT_ERRORS)
-# `numbers`: numbers of samples and of positives, numbers by `NAMED`, and for each of `DISTANCES`
-# the numbers of true positives, false positives and missed accidents, and of known errors by
-# `ACCIDENT_ERRORS`; `errors`: for each distance and error floats with the same exact sum as all
-# errors. Flat, since breakdowns add up thousands, and as JSON can hold it.
+_CASES = ("tp", "fp", "fn")
+# Number of entries of a tally for one distance: cases, then known errors.
+_NUMBERS_PER_DISTANCE = len(_CASES) + len(ACCIDENT_ERRORS)
+# `numbers`: number of samples, number of positives, numbers by `NAMED`; then for each of
+# `DISTANCES` the numbers of true positives, false positives and missed accidents, and of known
+# errors by `ACCIDENT_ERRORS`. `errors`: for each distance and error, floats with the same exact sum
+# as all errors. A tally is flat and JSON-compatible, since breakdowns add up thousands of them.
 _Tally = Mapping[str, Any]
-_EMPTY_TALLY: Final[_Tally] = {
+_EMPTY_TALLY: _Tally = {
     "numbers": [0] * (2 + len(NAMED) + len(DISTANCES) * _NUMBERS_PER_DISTANCE),
     "errors": [[]] * (len(DISTANCES) * len(ACCIDENT_ERRORS)),
 }
-# A foreseen accident as counts hold it: differences from the truth in `position` (metres), `time`
-# (seconds, positive if later) and `id` (0 the same two actors, 1 others); None where there is no
-# truth or the value is not known.
+# A foreseen accident in counts: its differences from the truth in `position` (metres), `time`
+# (seconds, positive if later) and `id` (0 for the same two actors, 1 for others). A difference is
+# None if there is no true accident or the value is unknown.
 Alarm = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccidentsWithin(ShortRepr):
-    """Accidents counted with one distance allowed.
+    """Numbers of accidents, and their errors, at one allowed distance.
 
     Attributes:
-        distance: Allowed distance, metres.
-        tp: Predicted within the distance.
-        fp: Predicted elsewhere, or without a true accident.
-        fn: Missed.
-        accuracy: tp / (tp + fp / 2 + fn / 2); NaN where nothing is counted.
-        id_error: Share of the true positives that name other actors; None if the protocol has no
-            value.
-        position_error: Mean over the true positives, metres; None likewise.
-        time_error: Mean over the true positives, seconds; None likewise.
+        distance: Allowed position error, metres.
+        tp: Number of true accidents that are predicted within the distance.
+        fp: Number of predicted accidents that are too far from a true one, or have no true one.
+        fn: Number of true accidents that are missed.
+        accuracy: tp / (tp + fp / 2 + fn / 2); NaN if all three are 0.
+        id_error: Share of the true positives that name other actors; None if no value is known.
+        position_error: Mean over the true positives, metres; None if no value is known.
+        time_error: Mean over the true positives, seconds; None if no value is known.
     """
 
     distance: float
@@ -74,22 +73,21 @@ class AccidentsWithin(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccidentResult(TaskResult):
-    """Accident metrics of some samples.
+    """Accident metrics of a set of samples.
 
     Attributes:
-        within: Numbers by the distance allowed (`DISTANCES`).
-        apa: Accident prediction accuracy, the mean of the accuracies; in [0, 1], NaN where nothing
-            is counted.
-        id_error: Share of the true positives that name other actors; None where the protocol has no
-            value.
-        position_error: Metres; None likewise.
-        time_error: Seconds; None likewise.
+        within: Allowed distance in metres (`DISTANCES`) → numbers at this distance.
+        apa: Accident prediction accuracy: the mean of the accuracies at all distances, in [0, 1];
+            NaN if there is nothing to count.
+        id_error: Share of the true positives that name other actors; None if no value is known.
+        position_error: Mean over the true positives, metres; None if no value is known.
+        time_error: Mean over the true positives, seconds; None if no value is known.
         samples: Number of samples.
         positives: Number of samples with a true accident.
-        negatives: Number of the other samples.
-        truths: Actors that the samples' truths name, counts by `NAMED`.
-        notes: Sentences that a reader of the numbers should know.
-        beside: Results of other choices that are always printed too, by `name=value`.
+        negatives: Number of samples without a true accident.
+        truths: Which pair collides in the truth (`NAMED`) → number of samples.
+        notes: Caveats that belong next to the numbers, one sentence each.
+        beside: Results with other settings, which are always printed too; keys are `name=value`.
     """
 
     rows: ClassVar[tuple[Row, ...]] = (
@@ -119,13 +117,13 @@ class AccidentResult(TaskResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedAccidents(ShortRepr):
-    """The accidents of one sample, in the present ego frame; accidents read off maps have no `ids`.
+    """The accidents of one sample, in the current ego frame; accidents read off maps have no `ids`.
 
     Attributes:
-        true: The accident to come, by the protocol; None without one.
-        predicted: The foreseen accidents, one for each alarm, or for each prediction with one.
-        unplaced: Seconds to an impact within the horizon without a known position
-            (`BoxTruth.unplaced`); None without one.
+        true: The true accident to come, as the protocol defines it; None if there is none.
+        predicted: The predicted accidents: one per alarm, or one per prediction that contains one.
+        unplaced: Seconds to an impact within the horizon whose position is unknown
+            (`BoxTruth.unplaced`); None if there is none.
     """
 
     true: Accident | None
@@ -134,12 +132,12 @@ class ComparedAccidents(ShortRepr):
 
 
 def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> _Tally:
-    """Return the tally of one sample.
+    """Build the tally of one sample.
 
     Args:
         sample: Counts of the sample; only `positive` and `named` are read.
-        within: For each distance the numbers `tp`, `fp` and `fn`, and lists of the known values of
-            each of `ACCIDENT_ERRORS`.
+        within: For each of `DISTANCES`, the numbers `tp`, `fp` and `fn`, and for each of
+            `ACCIDENT_ERRORS` a list of the known values.
     """
     numbers = [1, int(sample["positive"])]
     numbers += [int(sample["named"] == name) for name in NAMED]
@@ -152,11 +150,11 @@ def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> _Tally:
     return {"numbers": numbers, "errors": errors}
 
 
-def united(tallies: Iterable[_Tally]) -> _Tally:
-    """Return the joint tally of several."""
-    parts = [_EMPTY_TALLY, *tallies]
-    number_columns = zip(*(tally["numbers"] for tally in parts), strict=True)
-    error_columns = zip(*(tally["errors"] for tally in parts), strict=True)
+def add_tallies(tallies: Iterable[_Tally]) -> _Tally:
+    """Add up tallies; the sum of none has only zeros."""
+    tallies = [_EMPTY_TALLY, *tallies]
+    number_columns = zip(*(tally["numbers"] for tally in tallies), strict=True)
+    error_columns = zip(*(tally["errors"] for tally in tallies), strict=True)
     return {
         "numbers": [sum(column) for column in number_columns],
         "errors": [exact_parts(column) for column in error_columns],
@@ -164,33 +162,35 @@ def united(tallies: Iterable[_Tally]) -> _Tally:
 
 
 def exact_parts(numbers: Iterable[Iterable[float]]) -> list[float]:
-    """Return a few floats with the exact sum of many: the rounded sum, then the remainders."""
-    remainder = [*chain.from_iterable(numbers)]
+    """Return a few floats with the exact sum of many: first the rounded sum, then remainders."""
+    remaining_terms = [*chain.from_iterable(numbers)]
     parts = []
-    while part := math.fsum(remainder):
+    while part := math.fsum(remaining_terms):
         parts.append(part)
-        if not math.isfinite(part):  # nothing remains of it, and nothing makes it 0
+        if not math.isfinite(part):  # no remainder of inf or NaN is 0
             break
-        remainder.append(-part)
+        remaining_terms.append(-part)
     return parts
 
 
 def tally_result(tally: _Tally, errors_at: float) -> AccidentResult:
-    """Return the metrics of a tally.
+    """Compute the metrics from a tally.
 
     Args:
-        tally: Joint tally of all samples.
-        errors_at: One of `DISTANCES`, metres; the errors are computed from the true positives at
+        tally: Summed tally of all samples.
+        errors_at: One of `DISTANCES`, metres; errors are averaged over the true positives within
             this distance.
     """
     samples, positives, *numbers = tally["numbers"]
     within = {}
     for index, distance in enumerate(DISTANCES):
         first_number = len(NAMED) + index * _NUMBERS_PER_DISTANCE
+        distance_numbers = numbers[first_number : first_number + _NUMBERS_PER_DISTANCE]
         first_error = index * len(ACCIDENT_ERRORS)
-        within[distance] = _within(distance, numbers[first_number:], tally["errors"][first_error:])
+        distance_errors = tally["errors"][first_error : first_error + len(ACCIDENT_ERRORS)]
+        within[distance] = _accidents_within(distance, distance_numbers, distance_errors)
     errors = within[errors_at]
-    accuracies = [cases.accuracy for cases in within.values()]
+    accuracies = [accidents.accuracy for accidents in within.values()]
     return AccidentResult(
         within=within,
         apa=math.fsum(accuracies) / len(within),
@@ -204,28 +204,29 @@ def tally_result(tally: _Tally, errors_at: float) -> AccidentResult:
     )
 
 
-def _within(
+def _accidents_within(
     distance: float, numbers: Sequence[int], errors: Sequence[Sequence[float]]
 ) -> AccidentsWithin:
-    """Return the numbers of one distance from the head of `numbers` and `errors`."""
-    tp, fp, fn, *error_counts = numbers[:_NUMBERS_PER_DISTANCE]
+    """Compute the numbers at one distance from its part of a tally's `numbers` and `errors`."""
+    tp, fp, fn, *error_counts = numbers
     means = []
-    for parts, count in zip(errors, error_counts, strict=False):
-        means.append(math.fsum(parts) / count if count else None)
+    for terms, count in zip(errors, error_counts, strict=True):
+        means.append(math.fsum(terms) / count if count else None)
+    id_error, position_error, time_error = means
     return AccidentsWithin(
         distance=distance,
         tp=tp,
         fp=fp,
         fn=fn,
         accuracy=prediction_accuracy(tp, fp, fn),
-        id_error=means[0],
-        position_error=means[1],
-        time_error=means[2],
+        id_error=id_error,
+        position_error=position_error,
+        time_error=time_error,
     )
 
 
 def average_precision(scores: ArrayLike, is_right: ArrayLike, positives: int) -> float:
-    """Return the area under the steps of precision over recall; alarms of equal score are one step.
+    """Return the area under the steps of precision over recall; alarms with one score share a step.
 
     Recall that no alarm reaches adds nothing, as in `sklearn.metrics.average_precision_score`.
 
@@ -233,113 +234,121 @@ def average_precision(scores: ArrayLike, is_right: ArrayLike, positives: int) ->
     0.8333333333333333
 
     Args:
-        scores: (N,) scores of the alarms, higher is surer.
-        is_right: (N,) whether each alarm is right.
+        scores: (N,) scores of the alarms; higher means more certain.
+        is_right: (N,) bool, True for correct alarms.
         positives: Number of true accidents, at least 1.
 
     Returns:
-        A share in [0, 1]; 0 without alarms.
+        The average precision in [0, 1]; 0 if there are no alarms.
     """
     score = np.asarray(scores, dtype=np.float64)
-    true = np.asarray(is_right, dtype=np.float64)
+    right_weight = np.asarray(is_right, dtype=np.float64)
     if not len(score):
         return 0.0
     steps = np.unique(-score)
     step_index = np.searchsorted(steps, -score)
-    raised = np.bincount(step_index, minlength=len(steps))
-    right = np.bincount(step_index, true, len(steps))
-    precision = np.cumsum(right) / np.cumsum(raised)
-    return math.fsum((right / positives * precision).tolist())
+    alarm_counts = np.bincount(step_index, minlength=len(steps))
+    right_counts = np.bincount(step_index, right_weight, len(steps))
+    precision = np.cumsum(right_counts) / np.cumsum(alarm_counts)
+    recall_steps = right_counts / positives
+    return math.fsum((recall_steps * precision).tolist())
 
 
 def hit_of(alarms: Sequence[Alarm], distance: float) -> Alarm | None:
-    """Return the first alarm that foresees the true accident nearer than a distance; or None."""
+    """Return the first alarm nearer to the true accident than `distance`; None if there is none."""
     for alarm in alarms:
         if alarm["position"] is not None and alarm["position"] < distance - TIE:
             return alarm
     return None
 
 
-def foreseen(
+def make_alarm(
     position: float | None = None,
     time: float | None = None,
     id_error: int | None = None,
     **extra: float,
 ) -> dict[str, Any]:
-    """Return an `Alarm` with its position rounded so that values within `TIE` compare equal.
+    """Build an `Alarm`; its position error is rounded so that values within `TIE` compare equal.
 
     Args:
-        position: Difference of positions, metres.
-        time: Difference of times, seconds.
-        id_error: 0 if it names the same actors, otherwise 1.
-        **extra: Values that are stored with it.
+        position: Position error, metres; None if there is no true accident.
+        time: Time error, seconds, positive if the prediction is later; None if there is none.
+        id_error: 0 if the alarm names the true actors, otherwise 1; None if unknown.
+        **extra: Further values to store in the alarm.
     """
-    position = None if position is None else float(even(np.asarray(position)))
+    if position is not None:
+        position = float(even(np.asarray(position)))
     return {"position": position, "time": time, "id": id_error, **extra}
 
 
-def named(pair: Iterable[int | None] | None, context: AccidentContext) -> str:
-    """Return the actors that a truth names, one of `NAMED`.
+def classify_pair(pair: Iterable[int | None] | None, context: AccidentContext) -> str:
+    """Return which pair collides in the truth, one of `NAMED`.
 
     Args:
-        pair: Actor ids, None for one that is not known; None for no accident.
-        context: Context of the sample.
+        pair: Actor ids of the pair, None for an unknown id; None if there is no accident.
+        context: Context of the sample, which has the pair of the meta file.
     """
     if pair is None:
         return "none"
     actors = set(pair)
     if not context.known or None in actors:
         return "unknown"
-    return "meta" if context.pair is not None and actors == set(context.pair) else "another"
+    if context.pair is not None and actors == set(context.pair):
+        return "meta"
+    return "another"
 
 
 def alarms_tally(sample: Counts, alarms: Sequence[Alarm]) -> _Tally:
-    """Return what one sample adds.
+    """Build the tally of one sample from its alarms.
 
-    An accident foreseen elsewhere is a false positive and leaves the true one missed.
+    If an accident is foreseen in the wrong place, it is a false positive, and the true accident is
+    missed.
 
     Args:
         sample: Counts of the sample; only `positive` and `named` are read.
-        alarms: Its alarms, the most important one first.
+        alarms: Alarms of the sample, the most important one first.
     """
     within = [_cases_within(sample, alarms, distance) for distance in DISTANCES]
     return sample_tally(sample, within)
 
 
 def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float) -> dict[str, Any]:
-    """Return the cases of one sample with a distance allowed, and the known errors."""
+    """Return the cases and the known errors of one sample at one allowed distance."""
     hit = hit_of(alarms, distance) if sample["positive"] else None
-    cases: dict[str, Any] = {
-        "tp": int(hit is not None),
-        "fp": len(alarms) - int(hit is not None),
-        "fn": int(sample["positive"] and hit is None),
-    }
+    cases: dict[str, Any] = {name: [] for name in ACCIDENT_ERRORS}
+    if hit is None:
+        return cases | {"tp": 0, "fp": len(alarms), "fn": int(sample["positive"])}
     for name in ACCIDENT_ERRORS:
-        cases[name] = [] if hit is None or hit[name] is None else [abs(hit[name])]
-    return cases
+        if hit[name] is not None:
+            cases[name].append(abs(hit[name]))
+    return cases | {"tp": 1, "fp": len(alarms) - 1, "fn": 0}
 
 
 def actor_of(
     cells: BoolArray, frame: int, label: MotionLabels, context: AccidentContext
 ) -> int | None:
-    """Return the actor to which most of an instance's labelled cells belong.
+    """Return the actor that most of an instance's labelled cells belong to.
 
-    Of equal ones it is the actor that was rasterised first.
+    If actors have the same number of cells, the one that was rasterised first is returned.
 
     Args:
-        cells: (H, W) cells of the instance, in the label's orientation.
-        frame: Frame of the label.
+        cells: (H, W) mask of the instance, in the label's orientation.
+        frame: Index of the frame of the label.
         label: Label of the sample.
-        context: Context, which has the actor id of the label's own box.
+        context: Context, which has the actor id of the agent that recorded the label.
 
     Returns:
-        Actor id; None if no cell is labelled, or if the agent of the label is not known.
+        Actor id; None if no cell is labelled, or if most cells belong to the recording agent and
+        its actor id is unknown.
     """
-    drawn = label.instance[frame][cells]
-    instances, counts = np.unique(drawn[drawn > 0], return_counts=True)
+    labelled_instances = label.instance[frame][cells]
+    instances, counts = np.unique(labelled_instances, return_counts=True)
+    counts = counts[instances > 0]
+    instances = instances[instances > 0]
     if not len(instances):
         return None
-    largest = int(instances[np.argmax(counts)])
-    actors = (actor for actor, instance in label.id_map.items() if instance == largest)
-    actor = next(actors, None)
-    return context.own_actor_id if actor == OWN_BOX_ID else actor
+    largest_instance = instances[np.argmax(counts)]
+    for actor, instance in label.id_map.items():
+        if instance == largest_instance:
+            return context.own_actor_id if actor == OWN_BOX_ID else actor
+    return None

@@ -1,6 +1,4 @@
-"""The task `detection`: average precision and errors of boxes, by the released rules and others."""
-
-from __future__ import annotations
+"""The task `detection`: average precision and errors of boxes under the released or other rules."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -22,7 +20,8 @@ from deepaccident_devkit.evaluation.detection.boxes import (
 from deepaccident_devkit.evaluation.detection.curves import average_precision
 from deepaccident_devkit.evaluation.detection.matching import (
     Ring,
-    boxes_taken,
+    existing_detections,
+    existing_truth,
     frame_counts,
     nearest_by_score,
     nearest_by_truth,
@@ -54,7 +53,7 @@ __all__ = [
 
 
 class DetectionEvaluator(Evaluator[DetectionResult]):
-    """Average precision and errors of detected boxes, from matches that are counted by sample.
+    """Evaluator of detected boxes: average precision and errors, from the matches of each sample.
 
     ```python
     evaluator = DetectionEvaluator("paper")
@@ -64,7 +63,7 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
     ```
 
     Attributes:
-        protocol: Rules, with the switches that were passed.
+        protocol: Rules of the evaluation, with the switches applied.
     """
 
     task = "detection"
@@ -78,26 +77,27 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
     protocol: DetectionProtocol
 
     def __init__(self, protocol: str | DetectionProtocol = "released", **switches: Any) -> None:
-        """Start without samples.
+        """Create an evaluator without samples.
 
         Args:
-            protocol: `released` (its distance_mAP), `released_iou` (its iou_mAP), `paper`,
-                `opencood`, or your own.
+            protocol: `released` (the released code's distance_mAP), `released_iou` (its iou_mAP),
+                `paper`, `opencood`, or your own `DetectionProtocol`.
             **switches: Fields of `DetectionProtocol` to change.
 
         Raises:
-            ChoiceError: no such protocol, switch or choice.
-            ConfigError: choices that exclude each other.
+            ChoiceError: If the protocol, a switch or a choice does not exist.
+            ConfigError: If choices exclude each other.
         """
-        super().__init__(detection_protocol(protocol, **switches))
+        switched_protocol = detection_protocol(protocol, **switches)
+        super().__init__(switched_protocol)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The protocol's choices."""
+        """Names and values of the protocol's fields."""
         return self.protocol.as_dict()
 
     def read(self, results: Any, dataset: Dataset, token: str) -> DetectedBoxes:
-        """Return the boxes, which results hold in the world, in the protocol's frame."""
+        """Read a sample's boxes, and transform them from the world to the protocol's frame."""
         boxes: DetectedBoxes = results.prediction(token)
         frame = self.protocol.frame
         return boxes.transform(dataset.world_from(token, frame).inverse(), frame)
@@ -112,46 +112,48 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         Args:
             token: Token of the sample.
             prediction: Detections in the protocol's frame; may be empty.
-            truth: True boxes in that frame, from `detection_truth`; the protocol's own box, area
-                and ranges are applied here.
+            truth: True boxes in the protocol's frame, from `detection_truth`. The protocol's rules
+                for the agent's own box, the area and the ranges are applied here.
 
         Raises:
-            GeometryError: the truth is not of boxes, or boxes are in another frame.
-            EvaluationError: the prediction is not of boxes, or the sample came before with another
-                result.
+            GeometryError: If the truth is not `Boxes`, or boxes are in another frame.
+            EvaluationError: If the prediction is not `DetectedBoxes`, or the sample was counted
+                before with other counts.
         """
         frame = self.protocol.frame
         if not isinstance(prediction, DetectedBoxes):
             raise EvaluationError(
                 f"{token}: expected DetectedBoxes as the prediction, found "
-                f"{type(prediction).__name__}; make them with "
-                f"DetectedBoxes.from_arrays(center, size, yaw, scores, frame={frame!r}), of no "
-                "rows where nothing is detected"
+                f"{type(prediction).__name__}; make them with DetectedBoxes.from_arrays(center, "
+                f"size, yaw, scores, frame={frame!r}), with arrays of no rows if nothing is "
+                "detected"
             )
         true_boxes = checked_boxes("truth", truth)
         for name, boxes in (("prediction", prediction.boxes), ("truth", true_boxes)):
             if boxes.frame != frame:
                 raise GeometryError(
-                    f"{token}: {name} in frame {boxes.frame!r}, the protocol counts in {frame!r}; "
-                    "transform them, or choose frame="
+                    f"{token}: {name} in frame {boxes.frame!r}, but the protocol evaluates in "
+                    f"{frame!r}; transform them, or choose frame="
                 )
         detections = columns_of(prediction.boxes, prediction.scores)
         counts = frame_counts(detections, columns_of(truth), self.protocol)
         self.add(token, {"token": token, **counts})
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
-        """Return the metrics of some samples' counts, in any order."""
+        """Compute the metrics from the counts of samples, in any order."""
         return detection_result(counts, self.protocol)
 
     def sample_row(self, token: str) -> dict[str, int]:
-        """Return the numbers of boxes that count, and true positives by threshold.
+        """Return a sample's row: how many boxes count, and true positives at each threshold.
 
-        They are sums over all classes and ranges.
+        The numbers are summed over all classes and ranges.
         """
         counts = self._counts[token]
+        tp_cells = counts["tp"][0]
+        detection_groups = counts["detections"][0]
         thresholds = self.protocol.thresholds
-        hits = Counter(cell % len(thresholds) for cell in counts["tp"][0])
-        row = {"truths": sum(counts["truths"]), "detections": len(counts["detections"][0])}
+        hits = Counter(cell % len(thresholds) for cell in tp_cells)
+        row = {"truths": sum(counts["truths"]), "detections": len(detection_groups)}
         for level, threshold in enumerate(thresholds):
             row[f"tp_{threshold:g}"] = hits[level]
         return row
@@ -161,27 +163,28 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
     ) -> Iterator[DetectionResult]:
         """Yield the result of each draw (`Evaluator.resampled`).
 
-        What does not depend on the draw is computed once.
+        Whatever does not depend on the draw is computed only once.
         """
-        owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        part_sizes = [len(part) for part in parts]
+        part_index = np.repeat(np.arange(len(parts)), part_sizes)
         ledger = Ledger([counts for part in parts for counts in part], self.protocol)
-        sample_owner = owner[ledger.order]
-        yield from drawn_results(ledger, self.protocol, times[:, sample_owner].astype(np.int32))
+        sample_times = times[:, part_index[ledger.order]]
+        yield from drawn_results(ledger, self.protocol, sample_times.astype(np.int32))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DetectionMatches(FrozenArrays):
-    """The matches of one sample at one threshold, with all detections, as rows of the boxes.
+    """The matches of one sample at one threshold, as indices of detections and of true boxes.
 
-    Boxes that do not count (beyond the protocol's area and ranges, of other classes, or matched
-    with such boxes) are in no array.
+    Boxes that do not count are left out: boxes outside the protocol's area and ranges, boxes of
+    other classes, and boxes that are matched with one of these.
 
     Attributes:
-        threshold: Metres or a share, one of the protocol's.
-        detection: (M,) int64 detections that are true positives.
-        truth: (M,) int64 true box of each.
-        false: (F,) int64 detections without a true box.
-        missed: (G,) int64 true boxes without a detection.
+        threshold: One of the protocol's thresholds, metres or a share.
+        detection: (M,) int64 indices of the detections that are true positives.
+        truth: (M,) int64 index of the true box of each of these detections.
+        false: (F,) int64 indices of the false positives.
+        missed: (G,) int64 indices of the missed true boxes.
     """
 
     threshold: float
@@ -201,54 +204,57 @@ def detection_matches(
 
     Args:
         prediction: Detections in the protocol's frame.
-        truth: True boxes in that frame, from `detection_truth`.
+        truth: True boxes in the protocol's frame, from `detection_truth`.
         protocol: Name of a protocol, or a protocol.
-        threshold: One of the protocol's thresholds; None for that of its errors, otherwise the
-            middle one.
+        threshold: One of the protocol's thresholds; None takes its `error_threshold` or, if it has
+            none, the middle threshold.
 
     Raises:
-        ChoiceError: no such protocol, or not one of its thresholds.
+        ChoiceError: If the protocol does not exist, or does not have this threshold.
     """
     rules = detection_protocol(protocol)
-    middle = rules.thresholds[len(rules.thresholds) // 2]
-    used_threshold = threshold or rules.error_threshold or middle
+    middle_threshold = rules.thresholds[len(rules.thresholds) // 2]
+    used_threshold = threshold or rules.error_threshold or middle_threshold
     if used_threshold not in rules.thresholds:
         raise ChoiceError(
             f"threshold: expected one of {', '.join(map(str, rules.thresholds))}, found "
             f"{threshold!r}"
         )
     level = rules.thresholds.index(used_threshold)
-    detected = columns_of(prediction.boxes, prediction.scores)
-    true = columns_of(truth)
-    (detected, rows), (true, true_rows) = boxes_taken(detected, true, rules)
-    pairs: list[tuple[int, int]] = []
+    all_detections = columns_of(prediction.boxes, prediction.scores)
+    detections, rows = existing_detections(all_detections, rules)
+    true_boxes, true_rows = existing_truth(columns_of(truth), rules)
+    matched_rows: list[tuple[int, int]] = []
     unmatched: set[int] = set()
     missed: set[int] = set()
     for position in range(len(rules.ranges)):
-        ring = ring_of(detected, true, rules, position)
-        holder = _holders(ring, rules, level)
-        for true_box, detection in holder.items():
+        ring = ring_of(detections, true_boxes, rules, position)
+        detection_by_truth = _matched_detections(ring, rules, level)
+        for true_box, detection in detection_by_truth.items():
             if ring.counts[detection] and ring.truth_counts[true_box]:
-                pairs.append((rows[detection], true_rows[true_box]))
-        unmatched |= {*np.flatnonzero(ring.counts).tolist()} - {*holder.values()}
-        missed |= {*np.flatnonzero(ring.truth_counts).tolist()} - {*holder}
-    matched = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+                matched_rows.append((rows[detection], true_rows[true_box]))
+        counted_detections = np.flatnonzero(ring.counts).tolist()
+        unmatched |= set(counted_detections) - set(detection_by_truth.values())
+        counted_truth = np.flatnonzero(ring.truth_counts).tolist()
+        missed |= set(counted_truth) - detection_by_truth.keys()
+    pairs = np.array(sorted(matched_rows), dtype=np.int64).reshape(-1, 2)
     return DetectionMatches(
         threshold=used_threshold,
-        detection=matched[:, 0],
-        truth=matched[:, 1],
+        detection=pairs[:, 0],
+        truth=pairs[:, 1],
         false=np.sort(rows[list(unmatched)]),
         missed=np.sort(true_rows[list(missed)]),
     )
 
 
-def _holders(ring: Ring, rules: DetectionProtocol, level: int) -> Mapping[int, int]:
-    """Return the detection of each matched true box, also of pairs that do not count."""
+def _matched_detections(ring: Ring, rules: DetectionProtocol, level: int) -> Mapping[int, int]:
+    """Match a range at a threshold: true box → detection, including pairs that do not count."""
     reach = ring.reach(level)
-    classes = len(rules.classes)
+    class_count = len(rules.classes)
     if rules.matching == "by_score":
-        holder = nearest_by_score(reach)
+        candidate_by_truth = nearest_by_score(reach)
     else:
-        counts = {candidate: bool(ring.counts[candidate // classes]) for candidate in reach}
-        holder = nearest_by_truth(reach, counts, ring.truth_counts.tolist()).holder
-    return {truth: candidate // classes for truth, candidate in holder.items()}
+        counts = {candidate: bool(ring.counts[candidate // class_count]) for candidate in reach}
+        steps = nearest_by_truth(reach, counts, ring.truth_counts.tolist())
+        candidate_by_truth = steps.holder
+    return {truth: candidate // class_count for truth, candidate in candidate_by_truth.items()}

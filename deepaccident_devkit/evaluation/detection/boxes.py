@@ -1,4 +1,4 @@
-"""Detected boxes, the true boxes of a sample by a protocol, and the columns of both for metrics."""
+"""Detected boxes, a sample's true boxes under a protocol, and the columns that metrics read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.dataset import Dataset, RowArgument, Visible
 from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
 from deepaccident_devkit.evaluation.task import as_tuples, protocol_of, switched
 from deepaccident_devkit.geometry import SE3, Boxes
@@ -33,87 +33,96 @@ TruthSource = Literal["label", "visible", "cooperative"]
 Measure = Literal["distance_of_bottoms", "distance_bev", "iou_3d", "iou_bev"]
 Matching = Literal["by_truth", "by_score"]
 Curve = Literal["released", "nuscenes", "voc"]
-_CHOICES: Final = {
+_CHOICES = {
     "truth": get_args(TruthSource),
     "measure": get_args(Measure),
     "matching": get_args(Matching),
     "curve": get_args(Curve),
     "area_of": ("center", "footprint"),
 }
-# Largest number of points of all curves together.
-_MAX_POINTS: Final = 10_000_000
+# Largest total number of points of all curves.
+_MAX_POINTS = 10_000_000
 
 
 def _check_classes(classes: tuple[tuple[str, tuple[str, ...]], ...]) -> None:
-    """Check that no category is unknown or in two classes; raises ConfigError."""
-    used = [category for _, categories in classes for category in categories]
-    if not used or len(set(used)) < len(used) or not set(used) <= set(CATEGORIES):
+    """Raise ConfigError if a category is unknown or belongs to two classes."""
+    used_categories: list[str] = []
+    for _, categories in classes:
+        used_categories.extend(categories)
+    distinct_categories = set(used_categories)
+    is_repeated = len(distinct_categories) < len(used_categories)
+    if not used_categories or is_repeated or not distinct_categories <= set(CATEGORIES):
         raise ConfigError(
-            f"classes: expected names with categories of {', '.join(CATEGORIES)}, each at most "
-            f"once, found {classes}"
+            f"classes: expected names of classes with categories from {', '.join(CATEGORIES)}, "
+            f"each category at most once, found {classes}"
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DetectionProtocol:
-    """Rules for which boxes count as found, and how numbers are made of them.
+    """Rules that decide which boxes count as found, and how metrics are computed from them.
 
-    Sources: docs/released_code.md, Detection (released), the paper's text, the nuScenes devkit
-        (eval/detection) and OpenCOOD (opencood/utils/eval_utils.py, box_utils.py and
-        data_utils/datasets).
+    Sources: the section "Detection" of docs/released_code.md (released), the paper's text, the
+        nuScenes devkit (eval/detection) and OpenCOOD (opencood/utils/eval_utils.py, box_utils.py
+        and data_utils/datasets).
 
     Attributes:
-        classes: Classes that are counted separately: a name and the categories of each.
+        classes: Classes that are counted separately: the name and the categories of each class.
         frame: Frame of predictions and truth, `lidar` or `ego`.
-        truth: Boxes that `detection_truth` returns: all of the agent's own `label`, the ones of
-            them that are `visible` to any agent by the released rule, or the `cooperative` union of
-            some agents' labels.
-        label_velocity: Whether the truth's velocity is the label's as written; otherwise it is the
-            one derived from positions.
+        truth: Which boxes `detection_truth` returns. `label`: all boxes of the agent's own label;
+            `visible`: only boxes that any agent sees by the released rule; `cooperative`: the union
+            of the labels of several agents.
+        label_velocity: Whether true velocities are read from the label; otherwise they are derived
+            from positions.
         own_box: Whether the recording agent's own box must be found.
         single_precision: Whether boxes and distances are rounded to single precision, as in the
             released code's tensors.
-        unknown_velocity_is_zero: Whether an unknown true velocity counts as standing still;
-            otherwise it does not count.
-        area: Start and end along x, then along y, metres, ends included: boxes beyond it do not
-            exist; None for no limit.
-        area_of: Part of a box that must be in the area, its `center` or its complete `footprint`.
-        ranges: Rings that are counted separately, from and to (metres, the end excluded). With
-            matching `by_truth`, a box beyond the ring only takes part in matching, a detection with
-            truth of any class, and its match does not count; with `by_score` it does not exist.
-        range_from_x_alone: Whether rings use the distance sqrt(x² + x²), a bug: sqrt(x² + y²) is
-            meant.
-        measure: Measure of nearness: distance of the centres of the lower faces, distance of the
-            centres on the ground, overlap of volumes or of footprints (intersection over union).
-        bottom_taken_as_top: Whether boxes reach downwards from their lower face in the overlap of
-            volumes.
+        unknown_velocity_is_zero: Whether an unknown true velocity counts as 0; otherwise it does
+            not count.
+        area: Start and end along x, then along y, metres, ends included. Boxes outside the area are
+            ignored; None for no limit.
+        area_of: Part of a box that must be in the area: its `center` or its complete `footprint`.
+        ranges: Start and end of each distance range that is counted separately, metres, end
+            excluded. With `by_score`, boxes outside a range are ignored. With `by_truth`, they take
+            part in matching (detections outside it with true boxes of any class), but their matches
+            do not count.
+        range_from_x_alone: Whether ranges use the distance sqrt(x² + x²) instead of sqrt(x² + y²),
+            a bug.
+        measure: How near two boxes are: distance between the centres of their lower faces, distance
+            between their centres on the ground, or intersection over union of their volumes or
+            footprints.
+        bottom_taken_as_top: Whether, for the overlap of volumes, boxes extend downwards from their
+            lower face, a bug.
         thresholds: Thresholds of the measure that are counted separately: metres, or shares.
-        small_thresholds: Thresholds of cyclists, motorcycles and pedestrians; None for the same.
-        threshold_included: Whether a pair exactly at the threshold matches.
-        matching: `by_truth`: each true box in the label's order takes the nearest detection (and,
-            to choose the points of the curve, the one with the highest score, of equal ones the
-            first); `by_score`: each detection in the order of scores takes the nearest true box.
-            Equal scores are then in the order of the samples' tokens, and within a sample in the
-            order of the boxes' values, so that the order of the boxes does not count.
-        curve: How precision and recall become an average precision: `released`: the mean precision
-            at the scores at which recall first exceeds multiples of 1/points (0 where it never
-            does, no envelope); `nuscenes`: interpolated at `points` levels of recall from 0 to 1;
-            `voc`: the area under the envelope.
+        small_thresholds: Thresholds for cyclists, motorcycles and pedestrians; None for the same
+            thresholds.
+        threshold_included: Whether a pair that is exactly at the threshold matches.
+        matching: How boxes are matched. `by_truth`: true boxes, in the label's order, take the
+            nearest free detection; to choose the points of the curve, they take the free detection
+            with the highest score (ties: the first). `by_score`: detections, in descending order of
+            score, take the nearest free true box. Equal scores are ordered by the samples' tokens,
+            then by the boxes' values, so the order of the boxes does not matter.
+        curve: How the average precision is computed. `released`: mean precision at the scores at
+            which recall first exceeds multiples of 1/points (0 if it never does), without an
+            envelope; `nuscenes`: precision interpolated at `points` levels of recall from 0 to 1;
+            `voc`: area under the envelope.
         points: Number of points of a curve.
-        min_recall: Share of the points that does not count; not for `voc`.
-        min_precision: Precision that counts as 0, with the rest spread to [0, 1]; only for
-            `nuscenes`.
-        global_sort: Whether scores are ordered over all samples; otherwise within each sample, one
-            after another by their tokens (OpenCOOD's default). Only for `voc`.
-        error_threshold: Threshold of the matches with errors; None for no errors.
-        error_of_bottoms: Whether the position error is that of the lower faces' centres in 3D;
-            otherwise it is on the ground.
-        scale_by_overlap: Whether the scale error is 1 − overlap of volumes as the boxes stand;
-            otherwise as if centre and heading were equal.
+        min_recall: Share of the points, from the lowest recall on, that is left out; not used by
+            `voc`.
+        min_precision: Precision that counts as 0; higher values are rescaled to [0, 1]. Only used
+            by `nuscenes`.
+        global_sort: Whether detections are sorted by score over all samples; otherwise they are
+            sorted within each sample, and samples by token (OpenCOOD's default). Only used by
+            `voc`.
+        error_threshold: Threshold at which the errors of matches are computed; None for no errors.
+        error_of_bottoms: Whether the position error is the 3D distance between the centres of the
+            lower faces; otherwise it is the distance on the ground.
+        scale_by_overlap: Whether the scale error is 1 − the overlap of volumes of the boxes as they
+            are; otherwise the boxes are first aligned in centre and heading.
         orientation_unwrapped: Whether the heading error is |a mod 6.2831852 − b mod 6.2831852|, up
-            to a full turn; otherwise it is the smaller angle between the two.
-        absent_class_is_zero: Whether a class without true boxes has average precision 0 and errors
-            1; otherwise it is left out of the means.
+            to a full turn; otherwise it is the smaller angle between the two headings.
+        absent_class_is_zero: Whether a class without true boxes has an average precision of 0 and
+            errors of 1; otherwise it is left out of the means.
     """
 
     # what must be found
@@ -151,15 +160,20 @@ class DetectionProtocol:
     absent_class_is_zero: bool = False
 
     def __post_init__(self) -> None:
-        """Check the choices; raises ChoiceError or ConfigError."""
+        """Check the choices.
+
+        Raises:
+            ChoiceError: If a choice does not exist.
+            ConfigError: If choices exclude each other, or a number is invalid.
+        """
         for name in ("classes", "area", "ranges", "thresholds", "small_thresholds"):
             object.__setattr__(self, name, as_tuples(getattr(self, name)))
         settle_choices(self, _CHOICES)
         _check_classes(self.classes)
         if self.frame not in ("lidar", "ego"):
             raise ConfigError(
-                f"frame: expected 'lidar' or 'ego', found {self.frame!r}: ranges are around the "
-                "agent"
+                f"frame: expected 'lidar' or 'ego', found {self.frame!r}, as ranges are "
+                "distances from the agent"
             )
         if not self.thresholds or not self.ranges:
             raise ConfigError("thresholds and ranges: expected at least one of each")
@@ -170,7 +184,7 @@ class DetectionProtocol:
         self._check_curve()
 
     def _check_curve(self) -> None:
-        """Check the choices of the curve and of the errors; raises ConfigError."""
+        """Raise ConfigError if the choices for the curve or for the errors are invalid."""
         if not (self.points > 1 and 0 <= self.min_recall < 1 and 0 <= self.min_precision < 1):
             raise ConfigError(
                 "points, min_recall, min_precision: expected at least 2, and shares from 0 and "
@@ -184,8 +198,8 @@ class DetectionProtocol:
             )
         if not self.global_sort and self.curve != "voc":
             raise ConfigError(
-                f"global_sort: the curve {self.curve!r} is by the order of all scores; choose "
-                "curve='voc'"
+                f"global_sort: the curve {self.curve!r} depends on the order of all scores; "
+                "choose curve='voc'"
             )
         if self.error_threshold is None:
             return
@@ -198,17 +212,17 @@ class DetectionProtocol:
             )
 
     def limits(self, name: str) -> tuple[float, ...]:
-        """Return the thresholds of a class by its name."""
+        """Return the thresholds of the class with a name."""
         if self.small_thresholds is not None and name in SMALL_CATEGORIES:
             return self.small_thresholds
         return self.thresholds
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all choices, as JSON holds them."""
+        """Convert all fields to JSON-compatible values."""
         return dict(json.loads(json.dumps(asdict(self))))
 
 
-_RELEASED: Final = DetectionProtocol(
+_RELEASED = DetectionProtocol(
     truth="label",
     label_velocity=True,
     own_box=True,
@@ -264,18 +278,19 @@ DETECTION_PROTOCOLS: Final[Mapping[str, DetectionProtocol]] = {
         curve="voc",
     ),
 }
-"""By name: the released code (`distance_mAP`, and its other mode, `iou_mAP`), the paper, and the
-numbers that V2X papers print."""
+"""Name → protocol: the released code (with `distance_mAP`, or its other mode `iou_mAP`), the paper,
+and OpenCOOD, whose numbers V2X papers report."""
 
 
 def detection_protocol(protocol: str | DetectionProtocol, **switches: Any) -> DetectionProtocol:
-    """Return a protocol by its name, or a protocol itself, with some choices changed.
+    """Return a protocol, which may be passed by name, with some fields changed.
 
     Raises:
-        ChoiceError: no such protocol or choice.
-        ConfigError: choices that exclude each other.
+        ChoiceError: If the protocol or a choice does not exist.
+        ConfigError: If choices exclude each other.
     """
-    return switched(protocol_of(protocol, DETECTION_PROTOCOLS), switches)
+    base_protocol = protocol_of(protocol, DETECTION_PROTOCOLS)
+    return switched(base_protocol, switches)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -283,22 +298,24 @@ class DetectedBoxes(FrozenArrays):
     """Detections of one sample; arrays are read-only.
 
     Attributes:
-        boxes: N boxes, right-handed, in the frame that they name; velocities NaN where the detector
-            has none.
-        scores: (N,) float64 confidence of the detector, higher is surer.
+        boxes: N right-handed boxes in the frame `boxes.frame`; velocities are NaN if the detector
+            does not predict them.
+        scores: (N,) float64 confidences; higher means more certain.
     """
 
     boxes: Boxes
     scores: FloatArray
 
     def __post_init__(self) -> None:
-        """Check and freeze; raises GeometryError."""
+        """Check and freeze the arrays.
+
+        Raises:
+            GeometryError: If `boxes` is not a `Boxes`, or a score is invalid.
+        """
         checked_boxes("detected boxes", self.boxes)
         scores = checked("scores", self.scores, (len(self.boxes),)).copy()
         if not np.isfinite(scores).all():
-            raise GeometryError(
-                "scores: not all numbers are finite; leave out the boxes that have none"
-            )
+            raise GeometryError("scores: not all numbers are finite; remove boxes without a score")
         object.__setattr__(self, "scores", scores)
         FrozenArrays.__post_init__(self)
 
@@ -314,19 +331,19 @@ class DetectedBoxes(FrozenArrays):
         category: ArrayLike | None = None,
         velocity: ArrayLike | None = None,
     ) -> DetectedBoxes:
-        """Return boxes that stand upright in `frame`, right-handed (x forward, y left).
+        """Create detections from boxes that are upright in `frame` (right-handed, y to the left).
 
         Args:
-            center: (N, 3) metres.
+            center: (N, 3) centres, metres.
             size: (N, 3) full length, width, height, metres.
-            yaw: (N,) radians, counter-clockwise.
-            scores: (N,) confidences, higher is surer.
-            frame: Frame of all values: `lidar` for an evaluator, `world` for results files.
-            category: (N,) indices or names; None for cars.
-            velocity: (N, 2) or (N, 3) m/s over the ground; None for unknown.
+            yaw: (N,) headings, radians, counter-clockwise.
+            scores: (N,) confidences; higher means more certain.
+            frame: Frame of all values: `lidar` for evaluators, `world` for results files.
+            category: (N,) indices or names of categories; None if all are cars.
+            velocity: (N, 2) or (N, 3) velocities over the ground, m/s; None if unknown.
 
         Raises:
-            GeometryError: an impossible shape or number.
+            GeometryError: If a shape or a value is invalid.
         """
         columns: dict[str, Any] = {}
         if velocity is not None:
@@ -338,7 +355,7 @@ class DetectedBoxes(FrozenArrays):
         return cls(boxes=boxes, scores=scores)  # type: ignore[arg-type]  # checked in __post_init__
 
     def transform(self, target_from_source: SE3, frame: str) -> DetectedBoxes:
-        """Return the detections in another frame, such as `world` for results files."""
+        """Transform the detections to another frame, such as `world` for results files."""
         return replace(self, boxes=self.boxes.transform(target_from_source, frame))
 
     def __len__(self) -> int:
@@ -348,18 +365,18 @@ class DetectedBoxes(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BoxColumns:
-    """N upright boxes as the metrics read them, in one right-handed frame around the agent.
+    """Columns of N upright boxes that the metrics read, in a right-handed frame around the agent.
 
     Arrays are float64 or float32.
 
     Attributes:
-        center: (N, 3) metres.
+        center: (N, 3) centres, metres.
         size: (N, 3) length, width, height, metres.
-        yaw: (N,) radians, any number of turns.
-        velocity: (N, 2) m/s, NaN where unknown.
+        yaw: (N,) headings, radians; not wrapped to one turn.
+        velocity: (N, 2) velocities, m/s; NaN if unknown.
         category: (N,) index into `taxonomy.CATEGORIES`.
-        score: (N,) float64; any value for true boxes.
-        own: (N,) bool, whether it is the recording agent itself.
+        score: (N,) float64 confidences; without meaning for true boxes.
+        own: (N,) bool, True for the box of the recording agent itself.
     """
 
     center: AnyArray
@@ -375,13 +392,13 @@ class BoxColumns:
         return len(self.center)
 
     def select(self, rows: AnyArray) -> BoxColumns:
-        """Return the boxes of a mask or of an array of rows."""
+        """Return the boxes that a mask or an array of indices selects."""
         columns = {name: getattr(self, name)[rows] for name in self.__dataclass_fields__}
         return BoxColumns(**columns)
 
     @property
     def surest_first(self) -> IntArray:
-        """(N,) rows by falling score, equal ones by the boxes' values, whatever their order."""
+        """(N,) indices in descending order of score; ties are ordered by the boxes' values."""
         columns = [
             -self.score,
             self.category,
@@ -394,19 +411,22 @@ class BoxColumns:
         return np.lexsort(np.column_stack(columns).T[::-1])
 
     def rounded(self) -> BoxColumns:
-        """Return the same boxes in single precision; scores stay."""
-        names = ("center", "size", "yaw", "velocity")
-        return replace(self, **{name: getattr(self, name).astype(np.float32) for name in names})
+        """Round the boxes to single precision; scores do not change."""
+        columns = {}
+        for name in ("center", "size", "yaw", "velocity"):
+            columns[name] = getattr(self, name).astype(np.float32)
+        return replace(self, **columns)
 
     @property
     def bottom(self) -> AnyArray:
-        """(N,) height of the lower faces, metres, in the boxes' own precision."""
-        half_height = self.size[:, 2] / 2
-        return np.asarray(self.center[:, 2] - half_height)
+        """(N,) z of the lower faces, metres, in the boxes' own precision."""
+        z = self.center[:, 2]
+        height = self.size[:, 2]
+        return np.asarray(z - height / 2)
 
     @property
     def footprint(self) -> FloatArray:
-        """(N, 5) float64, x, y, length, width, yaw, as geometry.box_arrays takes them."""
+        """(N, 5) float64 x, y, length, width, yaw, as `geometry.box_arrays` expects them."""
         position = self.center[:, :2]
         extent = self.size[:, :2]
         footprint = np.column_stack([position, extent, self.yaw])
@@ -414,7 +434,7 @@ class BoxColumns:
 
 
 def columns_of(boxes: Boxes, scores: FloatArray | None = None) -> BoxColumns:
-    """Return the columns of true boxes, or of detected ones with their scores."""
+    """Extract the columns of true boxes, or of detected boxes with their scores."""
     return BoxColumns(
         center=boxes.center,
         size=boxes.size,
@@ -433,34 +453,32 @@ def detection_truth(
     *,
     agents: Agents = None,
 ) -> Boxes:
-    """Return the boxes that a detector should find at a sample, by a protocol.
+    """Return the boxes that a detector should find in a sample, under a protocol.
 
-    They depend on its `truth`, `label_velocity` and `own_box`. Area and ranges are not applied:
-    `DetectionEvaluator.update` does that for truth and detections.
+    They depend on the protocol's `truth`, `label_velocity` and `own_box`. Area and ranges are not
+    applied here: `DetectionEvaluator.update` applies them to truth and detections.
 
     Args:
-        dataset: The release.
-        sample: Token or record; the evaluation is around its agent.
+        dataset: Release with the sample.
+        sample: Token or record of the sample; the evaluated area is around its agent.
         protocol: Name of a protocol, or a protocol.
-        agents: For `cooperative` truth: the agents that contribute labels (as in
-            `v2x.cooperative_boxes`); None for all.
+        agents: For `cooperative` truth, the agents that contribute labels (as in
+            `v2x.cooperative_boxes`); None for all agents.
 
     Returns:
         Boxes in the protocol's frame.
 
     Raises:
-        TokenError: no such sample.
-        ChoiceError: no such protocol, agent or configuration.
-        ConfigError: `agents` are passed and the truth is not cooperative.
-        NotAvailableError: the sample has no label (the test split ships without), or an agent is
-            not in this release.
+        TokenError: If the release does not have the sample.
+        ChoiceError: If the protocol, an agent or the configuration does not exist.
+        ConfigError: If `agents` are passed although the truth is not cooperative.
+        NotAvailableError: If the sample has no label (the test split has none), or an agent is not
+            in this release.
     """
     rules = detection_protocol(protocol)
     record = dataset.get("sample", sample)
     if not record["labelled"]:
-        raise NotAvailableError(
-            f"{record['token']}: has no label, so that nothing can be evaluated"
-        )
+        raise NotAvailableError(f"{record['token']}: has no label, so it cannot be evaluated")
     if rules.truth == "cooperative":
         boxes = cooperative_boxes(dataset, sample, agents=agents, frame=rules.frame)
         own_id = dataset.get("agent", record["agent_token"])["actor_id"]
@@ -473,7 +491,8 @@ def detection_truth(
             "or None"
         )
     else:
-        boxes = dataset.boxes(sample, rules.frame, "released" if rules.truth == "visible" else None)
+        visible: Visible | None = "released" if rules.truth == "visible" else None
+        boxes = dataset.boxes(sample, rules.frame, visible)
         is_own = boxes.actor_id == OWN_ACTOR_ID
     if rules.label_velocity:
         boxes = _with_label_velocity(dataset, sample, boxes, rules)
@@ -483,15 +502,19 @@ def detection_truth(
 def _with_label_velocity(
     dataset: Dataset, sample: RowArgument, boxes: Boxes, rules: DetectionProtocol
 ) -> Boxes:
-    """Return the boxes with the velocities as written in the label.
+    """Replace the boxes' velocities by the ones that the label states.
 
-    The released code assumes that these are in LiDAR axes. Raises ConfigError for another frame.
+    The released code assumes that these are along the axes of the LiDAR frame.
+
+    Raises:
+        ConfigError: If the boxes are in another frame, or come from the labels of several agents.
     """
     if rules.frame != "lidar" or rules.truth == "cooperative":
         raise ConfigError(
-            "label_velocity: the label's velocities are those of one agent's LiDAR frame; choose "
-            "False"
+            "label_velocity: the label's velocities are in the LiDAR frame of one agent, but "
+            "this truth merges several agents; choose False"
         )
     rows = dataset.annotation_rows(sample)
-    velocity = dataset.columns("annotation")["velocity_label"][rows][boxes.row]
-    return replace(boxes, velocity=np.column_stack([velocity, np.zeros(len(velocity))]))
+    label_velocity = dataset.columns("annotation")["velocity_label"][rows][boxes.row]
+    velocity = np.column_stack([label_velocity, np.zeros(len(label_velocity))])
+    return replace(boxes, velocity=velocity)

@@ -1,15 +1,13 @@
-"""From the counts of many samples to precision, recall and average precision, by three rules.
+"""Precision, recall and average precision from the counts of many samples, under three rules.
 
-Each sample may be taken several times, or not at all: resamples share all that does not depend on
-these numbers.
+Each sample may be drawn several times, or not at all: resamples share everything that does not
+depend on how often.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import fsum, nan
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,21 +17,26 @@ from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """Detections of one class within one range at one threshold, by score; S samples by token.
+    """N detections of one class in one range at one threshold, in descending order of score.
+
+    They belong to S samples, which are sorted by token.
 
     Attributes:
-        truths: (S,) number of true boxes of each sample that count.
-        scores: (N,) scores of its detections, falling; equal ones by sample, then in the order of
-            `rows_taken`.
-        sample: (N,) sample of each detection.
-        detected: (N,) 1 where the detection counts.
-        tp: (N,) number of true boxes that are found with this detection (0 or 1).
-        spent: (N,) number of detections that go to true boxes that do not count.
-        excused: (N,) change of the number of true boxes that are neither found nor missed.
-        matched: (M,) rows of the matches that decide the points of the `released` curve, rising.
-        error_rows: (E,) rows of the matches that have errors, rising, each once; in one cell per
-            class.
-        errors: (E, 4) in the order of `matching.ERRORS`, NaN where unknown.
+        truths: (S,) how many true boxes of each sample count.
+        scores: (N,) descending scores of the detections; ties are ordered by sample, then as in
+            `matching.existing_detections`.
+        sample: (N,) index of the sample of each detection.
+        detected: (N,) 1 if the detection counts, otherwise 0.
+        tp: (N,) change that the detection causes in the number of found true boxes (0 or 1).
+        spent: (N,) change that it causes in the number of detections that are matched with true
+            boxes that do not count.
+        excused: (N,) change that it causes in the number of true boxes that are neither found nor
+            missed.
+        matched: (M,) ascending indices of the matches that decide the points of the `released`
+            curve.
+        error_rows: (E,) ascending, unique indices of the matches that have errors; only one cell of
+            each class has them.
+        errors: (E, 4) errors in the order of `matching.ERRORS`; NaN if unknown.
     """
 
     truths: IntArray
@@ -49,13 +52,13 @@ class Cell:
 
 
 class Points(NamedTuple):
-    """The curves of a cell in each of D draws; for one draw without the first axis.
+    """The curves of a cell in each of D draws; for a single draw, the first axis is missing.
 
     Attributes:
-        precision: (D, P) shares.
-        recall: (D, P) shares.
-        average: (D,) average precision as a share.
-        errors: (D, 4) mean errors, NaN without.
+        precision: (D, P) precision in [0, 1].
+        recall: (D, P) recall in [0, 1].
+        average: (D,) average precision in [0, 1].
+        errors: (D, 4) mean errors; NaN if no error is known.
     """
 
     precision: FloatArray
@@ -65,26 +68,28 @@ class Points(NamedTuple):
 
 
 def curves(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Points:
-    """Return precision, recall, average precision and mean errors of a cell by the protocol.
+    """Compute precision, recall, average precision and mean errors of a cell under a protocol.
 
     Args:
         cell: Cell of S samples.
-        protocol: The rules.
-        times: How often each sample is taken in each draw, shape (D, S).
+        protocol: Rules, such as the type of the curve.
+        times: (D, S) how often each draw contains each sample.
     """
     if protocol.curve == "released":
-        return _released(cell, protocol, times)
-    curve = _CURVES[protocol.curve]
-    draws = [curve(drawn, protocol) for drawn in _drawn(cell, protocol, times)]
-    columns = zip(*draws, strict=True)
-    return Points(*(np.array(column, dtype=np.float64) for column in columns))
+        return _released_curves(cell, protocol, times)
+    compute_curve = _nuscenes_curve if protocol.curve == "nuscenes" else _voc_curve
+    curves_by_draw = []
+    for drawn_cell in _drawn_cells(cell, protocol, times):
+        curves_by_draw.append(compute_curve(drawn_cell, protocol))
+    fields = zip(*curves_by_draw, strict=True)
+    return Points(*(np.array(field, dtype=np.float64) for field in fields))
 
 
 def average_precision(precision: FloatArray, min_precision: float = 0.0) -> float:
     """Return the average precision (AP) of a curve: the mean of the precision over its points.
 
-    With `min_precision` the part above it counts, spread to [0, 1], as in `calc_ap` of the nuScenes
-    devkit (`eval/detection/algo.py`).
+    With `min_precision`, only the part above it counts, rescaled to [0, 1], as in `calc_ap` of the
+    nuScenes devkit (`eval/detection/algo.py`).
 
     >>> import numpy as np
     >>> average_precision(np.array([1.0, 0.75, 0.5, 0.0]))
@@ -96,48 +101,50 @@ def average_precision(precision: FloatArray, min_precision: float = 0.0) -> floa
         min_precision: Precision that counts as 0.
 
     Returns:
-        A share in [0, 1].
+        The average precision in [0, 1].
     """
     if not min_precision:
         return _mean(precision)
-    above = np.maximum(precision - min_precision, 0)
-    return _mean(above) / (1 - min_precision)
+    excess = np.maximum(precision - min_precision, 0)
+    return _mean(excess) / (1 - min_precision)
 
 
 def recall_matches(truths: IntArray, points: int) -> IntArray:
-    """Return the matches at which the released code reads its curve, from 1 by falling score.
+    """Return the numbers of the matches at which the released code reads its curve.
 
-    For each level it takes the first match with a number / truths above it. Levels are
-    sums of 1/points in double precision; their rounding decides ties.
+    Matches are numbered from 1 in descending order of score. Each level of recall takes the first
+    match for which number / truths exceeds it. Levels are sums of 1/points in double precision;
+    their rounding decides ties.
 
     Args:
         truths: (D,) numbers of true boxes.
-        points: P, number of levels up to a recall of 1.
+        points: Number P of levels up to a recall of 1.
 
     Returns:
-        (D, P) rising; more than `truths` for a level that is never exceeded.
+        (D, P) ascending numbers; greater than `truths` for a level that is never exceeded.
     """
     levels = np.cumsum(np.full(points, 1.0 / points))
     positive_truths = np.maximum(truths, 1)[:, None]
-    number = np.maximum(np.floor(levels * positive_truths).astype(np.int64) - 1, 1)
+    lower_bounds = np.floor(levels * positive_truths).astype(np.int64) - 1
+    number = np.maximum(lower_bounds, 1)
     for _ in range(3):
         number += number / positive_truths <= levels
     return np.asarray(number)
 
 
 class _Sums:
-    """Sums over a cell's rows in each draw."""
+    """Cumulative sums over selected rows of a cell, for each draw."""
 
     def __init__(
         self, cell: Cell, times: IntArray, rows: IntArray, values: IntArray | None = None
     ) -> None:
-        """Count some rows as often as their samples are taken.
+        """Sum the values of rows, each as often as the draw contains its sample.
 
         Args:
             cell: Cell of S samples.
-            times: How often each sample is taken in each draw, shape (D, S).
-            rows: Rows that are counted.
-            values: What each row adds; None for 1.
+            times: (D, S) how often each draw contains each sample.
+            rows: (R,) ascending indices of the rows to sum.
+            values: (R,) value of each row; None if all are 1.
         """
         weights = np.take(times, cell.sample[rows], axis=1)
         if values is not None:
@@ -148,92 +155,107 @@ class _Sums:
 
     @property
     def all(self) -> IntArray:
-        """(D,) sums of all rows."""
+        """(D,) sums over all selected rows."""
         return np.asarray(self._sums[:, -1])
 
-    def above(self, ends: IntArray) -> IntArray:
-        """Return the sums of the cell's first rows, as many as `ends` (D, P), shape (D, P)."""
-        counts = np.searchsorted(self._rows, ends)
+    def above(self, row_counts: IntArray) -> IntArray:
+        """Return the sums over the selected rows that are among the cell's first rows.
+
+        Args:
+            row_counts: (D, P) number of first rows of the cell.
+
+        Returns:
+            Sums, shape (D, P).
+        """
+        counts = np.searchsorted(self._rows, row_counts)
         return np.take_along_axis(self._sums, counts, axis=1)
 
-    def row_of(self, number: IntArray) -> IntArray:
-        """Return the row with which the sum reaches a number.
+    def find_rows(self, number: IntArray) -> IntArray:
+        """Return the rows of the cell at which the sum reaches the numbers.
 
         Args:
             number: (D, P) numbers from 1.
 
         Returns:
-            (D, P) rows; any row if the sum never reaches it.
+            (D, P) indices of rows; arbitrary if the sum never reaches the number.
         """
-        draws = np.arange(len(self._sums))[:, None]
-        # one sorted array for all draws: each is lifted above the sums of the draws before it
-        lift = (self.all.max(initial=0) + 1) * draws
-        index = np.searchsorted((self._sums[:, 1:] + lift).reshape(-1), number + lift)
-        index -= len(self._rows) * draws
-        return np.asarray(self._rows[np.minimum(index, len(self._rows) - 1)])
+        # search all draws in one sorted array: shift each draw above the sums of the previous ones
+        draw = np.arange(len(self._sums))[:, None]
+        lift = (self.all.max(initial=0) + 1) * draw
+        lifted_sums = self._sums[:, 1:] + lift
+        row_count = len(self._rows)
+        index = np.searchsorted(lifted_sums.reshape(-1), number + lift)
+        index -= row_count * draw
+        return np.asarray(self._rows[np.minimum(index, row_count - 1)])
 
 
-def _released(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Points:
-    """Return the curve of the released code."""
+def _released_curves(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Points:
+    """Compute the curves as the released code does."""
     truths = times @ cell.truths
-    matched = _Sums(cell, times, cell.matched)
+    matches = _Sums(cell, times, cell.matched)
     number = recall_matches(truths, protocol.points)
-    is_reached = number <= matched.all[:, None]
-    ends = np.zeros(number.shape, dtype=np.int64)
+    is_reached = number <= matches.all[:, None]
+    row_counts = np.zeros(number.shape, dtype=np.int64)
     if is_reached.any():
-        threshold = cell.scores[matched.row_of(np.where(is_reached, number, 1))]
-        # number of rows with at least each score: equal scores come in together
-        reached_ends = np.searchsorted(-cell.scores, -threshold, side="right")
-        ends = np.where(is_reached, reached_ends, 0)
-    tp = _Sums(cell, times, np.flatnonzero(cell.tp)).above(ends)
-    spent = _Sums(cell, times, np.flatnonzero(cell.spent)).above(ends)
-    detected = _Sums(cell, times, np.flatnonzero(cell.detected)).above(ends)
+        reached_number = np.where(is_reached, number, 1)
+        threshold = cell.scores[matches.find_rows(reached_number)]
+        # number of rows with at least each score: rows with equal scores are added together
+        reached_counts = np.searchsorted(-cell.scores, -threshold, side="right")
+        row_counts = np.where(is_reached, reached_counts, 0)
+    tp = _Sums(cell, times, np.flatnonzero(cell.tp)).above(row_counts)
+    spent = _Sums(cell, times, np.flatnonzero(cell.spent)).above(row_counts)
+    detected = _Sums(cell, times, np.flatnonzero(cell.detected)).above(row_counts)
     changed = np.flatnonzero(cell.excused)
-    excused = _Sums(cell, times, changed, cell.excused[changed]).above(ends)
-    # where all detections of a score went to boxes that do not count, the released code divides
-    # 0 by 0 and stops
+    excused = _Sums(cell, times, changed, cell.excused[changed]).above(row_counts)
+    # if all detections down to a score match boxes that do not count, the released code divides 0
+    # by 0 and stops
     precision = _ratio(tp, detected - spent, 0.0)
-    recall = np.where(is_reached, _ratio(tp, truths[:, None] - excused, nan), 0.0)
+    known_recall = _ratio(tp, truths[:, None] - excused, nan)
     start = int(protocol.min_recall * protocol.points)
-    errors = []
-    for draw in _errors_at(cell, times, ends):
-        errors.append([_mean(column) for column in draw[start:].T])
+    mean_errors = []
+    for errors in _errors_at(cell, times, row_counts):
+        mean_errors.append([_mean(column) for column in errors[start:].T])
     return Points(
         precision=precision,
-        recall=recall,
+        recall=np.where(is_reached, known_recall, 0.0),
         average=np.array([average_precision(draw[start:]) for draw in precision]),
-        errors=np.array(errors),
+        errors=np.array(mean_errors),
     )
 
 
-def _errors_at(cell: Cell, times: IntArray, ends: IntArray) -> FloatArray:
-    """Return mean errors of the matches among the first rows of a cell; 1 without matches.
+def _errors_at(cell: Cell, times: IntArray, row_counts: IntArray) -> FloatArray:
+    """Return the mean errors of the matches among a cell's first rows; 1 if there are no matches.
 
     Args:
         cell: Cell of S samples.
-        times: How often each sample is taken in each draw, shape (D, S).
-        ends: Numbers of rows, shape (D, P).
+        times: (D, S) how often each draw contains each sample.
+        row_counts: (D, P) number of first rows.
 
     Returns:
-        Errors, shape (D, P, 4).
+        Errors, shape (D, P, 4), in the order of `matching.ERRORS`.
     """
     if not len(cell.errors):
-        return np.ones((*ends.shape, 4))
-    matches = _Sums(cell, times, cell.error_rows).above(ends)
+        return np.ones((*row_counts.shape, 4))
+    match_counts = _Sums(cell, times, cell.error_rows).above(row_counts)
     weights = np.take(times, cell.sample[cell.error_rows], axis=1)
-    rows = np.searchsorted(cell.error_rows, ends)
+    error_counts = np.searchsorted(cell.error_rows, row_counts)
     means = []
-    for error in cell.errors.T:
-        sums = np.zeros((len(times), len(error) + 1))
-        weighted = weights * error
-        weighted[weights == 0] = 0.0  # and not NaN
-        np.cumsum(weighted, axis=1, out=sums[:, 1:])
-        means.append(_ratio(np.take_along_axis(sums, rows, axis=1), matches, 1.0))
+    for errors in cell.errors.T:
+        sums = np.zeros((len(times), len(errors) + 1))
+        weighted_errors = weights * errors
+        weighted_errors[weights == 0] = 0.0  # instead of NaN
+        np.cumsum(weighted_errors, axis=1, out=sums[:, 1:])
+        error_sums = np.take_along_axis(sums, error_counts, axis=1)
+        means.append(_ratio(error_sums, match_counts, 1.0))
     return np.stack(means, axis=-1)
 
 
-def _drawn(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator[Cell]:
-    """Yield the cell of each draw, with the rows of a sample repeated as often as it is taken."""
+def _drawn_cells(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator[Cell]:
+    """Yield the cell of each draw, with a sample's rows repeated as often as the draw contains it.
+
+    A block of successive rows is repeated as a whole. Its rows belong to the same sample, and if
+    scores are sorted over all samples, have the same score.
+    """
     is_start = np.diff(cell.sample, prepend=-1) != 0
     if protocol.global_sort:
         is_start |= np.diff(cell.scores, prepend=np.inf) != 0
@@ -242,12 +264,14 @@ def _drawn(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator
     error_index = np.full(len(cell.scores), -1)
     error_index[cell.error_rows] = np.arange(len(cell.error_rows))
     for draw in times:
-        copies = np.repeat(np.arange(len(starts)), draw[cell.sample[starts]])
-        length = lengths[copies]
-        ends = np.cumsum(length)
-        offsets = np.repeat(starts[copies] - (ends - length), length)
-        rows = np.arange(ends[-1] if ends.size else 0) + offsets
-        error = error_index[rows]
+        block_times = draw[cell.sample[starts]]
+        blocks = np.repeat(np.arange(len(starts)), block_times)
+        block_lengths = lengths[blocks]
+        block_ends = np.cumsum(block_lengths)
+        offsets = starts[blocks] - (block_ends - block_lengths)
+        rows = np.arange(block_lengths.sum()) + np.repeat(offsets, block_lengths)
+        row_errors = error_index[rows]
+        has_error = row_errors >= 0
         yield replace(
             cell,
             truths=cell.truths * draw,
@@ -257,77 +281,73 @@ def _drawn(cell: Cell, protocol: DetectionProtocol, times: IntArray) -> Iterator
             tp=cell.tp[rows],
             spent=cell.spent[rows],
             excused=cell.excused[rows],
-            error_rows=np.flatnonzero(error >= 0),
-            errors=cell.errors[error[error >= 0]],
+            error_rows=np.flatnonzero(has_error),
+            errors=cell.errors[row_errors[has_error]],
         )
 
 
-def _nuscenes(cell: Cell, protocol: DetectionProtocol) -> Points:
-    """Return the precision-recall curve of one draw, as the nuScenes devkit computes it."""
+def _nuscenes_curve(cell: Cell, protocol: DetectionProtocol) -> Points:
+    """Compute the precision-recall curve of one draw as the nuScenes devkit does."""
     truths = int(cell.truths.sum())
     levels = np.linspace(0, 1, protocol.points)
     hits = np.cumsum(cell.tp)
-    counted = np.cumsum(cell.detected - cell.spent)
+    num_counted = np.cumsum(cell.detected - cell.spent)
     if not hits.size or not hits[-1] or not truths:
         zeros = np.zeros(len(levels))
         return Points(precision=zeros, recall=levels, average=0.0, errors=np.ones(4))
     recall = hits / truths
-    row_precision = np.divide(hits, counted, out=np.zeros(len(hits)), where=counted > 0)
-    precision = np.interp(levels, recall, row_precision, right=0)
+    precision = np.interp(levels, recall, _ratio(hits, num_counted, 0.0), right=0)
     scores = np.interp(levels, recall, cell.scores, right=0)
     start = round(protocol.min_recall * (protocol.points - 1)) + 1
-    last = int(np.searchsorted(levels, recall[-1], side="right")) - 1
+    end = int(np.searchsorted(levels, recall[-1], side="right"))
     return Points(
         precision=precision,
         recall=levels,
         average=average_precision(precision[start:], protocol.min_precision),
-        errors=_interpolated_errors(cell, scores, start, last),
+        errors=_interpolated_errors(cell, scores[start:end]),
     )
 
 
-def _interpolated_errors(cell: Cell, scores: FloatArray, start: int, last: int) -> FloatArray:
-    """Return the mean of the running means of errors at the points from `start` to `last`.
+def _interpolated_errors(cell: Cell, scores: FloatArray) -> FloatArray:
+    """Average the running means of errors at the scores, shape (4,).
 
-    It is 1 without such points or without errors; NaN if no match has a known error.
+    The result is 1 if there are no scores or no errors, and NaN if no match has a known error.
     """
-    if last < start or not len(cell.errors):
+    if not len(scores) or not len(cell.errors):
         return np.ones(4)
     is_known = ~np.isnan(cell.errors)
-    sums = np.cumsum(np.where(is_known, cell.errors, 0), axis=0)
-    numbers = np.cumsum(is_known, axis=0)
-    running = np.divide(sums, numbers, out=np.zeros_like(sums), where=numbers > 0)
-    rising = cell.scores[cell.error_rows][::-1]
+    known_errors = np.where(is_known, cell.errors, 0)
+    error_counts = np.cumsum(is_known, axis=0)
+    running_means = _ratio(np.cumsum(known_errors, axis=0), error_counts, 0.0)
+    rising_scores = cell.scores[cell.error_rows][::-1]
     means = []
-    for column in running.T:
-        means.append(_mean(np.interp(scores[start : last + 1], rising, column[::-1])))
-    return np.where(numbers[-1] > 0, means, nan)
+    for column in running_means.T:
+        interpolated_errors = np.interp(scores, rising_scores, column[::-1])
+        means.append(_mean(interpolated_errors))
+    return np.where(error_counts[-1] > 0, means, nan)
 
 
-def _voc(cell: Cell, protocol: DetectionProtocol) -> Points:
-    """Return the curve of PASCAL VOC for one draw; its average precision is the exact area."""
+def _voc_curve(cell: Cell, protocol: DetectionProtocol) -> Points:
+    """Compute the curve of one draw as PASCAL VOC does; its average precision is the exact area."""
     truths = int(cell.truths.sum())
     levels = np.linspace(0, 1, protocol.points)
     hits = np.cumsum(cell.tp)
-    counted = np.cumsum(cell.detected - cell.spent)
-    precision = np.divide(hits, counted, out=np.zeros(len(hits)), where=counted > 0)
+    num_counted = np.cumsum(cell.detected - cell.spent)
+    precision = _ratio(hits, num_counted, 0.0)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
-    # for each number of found truths, the best precision with at least as many: recall rises by
-    # 1/truths at each
-    at_hits = envelope[cell.tp > 0]
-    required = np.maximum(np.ceil(levels * truths - 1e-9).astype(np.int64), 1)
-    sampled = np.append(at_hits, np.zeros(1))[np.minimum(required - 1, len(at_hits))]
-    average = fsum(at_hits.tolist()) / truths if truths else 0.0
-    return Points(precision=sampled, recall=levels, average=average, errors=np.full(4, nan))
-
-
-_CURVES: Final[Mapping[str, Callable[[Cell, DetectionProtocol], Points]]] = {
-    "nuscenes": _nuscenes,
-    "voc": _voc,
-}
+    # for each number of found true boxes, the best precision with at least as many; each one raises
+    # recall by 1/truths
+    best_precision = envelope[cell.tp > 0]
+    required_hits = np.maximum(np.ceil(levels * truths - 1e-9).astype(np.int64), 1)
+    index = np.minimum(required_hits - 1, len(best_precision))
+    sampled_precision = np.append(best_precision, 0.0)[index]
+    average = fsum(best_precision.tolist()) / truths if truths else 0.0
+    no_errors = np.full(4, nan)
+    return Points(precision=sampled_precision, recall=levels, average=average, errors=no_errors)
 
 
 def _ratio(part: AnyArray, total: IntArray, default: float) -> FloatArray:
-    """Return `part / total`, and a default where there is nothing."""
+    """Return `part / total`, or `default` where the total is not positive."""
     shape = np.broadcast_shapes(part.shape, total.shape)
     result = np.full(shape, default)
     np.divide(part, total, out=result, where=total > 0)
@@ -335,5 +355,6 @@ def _ratio(part: AnyArray, total: IntArray, default: float) -> FloatArray:
 
 
 def _mean(values: FloatArray) -> float:
-    """Return the exact mean of values (N,)."""
-    return fsum(values.tolist()) / len(values)
+    """Return the mean of values (N,), from their exactly rounded sum."""
+    total = fsum(values.tolist())
+    return total / len(values)

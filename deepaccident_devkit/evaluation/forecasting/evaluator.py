@@ -1,6 +1,4 @@
-"""`ForecastingEvaluator`: how far actors' predicted paths are from the recorded ones."""
-
-from __future__ import annotations
+"""`ForecastingEvaluator`: how far the predicted paths of actors are from their recorded paths."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,14 +41,14 @@ from deepaccident_devkit.evaluation.means import (
 )
 from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
 from deepaccident_devkit.evaluation.task import Row
-from deepaccident_devkit.support.arrays import FloatArray, check_least
+from deepaccident_devkit.support.arrays import FloatArray, check_minima
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# The row of all actors of a sample together: means over samples.
+# Name of the row of joint errors of all actors of a sample, averaged over samples.
 TOGETHER: Final = "together"
-_MISSING_NOTE: Final = "no forecast of {true actor}: without errors, counted in `without`"
-_UNKNOWN_NOTE: Final = (
-    "not counted: {forecast} of the agent itself, or of an actor that no label shows then"
+_MISSING_NOTE = "{true actor} without a forecast: no errors, but counted in `no forecast`"
+_UNKNOWN_NOTE = (
+    "not counted: {forecast} of the agent itself, or of an actor that no label of the frame shows"
 )
 
 
@@ -59,9 +57,10 @@ class ForecastingProtocol:
     """Rules of forecasting metrics.
 
     Attributes:
-        horizons: Seconds ahead, at most 5; the first is the main one.
-        modes: Numbers of an actor's most probable modes that count; the first is the main one.
-        miss_distance: Metres; a larger error of the best mode at the horizon is a miss.
+        horizons: Seconds ahead, at most 5; the first horizon is the main one.
+        modes: How many of an actor's most probable modes count (K); the first value is the main
+            one.
+        miss_distance: If the best mode's error at the horizon is larger, it is a miss; metres.
     """
 
     horizons: tuple[float, ...] = (3.0, 1.0, 2.0, 5.0)
@@ -69,14 +68,21 @@ class ForecastingProtocol:
     miss_distance: float = MISS_DISTANCE
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
-        check_least(self, miss_distance=0)
-        for name, low, high in (("horizons", FRAME_PERIOD, PATH_SECONDS), ("modes", 1, math.inf)):
-            values = getattr(self, name)
-            if not values or not all(low <= value <= high for value in values):
-                raise ConfigError(
-                    f"{name}: expected numbers from {low:g} to {high:g}, found {values!r}"
-                )
+        """Check the fields.
+
+        Raises:
+            ConfigError: If a value is out of range.
+        """
+        check_minima(self, miss_distance=0)
+        _check_range("horizons", self.horizons, FRAME_PERIOD, PATH_SECONDS)
+        _check_range("modes", self.modes, 1, math.inf)
+
+
+def _check_range(name: str, values: Sequence[float], low: float, high: float) -> None:
+    """Raise ConfigError if there are no values, or if one is outside the range `low` to `high`."""
+    is_in_range = [low <= value <= high for value in values]
+    if not values or not all(is_in_range):
+        raise ConfigError(f"{name}: expected numbers from {low:g} to {high:g}, found {values!r}")
 
 
 FORECASTING_PROTOCOLS: Final[Mapping[str, ForecastingProtocol]] = MappingProxyType(
@@ -85,15 +91,15 @@ FORECASTING_PROTOCOLS: Final[Mapping[str, ForecastingProtocol]] = MappingProxyTy
 
 
 def table_name(horizon: float, modes: int) -> str:
-    """Return the name of the table of a horizon and a number of modes: `3 s, K = 6`."""
+    """Return the name of the table for a horizon and a number of modes, such as `3 s, K = 6`."""
     return f"{horizon:g} s, K = {modes}"
 
 
 class ForecastingResult(MeansResult):
     """Tables by horizon and K, the number of modes that count; rows are groups of actors.
 
-    The row `all` has all actors, `mean of scenarios` the mean of the scenarios' means of that row,
-    and `together` takes the actors of a sample as one world.
+    The row `all` contains all actors. `mean of scenarios` first averages them within each scenario,
+    then over scenarios. `together` contains the joint errors of all actors of a sample.
     """
 
     __slots__ = ()
@@ -114,10 +120,10 @@ class ForecastingResult(MeansResult):
 
 
 class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
-    """Errors of the paths of other actors, for each actor's best mode.
+    """Evaluator of the predicted paths of other actors; it uses each actor's best mode.
 
-    Actors are compared by their ids. An actor without a forecast at a horizon has no number there,
-    and counts in `without`.
+    Actors are matched by their ids. An actor whose forecast does not reach a horizon has no errors
+    at that horizon, and is counted in `without`.
 
     >>> ForecastingEvaluator().compute().samples
     0
@@ -141,7 +147,7 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
     )
 
     def truth(self, dataset: Dataset, token: str, /, *_unused: Any) -> tuple[ForecastingTruth]:
-        """Return the recorded paths of all actors annotated at the present."""
+        """Return the recorded paths of all actors that are annotated in the current frame."""
         return (forecasting_truth(dataset, token),)
 
     def update(self, token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth) -> None:
@@ -149,94 +155,104 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
 
         Args:
             token: Token of the sample.
-            forecasts: At most one per actor; forecasts of actors that are not in the truth do not
-                count.
+            forecasts: At most one per actor; forecasts of actors that are not in the truth are
+                ignored.
             truth: Truth from `forecasting_truth(dataset, token)`.
 
         Raises:
-            EvaluationError: an item is not a forecast, two forecasts are of one actor, or the
-                sample came before with other counts.
+            EvaluationError: If an item is not a forecast, an actor has two forecasts, or the sample
+                was counted before with other counts.
         """
-        self.add(token, _counts(token, forecasts, truth, self.protocol))
+        items: list[object] = list(forecasts)
+        forecast_by_actor = {item.actor_id: item for item in items if isinstance(item, Forecast)}
+        if len(forecast_by_actor) < len(items):
+            raise EvaluationError(
+                f"{token}: expected a list of Forecasts, one per actor, found "
+                f"{shortened(repr(items))}"
+            )
+        self.add(token, _sample_counts(forecast_by_actor, truth, self.protocol))
 
 
-def _counts(
-    token: str, forecasts: Iterable[Forecast], truth: ForecastingTruth, rules: ForecastingProtocol
+def _sample_counts(
+    forecasts: Mapping[int, Forecast], truth: ForecastingTruth, rules: ForecastingProtocol
 ) -> Counts:
-    """Return what a sample adds."""
-    items: list[object] = list(forecasts)
-    of_actor = {item.actor_id: item for item in items if isinstance(item, Forecast)}
-    if len(of_actor) < len(items):
-        raise EvaluationError(
-            f"{token}: expected Forecasts, one of each actor, found {shortened(repr(items))}"
-        )
+    """Count one sample: errors of each actor, and joint errors.
+
+    Args:
+        forecasts: Actor id → forecast.
+        truth: Recorded paths of the sample.
+        rules: Horizons, numbers of modes and miss distance.
+    """
     sums = Sums()
     actors = set(truth.actor_id.tolist())
-    ends = np.array([of_actor[actor].times[-1] for actor in of_actor.keys() & actors])
-    sums.note(_MISSING_NOTE, len(actors) - len(ends))
-    sums.note(_UNKNOWN_NOTE, len(of_actor) - len(ends))
-    main = rules.horizons[0]
-    ends_early = ends < main - SAME_TIME
-    sums.note(f"no numbers at {main:g} s: {{forecast}} ending earlier", ends_early.sum())
-    sums.note(LONG_PATHS, (ends > LONGEST_PATH).sum())
+    forecast_ends = np.array([forecasts[actor].times[-1] for actor in forecasts.keys() & actors])
+    sums.note(_MISSING_NOTE, len(actors) - len(forecast_ends))
+    sums.note(_UNKNOWN_NOTE, len(forecasts) - len(forecast_ends))
+    main_horizon = rules.horizons[0]
+    ends_early = forecast_ends < main_horizon - SAME_TIME
+    sums.note(f"no numbers at {main_horizon:g} s: {{forecast}} ending earlier", ends_early.sum())
+    sums.note(LONG_PATHS, (forecast_ends > LONGEST_PATH).sum())
     if not actors:
         return sums.counts(truth.scenario)
-    paths, probabilities = _arrays(of_actor, truth)
-    recorded = np.isfinite(truth.path[..., 0])
+    all_paths, probabilities = _mode_arrays(forecasts, truth)
+    is_recorded = np.isfinite(truth.path[..., 0])
     groups = {}
     for name, members in zip(truth.groups, truth.members, strict=True):
         if members.any():
             groups[name] = members
+    everybody = {EVERYBODY: groups[EVERYBODY]}
     for horizon, mode_count in product(rules.horizons, rules.modes):
         steps = slice(round(horizon / FRAME_PERIOD))
-        table = table_name(horizon, mode_count)
-        path = paths[:, :, steps]
-        true = truth.path[:, steps]
-        valid = recorded[:, steps]
-        errors = actor_errors(path, true, valid, probabilities, mode_count, rules.miss_distance)
+        paths = all_paths[:, :, steps]
+        true_paths = truth.path[:, steps]
+        valid = is_recorded[:, steps]
+        errors = actor_errors(
+            paths, true_paths, valid, probabilities, mode_count, rules.miss_distance
+        )
         errors["without"] = np.where(valid[:, -1], np.isnan(errors["min_fde"]), np.nan)
-        if mode_count == rules.modes[0]:
-            sums.add_rows(table, groups, errors)
-        else:
-            sums.add_rows(table, {EVERYBODY: groups[EVERYBODY]}, errors)
-        together = _together(path, true, probabilities, mode_count, rules.miss_distance)
-        for column, value in together.items():
+        table = table_name(horizon, mode_count)
+        sums.add_rows(table, groups if mode_count == rules.modes[0] else everybody, errors)
+        joint_errors = _joint_errors(
+            paths, true_paths, probabilities, mode_count, rules.miss_distance
+        )
+        for column, value in joint_errors.items():
             sums.add(table, TOGETHER, column, value)
     return sums.counts(truth.scenario)
 
 
-def _arrays(
-    of_actor: Mapping[int, Forecast], truth: ForecastingTruth
+def _mode_arrays(
+    forecasts: Mapping[int, Forecast], truth: ForecastingTruth
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the modes' paths at the truth's steps and their probabilities, NaN for missing ones.
+    """Interpolate the forecasts at the truth's steps; missing modes and steps are NaN.
 
     Returns:
-        Paths (A, K, S, 2), and probabilities (A, K).
+        Paths (A, K, S, 2), metres, and probabilities (A, K).
     """
-    steps = np.arange(1, truth.path.shape[1] + 1) * FRAME_PERIOD
-    mode_count = max((len(forecast.paths) for forecast in of_actor.values()), default=1)
-    paths = np.full((len(truth.actor_id), mode_count, len(steps), 2), np.nan)
+    times = np.arange(1, truth.path.shape[1] + 1) * FRAME_PERIOD
+    mode_count = max((len(forecast.paths) for forecast in forecasts.values()), default=1)
+    paths = np.full((len(truth.actor_id), mode_count, len(times), 2), np.nan)
     probabilities = np.full(paths.shape[:2], np.nan)
     for row, actor in enumerate(truth.actor_id.tolist()):
-        if actor in of_actor:
-            forecast = of_actor[actor]
-            positions = forecast.at(steps, truth.present[row])
+        if actor in forecasts:
+            forecast = forecasts[actor]
+            positions = forecast.at(times, truth.present[row])
             paths[row, : len(positions)] = positions
             probabilities[row, : len(positions)] = forecast.probabilities
     return paths, probabilities
 
 
-def _together(
+def _joint_errors(
     paths: FloatArray,
     truth: FloatArray,
     probabilities: FloatArray,
     mode_count: int,
     miss_distance: float,
 ) -> dict[str, float]:
-    """Return the numbers of the best world: the one with the least mean FDE.
+    """Return the joint errors of the best world: the one with the lowest mean FDE.
 
-    It is chosen among the `mode_count` worlds with the highest mean probability. Actors with a
-    complete future and a forecast of it count, and the modes that all of these have.
+    It is chosen among the `mode_count` worlds with the highest mean probability. An actor counts
+    if its future is completely recorded and its forecast covers it. A world counts if all of these
+    actors have its mode.
     """
     is_complete = np.asarray(np.isfinite(paths).all(axis=(2, 3)))
     is_recorded = np.isfinite(truth).all(axis=(1, 2))
@@ -244,15 +260,15 @@ def _together(
     modes = np.flatnonzero(is_complete[actors].all(axis=0))
     if not len(actors) or not len(modes):
         return {}
-    mean_probability = probabilities[actors][:, modes].mean(axis=0)
-    most_probable = np.argsort(-mean_probability, kind="stable")[:mode_count]
+    mean_probabilities = probabilities[actors][:, modes].mean(axis=0)
+    most_probable = np.argsort(-mean_probabilities, kind="stable")[:mode_count]
     worlds = paths[actors][:, modes[most_probable]]
     ade, fde, final_errors = world_errors(worlds, truth[actors])
-    best = int(np.argmin(fde))
-    colliding = collisions(worlds[:, best : best + 1])
+    best_mode = int(np.argmin(fde))
+    is_colliding = collisions(worlds[:, best_mode : best_mode + 1])
     return {
-        "min_fde": fde[best],
-        "min_ade": ade[best],
-        "miss": miss_rate(final_errors[:, best], miss_distance),
-        "collisions": colliding.mean(),
+        "min_fde": fde[best_mode],
+        "min_ade": ade[best_mode],
+        "miss": miss_rate(final_errors[:, best_mode], miss_distance),
+        "collisions": is_colliding.mean(),
     }

@@ -1,11 +1,9 @@
-"""`Forecast`: predicted paths of an actor; and how far such paths are from the recorded one.
+"""`Forecast`: predicted paths of an actor; and functions that compare them with the recorded path.
 
-The errors by mode, and the joint errors of all actors (`world_errors`), are defined as in the
-package av2, which picks no mode. The mode that counts is chosen as in `eval_forecasting.py` of
-`argoverse-api`: the one with the least error at the end.
+The errors of a mode, and the joint errors of all actors (`world_errors`), are defined as in the
+package av2, which does not select a mode. The mode that counts is selected as in
+`eval_forecasting.py` of `argoverse-api`: it is the one with the lowest final error.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
@@ -23,23 +21,24 @@ from deepaccident_devkit.support.arrays import (
     checked_whole,
 )
 
-# Metres; a larger error at the end is a miss.
+# Largest final error that is not a miss, metres.
 MISS_DISTANCE: Final = 2.0
-# Metres; centres that come nearer to each other collide.
+# Two actors collide if their centres are nearer to each other than this, metres.
 COLLISION_DISTANCE: Final = 1.0
-# Seconds by which a moment may miss its step, as sums of float32 do.
+# Seconds by which a time may differ from its step, as sums of float32 do.
 SAME_TIME: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Forecast(FrozenArrays):
-    """Predicted paths of an actor: K modes; arrays are read-only.
+    """Predicted paths of an actor in K modes; arrays are read-only.
 
     Attributes:
         actor_id: CARLA id of the actor.
-        times: (T,) seconds after the present, ascending.
-        paths: (K, T, 2) centres of its box, x forward, y left, metres in the present ego frame.
-        probabilities: (K,) probabilities of the modes; they are not normalised.
+        times: (T,) seconds after the current frame, ascending.
+        paths: (K, T, 2) centres of the actor's box, x forward, y left, metres in the current ego
+            frame.
+        probabilities: (K,) probabilities of the modes; their sum may differ from 1.
     """
 
     actor_id: int
@@ -48,14 +47,18 @@ class Forecast(FrozenArrays):
     probabilities: FloatArray
 
     def __post_init__(self) -> None:
-        """Check and freeze; raises GeometryError."""
+        """Check and freeze the arrays.
+
+        Raises:
+            GeometryError: If a shape or a value is invalid.
+        """
         times = ascending_times(self.times)
         probabilities = checked("probabilities", self.probabilities, (None,)).copy()
         paths = checked("paths", self.paths, (len(probabilities), len(times), 2)).copy()
         if not len(paths) or not np.isfinite(paths).all():
             raise GeometryError(
-                "paths: expected one mode or more of finite numbers; leave out what is not "
-                "predicted"
+                "paths: expected at least one mode of finite numbers; leave out actors and "
+                "times without a prediction"
             )
         if not ((probabilities >= 0) & (probabilities <= 1)).all():
             raise GeometryError(
@@ -69,16 +72,17 @@ class Forecast(FrozenArrays):
         FrozenArrays.__post_init__(self)
 
     def at(self, steps: FloatArray, present: FloatArray) -> FloatArray:
-        """Return the positions at S seconds after the present, linear between the modes' times.
+        """Interpolate the positions linearly at S times.
 
-        Until its first time the actor goes straight on from its present position.
+        Before the forecast's first time, the actor moves in a straight line from its current
+        position.
 
         Args:
-            steps: Seconds after the present, shape (S,).
-            present: Position at the present, shape (2,).
+            steps: (S,) seconds after the current frame.
+            present: (2,) current position, metres.
 
         Returns:
-            Positions, shape (K, S, 2); NaN after the last time.
+            Positions, shape (K, S, 2), metres; NaN after the forecast's last time.
         """
         times = self.times
         paths = self.paths
@@ -88,12 +92,14 @@ class Forecast(FrozenArrays):
             paths = np.concatenate([start, paths], axis=1)
         if len(times) == 1:
             return np.full((len(paths), len(steps), 2), np.nan)
-        after = times.searchsorted(steps - SAME_TIME).clip(1, len(times) - 1)
-        before = after - 1
-        share = ((steps - times[before]) / (times[after] - times[before]))[:, None]
-        positions = paths[:, before] * (1 - share) + paths[:, after] * share
-        is_covered = (steps <= times[-1] + SAME_TIME)[:, None]
-        return np.where(is_covered, positions, np.nan)
+        later = times.searchsorted(steps - SAME_TIME).clip(1, len(times) - 1)
+        earlier = later - 1
+        period = times[later] - times[earlier]
+        share = ((steps - times[earlier]) / period)[:, None]
+        positions: FloatArray = paths[:, earlier] * (1 - share) + paths[:, later] * share
+        is_after_end = steps > times[-1] + SAME_TIME
+        positions[:, is_after_end] = np.nan
+        return positions
 
 
 def displacement_errors(
@@ -101,8 +107,8 @@ def displacement_errors(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the average and the final displacement error (ADE, FDE) of each mode, metres.
 
-    They are defined like `compute_ade` and `compute_fde` of av2 (`argoverse/av2-api`), with
-    the mean of the ADE over the valid steps only.
+    They are defined like `compute_ade` and `compute_fde` of av2 (`argoverse/av2-api`), except that
+    the ADE is averaged over valid steps only.
 
     >>> import numpy as np
     >>> truth = np.array([[[1.0, 0.0], [2.0, 0.0]]])
@@ -111,57 +117,58 @@ def displacement_errors(
     (array([[3.]]), array([[3.]]))
 
     Args:
-        paths: Predicted positions of N actors in K modes, (N, K, T, 2) metres; NaN where there is
-            none.
-        truth: Recorded positions at the same times, (N, T, 2) metres.
-        valid: Whether the truth is recorded, (N, T); it is not read elsewhere.
+        paths: (N, K, T, 2) predicted positions of N actors in K modes, metres; NaN if missing.
+        truth: (N, T, 2) recorded positions at the same times, metres.
+        valid: (N, T) bool, True for steps that are recorded; `truth` is ignored at other steps.
 
     Returns:
-        ADE, the mean distance over the valid steps, (N, K); and FDE, the distance at the last step,
-        (N, K). NaN where there is no such step, or the path ends before the last one.
+        The ADE, (N, K): the mean distance over the valid steps; and the FDE, (N, K): the distance
+        at the last step. The ADE is NaN without a valid step, the FDE if the last step is not
+        valid; both are NaN if the path ends before the last step.
     """
     errors = distances(paths, truth[:, None])
     errors = np.where(valid[:, None], errors, 0.0)
-    steps = valid.sum(axis=1)[:, None]
+    step_count = valid.sum(axis=1)[:, None]
+    mean_errors = errors.sum(axis=-1) / np.maximum(step_count, 1)
     reaches_end = np.isfinite(paths[..., -1, :]).all(axis=-1)
-    means = errors.sum(axis=-1) / np.maximum(steps, 1)
-    ade = np.where((steps > 0) & reaches_end, means, np.nan)
+    ade = np.where((step_count > 0) & reaches_end, mean_errors, np.nan)
     fde = np.where(valid[:, -1:], errors[..., -1], np.nan)
     return ade, fde
 
 
 def misses(final_errors: FloatArray, miss_distance: float = MISS_DISTANCE) -> FloatArray:
-    """Return 1 where a final error is a miss, 0 where it is not, NaN where it is NaN.
+    """Return 1 for final errors that are misses and 0 for others; NaN stays NaN.
 
     Args:
         final_errors: Displacement errors at the last step, metres, of any shape.
-        miss_distance: Metres; a larger error is a miss.
+        miss_distance: Largest error that is not a miss, metres.
     """
     is_missed = final_errors > miss_distance
     return np.where(np.isnan(final_errors), np.nan, is_missed)
 
 
 def miss_rate(final_errors: FloatArray, miss_distance: float = MISS_DISTANCE) -> float:
-    """Return the share of final errors that are misses, as `compute_is_missed_prediction` of av2.
+    """Return the share of final errors that are misses, like av2's `compute_is_missed_prediction`.
 
     >>> import numpy as np
     >>> miss_rate(np.array([0.5, 1.0, 2.5, np.nan]), miss_distance=2.0) == 1 / 3
     True
 
     Args:
-        final_errors: (N,) displacement errors at the last step, metres; NaN does not count.
-        miss_distance: Metres; a larger error is a miss.
+        final_errors: (N,) displacement errors at the last step, metres; NaN is ignored.
+        miss_distance: Largest error that is not a miss, metres.
 
     Returns:
-        A share in [0, 1]; NaN if there is nothing to count.
+        The miss rate in [0, 1]; NaN if there is nothing to count.
     """
-    is_missed = misses(final_errors, miss_distance)
-    is_missed = is_missed[~np.isnan(is_missed)]
-    return float(is_missed.mean()) if len(is_missed) else np.nan
+    known_errors = final_errors[~np.isnan(final_errors)]
+    if not len(known_errors):
+        return np.nan
+    return float((known_errors > miss_distance).mean())
 
 
 def brier(errors: FloatArray, probabilities: FloatArray) -> FloatArray:
-    """Return errors in metres plus (1 − probability)², as in av2."""
+    """Add the Brier penalty (1 − probability)² to errors in metres, as av2 does."""
     return errors + (1 - probabilities) ** 2
 
 
@@ -173,33 +180,35 @@ def actor_errors(
     mode_count: int,
     miss_distance: float = MISS_DISTANCE,
 ) -> dict[str, FloatArray]:
-    """Return the errors of each actor's best mode.
+    """Compute the errors of each actor's best mode.
 
-    The best mode has the least FDE among the `mode_count` most probable ones; the first of equal
-    modes counts.
+    The best mode has the lowest FDE among the `mode_count` most probable modes (ties: the first).
 
     Args:
-        paths: Paths as in `displacement_errors`; so are `truth` and `valid`.
-        truth: Recorded paths.
-        valid: Where the paths are recorded.
+        paths: (N, K, T, 2) predicted positions, metres; NaN if missing.
+        truth: (N, T, 2) recorded positions, metres.
+        valid: (N, T) bool, True for steps that are recorded.
         probabilities: (N, K) probabilities of the modes, not normalised; NaN for missing modes.
         mode_count: Number of modes that count.
-        miss_distance: Metres; a larger FDE is a miss.
+        miss_distance: Largest FDE that is not a miss, metres.
 
     Returns:
-        Arrays (N,), NaN for none: `min_fde`, `miss` (1 or 0) and `brier_min_fde` need the last
-        step, `min_ade` (of the best mode) and `min_ade_any` (the least of any mode) the complete
-        future, `cut_ade` (the least of any mode) any step. All need a path up to the last step.
+        Arrays (N,). `min_fde`, `miss` (1 or 0) and `brier_min_fde` describe the best mode, as does
+        `min_ade`; `min_ade_any` and `cut_ade` are the lowest ADE of any mode. Errors are NaN unless
+        the path reaches the last step, and unless the truth is recorded: at the last step for
+        `min_fde`, `miss` and `brier_min_fde`, at all steps for `min_ade` and `min_ade_any`, at any
+        step for `cut_ade`.
     """
     ade, fde = displacement_errors(paths, truth, valid)
+    actor = np.arange(len(paths))
     most_probable = np.argsort(-probabilities, axis=1, kind="stable")[:, :mode_count]
-    ade = np.take_along_axis(ade, most_probable, 1)
-    fde = np.take_along_axis(fde, most_probable, 1)
-    probabilities = np.take_along_axis(probabilities, most_probable, 1)
-    best = np.argmin(np.where(np.isnan(fde), np.inf, fde), axis=1)[:, None]
-    min_ade = np.take_along_axis(ade, best, 1)[:, 0]
-    min_fde = np.take_along_axis(fde, best, 1)[:, 0]
-    probability = np.take_along_axis(probabilities, best, 1)[:, 0]
+    ade = ade[actor[:, None], most_probable]
+    fde = fde[actor[:, None], most_probable]
+    known_fde = np.where(np.isnan(fde), np.inf, fde)
+    best_modes = np.argmin(known_fde, axis=1)
+    min_ade = ade[actor, best_modes]
+    min_fde = fde[actor, best_modes]
+    probability = probabilities[actor, most_probable[actor, best_modes]]
     min_ade_any = np.fmin.reduce(ade, axis=1)
     is_complete = valid.all(axis=1)
     return {
@@ -213,15 +222,15 @@ def actor_errors(
 
 
 def world_errors(paths: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the joint errors of N actors; the modes of one number are one world.
+    """Compute the joint errors of N actors; the k-th modes of all actors form the k-th world.
 
     Args:
-        paths: (N, K, T, 2) metres, at least one actor.
-        truth: (N, T, 2) metres, all recorded.
+        paths: (N, K, T, 2) predicted positions of at least one actor, metres.
+        truth: (N, T, 2) recorded positions, metres, without missing ones.
 
     Returns:
-        Means over the actors of ADE and of FDE, (K,) metres each, and the FDE of each actor, (N,
-        K).
+        ADE and FDE averaged over the actors, (K,) metres each, and the FDE of each actor, (N, K)
+        metres.
     """
     valid = np.ones(truth.shape[:2], dtype=bool)
     ade, fde = displacement_errors(paths, truth, valid)
@@ -229,13 +238,14 @@ def world_errors(paths: FloatArray, truth: FloatArray) -> tuple[FloatArray, Floa
 
 
 def collisions(paths: FloatArray, distance: float = COLLISION_DISTANCE) -> BoolArray:
-    """Return whether each actor comes too near to another one in each mode, shape (N, K).
+    """Find out which actors come too near to another one in each mode, shape (N, K) bool.
 
     Args:
-        paths: (N, K, T, 2) metres.
-        distance: Metres; two centres that are nearer at one step collide.
+        paths: (N, K, T, 2) predicted centres, metres.
+        distance: Actors collide if their centres are nearer to each other at any step, metres.
     """
-    apart = distances(paths[:, None], paths)
-    actors = np.arange(len(paths))
-    apart[actors, actors] = np.inf
-    return np.asarray((apart < distance).any(axis=(1, 3)))
+    center_distances = distances(paths[:, None], paths)
+    actor = np.arange(len(paths))
+    center_distances[actor, actor] = np.inf
+    is_near: BoolArray = center_distances < distance
+    return np.asarray(is_near.any(axis=(1, 3)))

@@ -1,6 +1,4 @@
-"""`ForecastingTruth`: recorded paths of the actors at a sample's present, and their groups."""
-
-from __future__ import annotations
+"""`ForecastingTruth`: recorded paths of the actors in a sample's frame, and their groups."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,10 +21,10 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 # Duration of the recorded paths, seconds.
 PATH_SECONDS: Final = 5.0
-# m/s at the present; slower actors stand.
+# Lowest current speed at which an actor counts as moving, m/s; slower actors count as standing.
 MOVING_SPEED: Final = 0.5
-# Number of seconds before the impact that have a group each.
-_SECONDS_TO_IMPACT: Final = 5
+# Each of the last seconds before the impact, this many, has a group of its own.
+_SECONDS_TO_IMPACT = 5
 EVERYBODY: Final = "all"
 CLASS_LABELS: Final = tuple(f"class {name}" for name in CATEGORIES)
 ROLES: Final = ("collider", "other")
@@ -40,18 +38,18 @@ MOTIONS: Final = ("moving", "standing")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ForecastingTruth(FrozenArrays):
-    """The other actors that are annotated at a sample's present; arrays are read-only.
+    """Paths of the other actors that are annotated in a sample's frame; arrays are read-only.
 
-    The agent's own vehicle is not among them: its path is its plan.
+    The agent's own vehicle is left out, since its path is its plan.
 
     Attributes:
         scenario: Token of the scenario.
-        actor_id: (A,) int64, ascending.
-        present: (A, 2) float64 centres, x forward, y left, metres in the present ego frame.
-        path: (A, S, 2) float64 centres at 0.1, 0.2, … s after the present, in the same frame; NaN
-            where nobody annotated the actor.
-        groups: Names of groups of actors.
-        members: (len(groups), A) bool, the actors of each group.
+        actor_id: (A,) int64 CARLA ids, ascending.
+        present: (A, 2) float64 current centres, x forward, y left, metres in the current ego frame.
+        path: (A, S, 2) float64 centres at 0.1, 0.2, … s after the current frame, in the current ego
+            frame; NaN where no agent annotated the actor.
+        groups: Names of the G groups of actors.
+        members: (G, A) bool, True if the actor is in the group.
     """
 
     scenario: str
@@ -65,18 +63,18 @@ class ForecastingTruth(FrozenArrays):
 def forecasting_truth(
     dataset: Dataset, sample: RowArgument, seconds: float = PATH_SECONDS
 ) -> ForecastingTruth:
-    """Return the recorded paths that forecasts of a sample are compared with.
+    """Collect the recorded paths that forecasts of a sample are compared with.
 
-    They are from the labels of all agents of the release.
+    They come from the labels of all agents in the release.
 
     Args:
-        dataset: The release.
-        sample: Token or record of the present.
-        seconds: Duration of the paths.
+        dataset: Release with the sample.
+        sample: Token or record of the sample.
+        seconds: Duration of the paths, seconds.
 
     Raises:
-        TokenError: no such sample.
-        NotAvailableError: the sample has no label.
+        TokenError: If the release does not have the sample.
+        NotAvailableError: If the sample has no label.
     """
     record = labelled_sample(dataset, sample)
     token = record["token"]
@@ -89,18 +87,20 @@ def forecasting_truth(
     if own_id is None:
         own_id = OWN_ACTOR_ID
     is_present = tracks.index[rows] == frame
-    present_rows = rows[is_present & (tracks.actor_id[rows] != own_id)]
-    actor = tracks.actor_id[present_rows]
-    rows = rows[np.isin(tracks.actor_id[rows], actor)]
-    path = np.full((len(actor), last_frame - frame + 1, 2), np.nan)
+    is_other = tracks.actor_id[rows] != own_id
+    present_rows = rows[is_present & is_other]
+    actor_ids = tracks.actor_id[present_rows]
+    path_rows = rows[np.isin(tracks.actor_id[rows], actor_ids)]
+    actor_index = actor_ids.searchsorted(tracks.actor_id[path_rows])
+    frame_index = tracks.index[path_rows] - frame
     ego_from_world = dataset.world_from(token, "ego").inverse()
-    actor_index = actor.searchsorted(tracks.actor_id[rows])
-    step = tracks.index[rows] - frame
-    path[actor_index, step] = ego_from_world.apply(tracks.boxes.center[rows])[:, :2]
+    centers = ego_from_world.apply(tracks.boxes.center[path_rows])
+    path = np.full((len(actor_ids), last_frame - frame + 1, 2), np.nan)
+    path[actor_index, frame_index] = centers[:, :2]
     groups = dict(_groups(dataset, token, tracks, present_rows))
     return ForecastingTruth(
         scenario=record["scenario_token"],
-        actor_id=actor,
+        actor_id=actor_ids,
         present=path[:, 0],
         path=path[:, 1:],
         groups=tuple(groups),
@@ -111,46 +111,54 @@ def forecasting_truth(
 def _groups(
     dataset: Dataset, token: str, tracks: ScenarioTracks, rows: IntArray
 ) -> Iterator[tuple[str, BoolArray]]:
-    """Yield groups of the actors at some rows of the tracks, by name.
+    """Yield each group's name and its mask (A,) of the actors at `rows` of the tracks.
 
-    Among the groups of one kind each actor is in exactly one.
+    Each actor is in at most one group of each kind.
     """
     sample = dataset.get("sample", token)
-    actor = tracks.actor_id[rows]
+    actor_ids = tracks.actor_id[rows]
     scenario = dataset.get("scenario", sample["scenario_token"])
     everybody = np.ones(len(rows), dtype=bool)
     yield EVERYBODY, everybody
     for code, name in enumerate(CLASS_LABELS):
         yield name, tracks.boxes.category[rows] == code
-    # without the meta file nothing is known about accidents
+    # without the meta file, it is unknown whether there is an accident
     if scenario["weather"] is not None:
         collision = scenario["collision"]
-        collides = np.isin(actor, [] if collision is None else collision["ids"])
+        colliding_ids = [] if collision is None else collision["ids"]
+        collides = np.isin(actor_ids, colliding_ids)
         yield from zip(ROLES, (collides, ~collides), strict=True)
         group = _time_to_impact_group(sample["time_to_impact"])
         if group is not None:
             yield group, everybody
-    eyes = _seen_by(dataset, token, actor)
-    by_ego = (eyes & (1 << AGENTS.index(sample["agent"]))) > 0
-    yield from zip(VIEWERS, (by_ego, ~by_ego & (eyes > 0), eyes == 0), strict=True)
+    seen_by = _seen_by(dataset, token, actor_ids)
+    own_bit = 1 << AGENTS.index(sample["agent"])
+    is_seen = seen_by > 0
+    is_seen_by_ego = (seen_by & own_bit) > 0
+    viewer_masks = is_seen_by_ego, is_seen & ~is_seen_by_ego, ~is_seen
+    yield from zip(VIEWERS, viewer_masks, strict=True)
     speed = np.linalg.norm(tracks.boxes.velocity[rows, :2], axis=1)
     yield from zip(MOTIONS, (speed >= MOVING_SPEED, speed < MOVING_SPEED), strict=True)
 
 
-def _time_to_impact_group(ahead: float | None) -> str | None:
-    """Return the group of `TO_IMPACT` of a time to impact; None if it is too far ahead."""
-    if ahead is None:
+def _time_to_impact_group(time_to_impact: float | None) -> str | None:
+    """Return the group in `TO_IMPACT` for a time to impact; None if the impact is too far ahead."""
+    if time_to_impact is None:
         return TO_IMPACT[_SECONDS_TO_IMPACT]
-    second = max(int(np.ceil(ahead - FRAME_PERIOD / 2)), 1) - 1
-    return TO_IMPACT[second] if second < _SECONDS_TO_IMPACT else None
+    last_second = int(np.ceil(time_to_impact - FRAME_PERIOD / 2))
+    second = max(last_second, 1) - 1
+    if second >= _SECONDS_TO_IMPACT:
+        return None
+    return TO_IMPACT[second]
 
 
-def _seen_by(dataset: Dataset, token: str, actor: IntArray) -> AnyArray:
-    """Return the agents that see each actor (A,), one bit per agent."""
+def _seen_by(dataset: Dataset, token: str, actor_ids: IntArray) -> AnyArray:
+    """Find the agents that see each actor, (A,) uint8 with one bit per agent."""
     visible = seen_actors(dataset, token, agents=None)
-    eyes = np.zeros(len(actor), dtype=np.uint8)
-    is_visible = np.isin(actor, visible.boxes.actor_id)
-    order = np.argsort(visible.boxes.actor_id)
-    sorted_ids = visible.boxes.actor_id[order]
-    eyes[is_visible] = visible.seen_by[order][sorted_ids.searchsorted(actor[is_visible])]
-    return eyes
+    visible_ids = visible.boxes.actor_id
+    seen_by = np.zeros(len(actor_ids), dtype=np.uint8)
+    is_visible = np.isin(actor_ids, visible_ids)
+    order = np.argsort(visible_ids)
+    index = visible_ids[order].searchsorted(actor_ids[is_visible])
+    seen_by[is_visible] = visible.seen_by[order][index]
+    return seen_by

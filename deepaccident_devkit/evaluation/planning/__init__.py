@@ -1,4 +1,4 @@
-"""Planned paths: rules of UniAD, ST-P3, VAD and BEV-Planner, and `clean`, made for accidents."""
+"""Planned paths (task `planning`): rules of UniAD, ST-P3, VAD, BEV-Planner, and our own `clean`."""
 
 from deepaccident_devkit.evaluation.planning.cells import (
     CELL_PROTOCOLS,

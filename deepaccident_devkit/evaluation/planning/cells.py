@@ -1,11 +1,9 @@
-"""Collisions and errors of plans as UniAD, ST-P3, VAD and BEV-Planner count them, on cells.
+"""Collisions and errors of plans on grid cells, as UniAD, ST-P3, VAD and BEV-Planner count them.
 
 The numbers of the four differ only by their definitions; `CellRules` has a field for each quirk.
-docs/protocols.md, Planning, names the lines of their code. Shapes: 6 steps at 0.5, 1, … 3 s; frame:
-the present ego frame, x forward, y left, metres.
+The section "Planning" of docs/protocols.md names the commits of their code. A path has 6 steps, at
+0.5, 1, … 3 s. Positions are in the current ego frame: x forward, y left, metres.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Mapping
@@ -17,42 +15,46 @@ import numpy as np
 
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray, ShortRepr
 
+# Number of steps of a path.
 STEPS: Final = 6
 # Seconds from one step to the next.
 STEP: Final = 0.5
-# Seconds; each horizon is two steps longer than the one before.
+# Seconds; each horizon is two steps longer than the previous one.
 HORIZONS: Final = (1, 2, 3)
 # Metres from the ego to the edges of the grid.
 HALF: Final = 50.0
-# Metres from nuScenes' ego origin to its LiDAR.
+# Distance, in metres, by which nuScenes' LiDAR is in front of its ego origin.
 LIDAR_AHEAD: Final = 0.985793
-# Metres; a shorter step has no direction.
-_MIN_STEP_M: Final = 1.0
+# A step shorter than this has no direction, metres.
+_MIN_STEP_M = 1.0
+# How values at the steps up to a horizon are reduced to one.
 Over = Literal["step", "mean", "any"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CellRules(ShortRepr):
-    """How one code counts, one field per quirk that was found in it.
+    """Rules of one public implementation, with one field per quirk that was found.
 
     Attributes:
-        whole_futures: Whether samples without 3 s of recorded future are left out. If not, missing
-            steps have an error of 0 and no collision, and count.
-        error: Whether the error is that of the horizon's step, or the mean up to it.
-        box_over: Reduction over the steps up to the horizon: `step`: the value at the last step;
-            `mean`: the mean; `any`: whether any step collides.
-        point_over: The same for collisions of the path's points.
-        cell: Side of a cell, metres.
-        rows: What the rows of cells are: metres forward, their mirror image, or y (then columns are
-            x).
-        mirrored: Whether columns are −y.
-        drawn_ahead: Metres by which objects are drawn too far ahead.
-        box_ahead: Metres from the path's point to the centre of the ego's box.
-        ego: Length and width of that box, metres; None for the agent's own.
+        whole_futures: Whether samples without 3 s of recorded future are left out. Otherwise
+            missing steps count, with an error of 0 and no collision.
+        error: Which error is reported at a horizon: `step`, the error at the horizon's step, or
+            `mean`, the mean over all steps up to it.
+        box_over: How collisions of the box are reduced over the steps up to a horizon. `step`:
+            whether the last step collides; `mean`: the mean; `any`: whether any step collides.
+        point_over: How collisions of the path's points are reduced, as for `box_over`.
+        cell: Side length of a cell, metres.
+        rows: What the rows of the grid are: `forward`, x; `backward`, x mirrored; `sideways`, y
+            (then columns are x).
+        mirrored: Whether columns are −y instead of y.
+        drawn_ahead: By how many metres objects are drawn too far ahead.
+        box_ahead: By how many metres the centre of the ego's box is in front of the path's point.
+        ego: Length and width of the ego's box, metres; None for the size of the agent's own box.
         turned: Whether the box turns with the path; a step shorter than 1 m has no direction.
-        point_far_off: Whether the point's cell is 25 m away.
-        objects: `vehicles`: all but pedestrians; `seen` or `annotated`: vehicles and pedestrians
-            that are seen or annotated at the present.
+        point_far_off: Whether the cell that is checked for the path's point is 25 m away from it, a
+            bug.
+        objects: Which objects count. `vehicles`: all but pedestrians; `seen` and `annotated`: the
+            vehicles and pedestrians that are seen, or annotated, in the current frame.
     """
 
     # what is averaged over which steps
@@ -64,7 +66,7 @@ class CellRules(ShortRepr):
     cell: float = 0.5
     rows: Literal["forward", "backward", "sideways"] = "forward"
     mirrored: bool = True
-    # the boxes and points that are compared on it
+    # the boxes and points that are drawn on the grid
     drawn_ahead: float = 0.0
     box_ahead: float = 0.5
     ego: tuple[float, float] | None = (4.084, 1.85)
@@ -74,24 +76,21 @@ class CellRules(ShortRepr):
 
     @property
     def size(self) -> int:
-        """Number of cells along each side."""
+        """Number of cells along each side of the grid."""
         return round(2 * HALF / self.cell)
 
     @property
     def middle(self) -> float:
-        """Metres from the centre of the first cell to the ego."""
+        """Distance from the centre of the first cell to the ego along one axis, metres."""
         return HALF - self.cell / 2
 
 
-def _own_box(rules: CellRules) -> CellRules:
-    """Return the same rules for the agent's own box.
-
-    Here the path's point is the centre of the box, up to 0.3 m.
-    """
+def _with_own_box(rules: CellRules) -> CellRules:
+    """Adapt rules to the agent's own box, whose centre is on the path (± 0.3 m)."""
     return replace(rules, ego=None, box_ahead=0.0, drawn_ahead=0.0)
 
 
-_PUBLIC: Final = {
+_PUBLIC_CODES = {
     "uniad": CellRules(whole_futures=False, error="step", box_over="step", point_over="step"),
     "stp3": CellRules(mirrored=False, drawn_ahead=LIDAR_AHEAD, objects="seen"),
     "vad": CellRules(rows="backward", point_far_off=True, objects="annotated"),
@@ -106,13 +105,14 @@ _PUBLIC: Final = {
     ),
 }
 CELL_PROTOCOLS: Final[Mapping[str, CellRules]] = MappingProxyType(
-    _PUBLIC | {f"{name}_own_box": _own_box(rules) for name, rules in _PUBLIC.items()}
+    _PUBLIC_CODES
+    | {f"{name}_own_box": _with_own_box(rules) for name, rules in _PUBLIC_CODES.items()}
 )
-"""Name of the code → its rules; `…_own_box` are the same with the box of DeepAccident."""
+"""Name of the implementation → its rules; `…_own_box` uses DeepAccident's boxes instead."""
 
 
 def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
-    """Return the cells that boxes with corners (N, 4, 2) cover, shape (H, W)."""
+    """Mark the cells that boxes with corners (N, 4, 2) in metres cover, shape (H, W) bool."""
     import cv2
 
     x = corners[..., 0] + rules.drawn_ahead
@@ -128,68 +128,78 @@ def occupied(corners: FloatArray, rules: CellRules) -> BoolArray:
     else:
         offsets = vertices.astype(np.float32) + np.float32(rules.middle)
         cells = np.trunc(offsets / np.float32(rules.cell))
-    drawn = np.zeros((rules.size, rules.size), dtype=np.uint8)
-    high = cells.max(axis=1)
-    low = cells.min(axis=1)
-    touches_grid = (high >= 0).all(axis=1) & (low < rules.size).all(axis=1)
-    for polygon in cells[touches_grid].astype(np.int32):
-        cv2.fillPoly(drawn, [polygon], 1)
-    return drawn.astype(bool)
+    reaches_first_cell = (cells.max(axis=1) >= 0).all(axis=1)
+    reaches_last_cell = (cells.min(axis=1) < rules.size).all(axis=1)
+    is_on_grid = reaches_first_cell & reaches_last_cell
+    image = np.zeros((rules.size, rules.size), dtype=np.uint8)
+    for polygon in cells[is_on_grid].astype(np.int32):
+        cv2.fillPoly(image, [polygon], 1)
+    return image.astype(bool)
 
 
 def touching(
     path: FloatArray, cells: BoolArray, ego: tuple[float, float], rules: CellRules
 ) -> BoolArray:
-    """Return whether the ego's box, and the path's point, is on an occupied cell at each step.
+    """Find the steps at which the ego's box, or the path's point, is on an occupied cell.
 
     Args:
-        path: (6, 2) positions, metres.
-        cells: (6, H, W) occupied cells of each step, from `occupied`.
+        path: (6, 2) planned positions, metres.
+        cells: (6, H, W) bool, the occupied cells at each step, from `occupied`.
         ego: Length and width of the agent's own box, metres.
-        rules: The protocol.
+        rules: Rules of the implementation.
 
     Returns:
-        (2, 6), first for the box, then for the point.
+        (2, 6) bool: the first row for the box, the second for the point.
     """
     steps = np.arange(len(path))
-    row, column = _box(path, ego, rules)
-    box = cells[steps[:, None], row, column].any(axis=1)
-    row, column = _point(path, rules)
-    is_inside = (row >= 0) & (row < rules.size) & (column >= 0) & (column < rules.size)
-    row = np.where(is_inside, row, 0)
-    column = np.where(is_inside, column, 0)
-    return np.stack([box, is_inside & cells[steps, row, column]])
+    row, column = _box_cells(path, ego, rules)
+    box_touches = cells[steps[:, None], row, column].any(axis=1)
+    row, column = _point_cells(path, rules)
+    is_on_grid = (row >= 0) & (row < rules.size) & (column >= 0) & (column < rules.size)
+    row[~is_on_grid] = 0
+    column[~is_on_grid] = 0
+    point_touches = is_on_grid & cells[steps, row, column]
+    return np.stack([box_touches, point_touches])
 
 
-def _box(path: FloatArray, ego: tuple[float, float], rules: CellRules) -> IntArray:
-    """Return rows and columns of the M cells of the box, clipped to the grid, shape (2, 6, M)."""
+def _box_cells(path: FloatArray, ego: tuple[float, float], rules: CellRules) -> IntArray:
+    """Return the rows and columns of the box's M cells, clipped to the grid, shape (2, 6, M)."""
     length, width = rules.ego or ego
-    along, across = np.meshgrid(
+    cells_ahead, cells_aside = np.meshgrid(
         _spanned_cells(length, rules.box_ahead, rules),
         _spanned_cells(width, 0.0, rules),
         indexing="ij",
     )
-    ahead = along.ravel()
-    aside = across.ravel()
+    ahead = cells_ahead.ravel()
+    aside = cells_aside.ravel()
     x = path[:, :1] / rules.cell
     y = path[:, 1:] / rules.cell
     if rules.turned:
         angle = _directions(path)[:, None]
-        centre = (rules.size - 1) / 2
         cosine = np.cos(angle)
         sine = np.sin(angle)
-        columns = np.round((ahead - centre) * cosine - (aside - centre) * sine + centre) + x
-        rows = np.round((ahead - centre) * sine + (aside - centre) * cosine + centre) + y
+        centre = (rules.size - 1) / 2
+        from_centre_x = ahead - centre
+        from_centre_y = aside - centre
+        columns = np.round(from_centre_x * cosine - from_centre_y * sine + centre) + x
+        rows = np.round(from_centre_x * sine + from_centre_y * cosine + centre) + y
     else:
         rows = x + ahead
         if rules.rows == "backward":
             rows = rules.size - x - ahead
         columns = aside + (-y if rules.mirrored else y)
-    return np.clip(np.trunc(np.stack([rows, columns])), 0, rules.size - 1).astype(np.int64)
+    cells = np.trunc(np.stack([rows, columns]))
+    return cells.clip(0, rules.size - 1).astype(np.int64)
 
 
 def _spanned_cells(extent: float, ahead: float, rules: CellRules) -> IntArray:
-    """Return the numbers of the cells that an extent spans, `ahead` metres ahead of the ego."""
+    """Return the indices of the cells that the box spans along one axis.
+
+    Args:
+        extent: Length of the box along the axis, metres.
+        ahead: Offset of its centre along the axis, metres.
+        rules: Rules of the implementation.
+    """
     half = extent / 2
     low = (-half + ahead + rules.middle) / rules.cell
     high = (half + ahead + rules.middle) / rules.cell
@@ -199,29 +209,31 @@ def _spanned_cells(extent: float, ahead: float, rules: CellRules) -> IntArray:
 
 
 def _directions(path: FloatArray) -> FloatArray:
-    """Return the direction of each step (6,), radians; 0 for short steps."""
+    """Return the direction of each step, (6,) radians; 0 for steps shorter than 1 m."""
     origin = np.zeros((1, 2), dtype=np.float32)
-    step = np.diff(path.astype(np.float32), axis=0, prepend=origin)
-    has_direction = np.hypot(step[:, 0], step[:, 1]) >= _MIN_STEP_M
-    return np.where(has_direction, np.arctan2(step[:, 1], step[:, 0]), 0.0)
+    steps = np.diff(path.astype(np.float32), axis=0, prepend=origin)
+    dx, dy = steps.T
+    has_direction = np.hypot(dx, dy) >= _MIN_STEP_M
+    return np.where(has_direction, np.arctan2(dy, dx), 0.0)
 
 
-def _point(path: FloatArray, rules: CellRules) -> IntArray:
-    """Return rows and columns of the path's points, shape (2, 6)."""
+def _point_cells(path: FloatArray, rules: CellRules) -> IntArray:
+    """Return the rows and columns of the cells that contain the path's points, shape (2, 6)."""
     x, y = path.T
     if rules.point_far_off:
-        cells = np.stack([rules.middle / 2 - x, rules.middle / 2 - y])
+        offsets = rules.middle / 2 - path.T
     elif rules.rows == "sideways":
-        cells = np.stack([y, x]) + rules.middle
+        offsets = np.stack([y, x]) + rules.middle
     else:
-        cells = np.stack([x, -y if rules.mirrored else y]) + rules.middle
-    return np.trunc(cells / rules.cell).astype(np.int64)
+        offsets = np.stack([x, -y if rules.mirrored else y]) + rules.middle
+    return np.trunc(offsets / rules.cell).astype(np.int64)
 
 
 def plan_displacement_errors(path: FloatArray, recorded: FloatArray) -> FloatArray:
-    """Return the distance of a planned path from the recorded one at each step (L2), metres.
+    """Return the distance (L2) of a planned path from the recorded path at each step, metres.
 
-    As in UniAD (`planning_metrics.py`) and ST-P3 (`metrics.py`), before their mean over steps.
+    UniAD (`planning_metrics.py`) and ST-P3 (`metrics.py`) compute the same distances before they
+    average over steps.
 
     >>> import numpy as np
     >>> plan_displacement_errors(np.array([[3.0, 4.0], [6.0, 0.0]]), np.zeros((2, 2))).tolist()
@@ -232,18 +244,19 @@ def plan_displacement_errors(path: FloatArray, recorded: FloatArray) -> FloatArr
         recorded: (T, 2) recorded positions at the same times, in the same frame, metres.
 
     Returns:
-        (T,) metres.
+        Distances, shape (T,), metres.
     """
-    return np.asarray(np.hypot(*(path - recorded).T))
+    dx, dy = (path - recorded).T
+    return np.asarray(np.hypot(dx, dy))
 
 
 def collision_rate(
     touched: BoolArray, recorded_touched: BoolArray, valid: BoolArray, over: Over = "mean"
 ) -> FloatArray:
-    """Return the collision rate of one plan at 1, 2 and 3 s, as the four public codes define it.
+    """Return the collision rate of one plan at 1, 2 and 3 s, as the public implementations do.
 
-    Steps at which the recorded path touches as well, or is not recorded, cannot collide, but stay
-    in the denominator. The rate of many plans is the mean over them.
+    A step does not collide if the recorded path touches an object, too, or if the step is not
+    recorded; such steps still count in the denominator. Rates of several plans are averaged.
 
     >>> import numpy as np
     >>> touched = np.array([False, False, True, True, True, True])
@@ -252,16 +265,17 @@ def collision_rate(
     [0.0, 0.5, 0.5]
 
     Args:
-        touched: (6,) whether the plan touches an object at steps of 0.5 s.
-        recorded_touched: (6,) whether the recorded path does.
-        valid: (6,) whether the step is recorded.
-        over: Reduction over the steps up to the horizon: `step`: value at the last step; `mean`;
-            `any`: whether any step collides.
+        touched: (6,) bool, steps (of 0.5 s) at which the plan touches an object.
+        recorded_touched: (6,) bool, steps at which the recorded path touches an object.
+        valid: (6,) bool, steps that are recorded.
+        over: How the steps up to a horizon are reduced. `step`: whether the last step collides;
+            `mean`: the mean; `any`: whether any step collides.
 
     Returns:
-        (3,) shares in [0, 1].
+        Shares in [0, 1], shape (3,).
     """
-    return _at_horizons(touched & ~(recorded_touched | ~valid), over)
+    collides = touched & ~recorded_touched & valid
+    return _at_horizons(collides, over)
 
 
 def cell_numbers(
@@ -271,27 +285,29 @@ def cell_numbers(
     touched: tuple[BoolArray, BoolArray],
     rules: CellRules,
 ) -> dict[str, FloatArray]:
-    """Return the numbers of a path beside the recorded one, at 1, 2 and 3 s.
+    """Compute the errors and collisions of a planned path at 1, 2 and 3 s.
 
-    At steps at which the recorded path's box touches, nothing collides, and the step stays in the
-    denominator: `left_out` is the share of such steps.
+    A step does not collide if the box on the recorded path touches an object, or if the step is not
+    recorded; such steps still count in the denominator.
 
     Args:
         path: (6, 2) planned positions, metres.
         recorded: (6, 2) recorded positions, metres.
-        valid: (6,) whether the steps are recorded.
-        touched: What `touching` returns for the planned and for the recorded path.
-        rules: The protocol.
+        valid: (6,) bool, steps that are recorded.
+        touched: Results of `touching` for the planned and for the recorded path.
+        rules: Rules of the implementation.
 
     Returns:
-        Arrays (3,): `l2`, metres; `l2_endpoint`, metres at the horizon by any rules, NaN where
-        nothing is recorded there; `collision`, `point_collision` and `left_out`, shares. NaN if the
-        sample does not count.
+        Arrays (3,). `l2`: error by the rules, metres. `l2_endpoint`: error at the horizon itself,
+        metres; NaN if that step is not recorded. `collision`, `point_collision`: shares.
+        `left_out`: share of the steps that cannot collide. All are NaN if the sample does not
+        count.
     """
     if rules.whole_futures and not valid.all():
         names = ("l2", "l2_endpoint", "collision", "point_collision", "left_out")
         return {name: np.full(3, np.nan) for name in names}
-    (box, point), (recorded_box, _) = touched
+    box, point = touched[0]
+    recorded_box, _ = touched[1]
     errors = plan_displacement_errors(path, recorded)
     left_out_over = "mean" if rules.box_over == "any" else rules.box_over
     return {
@@ -304,14 +320,14 @@ def cell_numbers(
 
 
 def _at_horizons(values: AnyArray, over: Over) -> FloatArray:
-    """Return values (6,) of steps reduced to the horizons, shape (3,)."""
-    reduced = []
+    """Reduce the values at steps (6,) up to each horizon, shape (3,)."""
+    reduced_values = []
     for horizon in HORIZONS:
-        steps = values[: 2 * horizon].astype(np.float64)
+        step_values = values[: 2 * horizon].astype(np.float64)
         if over == "step":
-            reduced.append(steps[-1])
+            reduced_values.append(step_values[-1])
         elif over == "any":
-            reduced.append(steps.max())
+            reduced_values.append(step_values.max())
         else:
-            reduced.append(steps.mean())
-    return np.array(reduced)
+            reduced_values.append(step_values.mean())
+    return np.array(reduced_values)

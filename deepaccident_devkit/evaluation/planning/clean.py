@@ -1,16 +1,13 @@
-"""`CleanPlanning`: effects of a plan on a recorded accident, and costs where nothing happens."""
-
-from __future__ import annotations
+"""`CleanPlanning`: what a plan changes in a recorded accident, and what it costs elsewhere."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import Final
 
 import numpy as np
 
 from deepaccident_devkit.collisions.contact import TOUCHING
-from deepaccident_devkit.collisions.outcomes import MOST_MARGIN
+from deepaccident_devkit.collisions.outcomes import MAX_END_GAP_M
 from deepaccident_devkit.collisions.replay import HORIZON
 from deepaccident_devkit.evaluation.means import Sums
 from deepaccident_devkit.evaluation.planning.cells import (
@@ -29,23 +26,27 @@ from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# Seconds, metres or m/s²: times are decimal numbers, and a path projected on itself loses digits.
-_ROUNDING_TOLERANCE: Final = 1e-6
-# Seconds between a sample and the lead that it counts for: lists of samples count back from each
-# recording's own end.
-_LEAD_TOLERANCE_S: Final = 0.2
-# Recorded progress in metres above which the lost share of it is meaningful.
-_MIN_PROGRESS_M: Final = 1.0
+# Seconds, metres or m/s². Times are decimal numbers, and a path that is projected onto itself loses
+# digits.
+_ROUNDING_TOLERANCE = 1e-6
+# A sample counts for a lead if its time to the accident differs from it by at most this, seconds.
+# Lists of samples are counted back from the end of each recording, so leads are not exact.
+_LEAD_TOLERANCE_S = 0.2
+# The lost share of the recorded progress is only meaningful if the progress is longer than this.
+_MIN_PROGRESS_M = 1.0
+# To measure progress, the recorded path is extended by this many seconds after the recording.
+_PATH_EXTENSION_S = 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanPlanning:
-    """Rules of the protocol `clean`; docs/protocols.md, Planning, defines the numbers.
+    """Rules of the protocol `clean`; docs/protocols.md, section "Planning", defines its numbers.
 
     Attributes:
         leads: Seconds before the accident at which plans are judged.
-        most_acceleration: m/s² along or across beyond which a plan cannot be driven.
-        braking: m/s² of a deceleration that passengers feel.
+        most_acceleration: If a plan's longitudinal or lateral acceleration exceeds this, it cannot
+            be driven; m/s².
+        braking: Decelerations from which passengers notice braking, m/s².
     """
 
     leads: tuple[float, ...] = (3.0, 2.0, 1.0, 0.5)
@@ -56,48 +57,54 @@ class CleanPlanning:
 def add_clean(
     sums: Sums, plans: Mapping[str, Plan], scene: PlanningScene, rules: CleanPlanning
 ) -> None:
-    """Add the effects of plans, among others that keep their recorded motion, to the sums.
+    """Add the effects of plans to the sums; all other actors move as recorded.
 
     Args:
-        sums: Sums of the sample.
-        plans: Plans by the name of their row; the recorded path is called `recorded`.
+        sums: Sums of the sample, which are changed.
+        plans: Name of the row → plan; the row `recorded` has the recorded path.
         scene: Scene of the sample.
-        rules: The protocol.
+        rules: Rules of the protocol.
     """
     if len(scene.recorded) < 2:
         sums.note(
-            "no numbers of {sample} without a later frame that counts; twins end where their "
-            "accident does"
+            "no numbers for {sample} without a later frame that counts; a twin ends where its "
+            "accident ends"
         )
         return
-    margin = _margin(scene)
+    margin = _contact_margin(scene)
     contacts = {name: _contacts(plan, scene, margin) for name, plan in plans.items()}
     recorded_contacts = contacts["recorded"]
     overlapping = recorded_contacts.overlapping
     if overlapping.any():
-        sums.note("left out: {actor} touching the ego at the present", int(overlapping.sum()))
+        sums.note(
+            "excluded: {actor} touching ego in the sample's own frame", int(overlapping.sum())
+        )
     if scene.is_collider and not scene.is_twin:
-        reason = _unusable(scene, margin, recorded_contacts)
+        reason = _reason_to_leave_out(scene, margin, recorded_contacts)
         if reason:
-            sums.note(f"{scene.scenario}: {reason}; left out: {{sample}}")
+            sums.note(f"{scene.scenario}: {reason}; excluded: {{sample}}")
             return
-    leads = _lead_tables(scene, rules)
-    steps = steps_of(STEP, min(scene.duration, HORIZONS[-1]))
-    recorded = recorded_poses(scene, steps)[:, :2]
+    lead_tables = _lead_tables(scene, rules)
+    times = steps_of(STEP, min(scene.duration, HORIZONS[-1]))
+    recorded_path = recorded_poses(scene, times)[:, :2]
     for row, plan in plans.items():
-        errors = plan_displacement_errors(plan.poses(steps)[:, :2], recorded)
+        path = plan.poses(times)[:, :2]
+        errors = plan_displacement_errors(path, recorded_path)
         for horizon in HORIZONS:
-            for column, value in _at_horizon(errors, scene, contacts[row], horizon).items():
+            numbers = _numbers_at_horizon(errors, scene, contacts[row], horizon)
+            for column, value in numbers.items():
                 sums.add(f"{horizon} s", row, column, value)
-        if leads:
-            numbers = _at_lead(plan, scene, contacts[row], recorded_contacts, rules)
-            for table, (column, value) in product(leads, numbers.items()):
+        if lead_tables:
+            numbers = _numbers_at_lead(plan, scene, contacts[row], recorded_contacts, rules)
+            for table, (column, value) in product(lead_tables, numbers.items()):
                 sums.add(table, row, column, value)
 
 
 def _lead_tables(scene: PlanningScene, rules: CleanPlanning) -> list[str]:
-    """Return the names of the tables of the leads that a sample counts for."""
-    role = "" if scene.is_collider else "bystander, "
+    """Return the names of the tables of the leads at which the sample counts."""
+    role = "bystander, "
+    if scene.is_collider:
+        role = ""
     tables = []
     for end, suffix in ((scene.to_end, ""), (scene.to_contact, " to contact")):
         for lead in rules.leads:
@@ -107,36 +114,44 @@ def _lead_tables(scene: PlanningScene, rules: CleanPlanning) -> list[str]:
 
 
 def _contacts(plan: Plan, scene: PlanningScene, margin: float) -> Contacts:
-    """Return the first contacts of a plan with the others.
+    """Find the first contact of a plan with each other actor.
 
-    They are searched for at least 3 s, up to the plan's end or the recording's; with the partner
-    for 3 s after the recording.
+    The search ends with the plan or after 3 s, whichever is later, but at the latest with the
+    recording. For the partner it ends 3 s after the recording.
+
+    Args:
+        plan: Plan of the agent.
+        scene: Scene of the sample.
+        margin: Gap that counts as contact with the partner, metres; for others it is 0.
     """
-    partner_end = scene.duration + (HORIZON if scene.partner.any() else 0.0)
-    other_end = min(scene.duration, max(float(plan.times[-1]), HORIZONS[-1]))
+    partner_end = scene.duration
+    if scene.partner.any():
+        partner_end += HORIZON
+    plan_end = max(float(plan.times[-1]), HORIZONS[-1])
+    other_end = min(scene.duration, plan_end)
     times = np.append(0.0, steps_of(FRAME_PERIOD, partner_end))
     return first_contacts(
         box_path(plan.poses(times), scene.offset),
         scene.size,
-        _prolonged(scene, len(times)),
+        _extended_footprints(scene, len(times)),
         np.where(scene.partner, margin, 0.0),
         np.where(scene.partner, partner_end, other_end),
     )
 
 
-def _at_horizon(
+def _numbers_at_horizon(
     errors: FloatArray, scene: PlanningScene, contacts: Contacts, horizon: int
 ) -> dict[str, float]:
-    """Return displacement errors and contacts of a plan up to a horizon.
+    """Compute the displacement errors and contacts of a plan up to a horizon.
 
     Args:
         errors: (N,) distances from the recorded path at its steps, metres.
         scene: Scene of the sample.
         contacts: First contacts of the plan.
-        horizon: Seconds.
+        horizon: Seconds after the current frame.
 
     Returns:
-        Metres and percent by column; NaN where nothing is recorded.
+        Column → metres or percent; NaN if no step is recorded (for `l2`: the horizon's step).
     """
     if not len(errors):
         return {"l2": np.nan, "l2_mean": np.nan, "contact": np.nan}
@@ -150,25 +165,33 @@ def _at_horizon(
     }
 
 
-def _at_lead(
+def _numbers_at_lead(
     plan: Plan,
     scene: PlanningScene,
     contacts: Contacts,
     recorded_contacts: Contacts,
     rules: CleanPlanning,
 ) -> dict[str, float]:
-    """Return the effects of a plan on the accident, or on the same moment of a twin."""
+    """Compute the effects of a plan on the accident, or at the same time of a twin.
+
+    Returns:
+        Column → metres, m/s or percent.
+    """
     end = min(float(plan.times[-1]), scene.duration)
     latest = end + _ROUNDING_TOLERANCE
     is_new = (contacts.time <= latest) & (recorded_contacts.time > latest) & ~scene.partner
     along, across = _accelerations(plan, scene.before)
-    lost, progress = _progress(plan, scene, end)
     hardest = max(np.abs(along).max(), np.abs(across).max())
+    progress, recorded_progress = _progress(plan, scene, end)
+    lost_progress = recorded_progress - progress
+    lost_percent = np.nan
+    if recorded_progress > _MIN_PROGRESS_M:
+        lost_percent = 100.0 * lost_progress / recorded_progress
     numbers = {
         "striking": 100.0 * (is_new & ~contacts.struck).any(),
         "struck": 100.0 * (is_new & contacts.struck).any(),
-        "lost_way": lost,
-        "lost": 100.0 * lost / progress if progress > _MIN_PROGRESS_M else np.nan,
+        "lost_way": lost_progress,
+        "lost": lost_percent,
         "infeasible": 100.0 * (hardest > rules.most_acceleration + _ROUNDING_TOLERANCE),
     }
     if scene.is_twin:
@@ -186,98 +209,102 @@ def _at_lead(
 
 
 def box_path(poses: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return x, y, yaw of the centre of the ego's box, shape (N, 3).
+    """Convert poses of the ego frame to poses of the centre of the ego's box, (N, 3: x, y, yaw).
 
     Args:
-        poses: (N, 3) x, y, yaw of the ego frame.
+        poses: (N, 3) x, y, yaw of the ego frame, metres and radians.
         offset: (2,) centre of the box in the ego frame, metres.
     """
-    cosine = np.cos(poses[:, 2])
-    sine = np.sin(poses[:, 2])
-    x = poses[:, 0] + cosine * offset[0] - sine * offset[1]
-    y = poses[:, 1] + sine * offset[0] + cosine * offset[1]
-    return np.column_stack([x, y, poses[:, 2]])
+    x, y, yaw = poses.T
+    cosine = np.cos(yaw)
+    sine = np.sin(yaw)
+    box_x = x + cosine * offset[0] - sine * offset[1]
+    box_y = y + sine * offset[0] + cosine * offset[1]
+    return np.column_stack([box_x, box_y, yaw])
 
 
-def _margin(scene: PlanningScene) -> float:
-    """Return the gap between the recorded pair at the end, which counts as contact, metres.
+def _contact_margin(scene: PlanningScene) -> float:
+    """Return the gap between the recorded pair in the last frame, metres; NaN without a partner.
 
-    NaN without a partner.
+    A gap up to this size counts as contact with the partner.
     """
-    last_pose = scene.recorded[-1:]
-    center = box_path(last_pose, scene.offset)[0, :2]
-    ego = np.concatenate([center, scene.size, scene.recorded[-1, 2:]])
-    gaps = gaps_of_pairs(ego, scene.footprint[-1, scene.partner])
-    return float(gaps[0]) + TOUCHING if len(gaps) else np.nan
+    x, y, yaw = box_path(scene.recorded[-1:], scene.offset)[0]
+    ego_footprint = np.array([x, y, *scene.size, yaw])
+    gaps = gaps_of_pairs(ego_footprint, scene.footprint[-1, scene.partner])
+    if not len(gaps):
+        return np.nan
+    return float(gaps[0]) + TOUCHING
 
 
-def _prolonged(scene: PlanningScene, frames: int) -> FloatArray:
-    """Return the recorded footprints (frames, A, 5), after their end only the partner's.
+def _extended_footprints(scene: PlanningScene, frames: int) -> FloatArray:
+    """Extend the recorded footprints to a number of frames; only the partner moves on.
 
-    The partner goes straight on; its velocity is that between its last two labels, however many
-    frames between them have none.
+    The partner goes straight on with its velocity between its last two labels, even if there are
+    frames without a label between them.
+
+    Returns:
+        Footprints, shape (frames, A, 5); NaN where an actor is missing.
     """
     recorded = without_gaps(scene.footprint)
-    absent = np.full((frames - len(recorded), *recorded.shape[1:]), np.nan)
-    later = np.broadcast_to(recorded[-1], absent.shape).copy()
-    step = (recorded[-1] - recorded[-2])[:, :2]
-    steps = np.arange(1, len(absent) + 1)
-    later[..., :2] += steps[:, None, None] * step
-    partner = scene.partner[:, None]
-    return np.concatenate([recorded, np.where(partner, later, absent)])
+    later_frames = np.arange(1, frames - len(recorded) + 1)
+    later = np.repeat(recorded[-1:], len(later_frames), axis=0)
+    last_step = (recorded[-1] - recorded[-2])[:, :2]
+    later[..., :2] += later_frames[:, None, None] * last_step
+    later[:, ~scene.partner] = np.nan
+    return np.concatenate([recorded, later])
 
 
 def _accelerations(plan: Plan, before: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the accelerations along and across the heading at each step, m/s².
+    """Compute the longitudinal and lateral accelerations of a plan at each step, m/s².
 
     Args:
-        plan: The plan.
-        before: (2,) velocity at the present, m/s, from which the first change counts.
+        plan: Plan of the agent.
+        before: (2,) velocity before the plan begins, m/s; the first step is compared with it.
     """
     times = np.append(0.0, plan.times[plan.times > 0])
     poses = plan.poses(times)
-    periods = np.diff(times)
-    later_velocity = np.diff(poses[:, :2], axis=0) / periods[:, None]
-    velocity = np.vstack([before, later_velocity])
-    change = np.diff(velocity, axis=0) / periods[:, None]
-    cosine = np.cos(poses[:-1, 2])
-    sine = np.sin(poses[:-1, 2])
-    along = cosine * change[:, 0] + sine * change[:, 1]
-    across = cosine * change[:, 1] - sine * change[:, 0]
+    periods = np.diff(times)[:, None]
+    planned_velocity = np.diff(poses[:, :2], axis=0) / periods
+    velocity = np.vstack([before, planned_velocity])
+    ax, ay = (np.diff(velocity, axis=0) / periods).T
+    yaw = poses[:-1, 2]
+    cosine = np.cos(yaw)
+    sine = np.sin(yaw)
+    along = cosine * ax + sine * ay
+    across = cosine * ay - sine * ax
     return along, across
 
 
 def _progress(plan: Plan, scene: PlanningScene, time: float) -> tuple[float, float]:
-    """Return the progress that a plan loses up to a time, and the recorded progress.
-
-    Both in metres along the recorded path.
-    """
-    times = np.append(np.arange(len(scene.recorded)) * FRAME_PERIOD, scene.duration + 100.0)
+    """Return the planned and the recorded progress along the recorded path up to a time, metres."""
+    recorded_times = np.arange(len(scene.recorded)) * FRAME_PERIOD
+    times = np.append(recorded_times, scene.duration + _PATH_EXTENSION_S)
     path = recorded_poses(scene, times)[:, :2]
     steps = np.diff(path, axis=0)
-    lengths = np.hypot(*steps.T)
-    arcs = np.append(0.0, np.cumsum(lengths))
-    offset = plan.poses(np.array([time]))[0, :2] - path[:-1]
-    projection = (offset * steps).sum(axis=1)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    arc_lengths = np.append(0.0, np.cumsum(lengths))
+    recorded_progress = float(np.interp(time, times, arc_lengths))
+    planned_position = plan.poses(np.array([time]))[0, :2]
+    offsets = planned_position - path[:-1]
+    projections = (offsets * steps).sum(axis=1)
     zeros = np.zeros(len(steps))
-    share = np.divide(projection, lengths**2, out=zeros, where=lengths > 0).clip(0, 1)
-    distance = np.hypot(*(offset - share[:, None] * steps).T)
-    nearest = int(np.argmin(distance))
-    recorded_progress = float(np.interp(time, times, arcs))
-    progress = float(arcs[nearest] + share[nearest] * lengths[nearest])
-    return recorded_progress - progress, recorded_progress
+    shares = np.divide(projections, lengths**2, out=zeros, where=lengths > 0).clip(0, 1)
+    dx, dy = (offsets - shares[:, None] * steps).T
+    nearest_index = int(np.argmin(np.hypot(dx, dy)))
+    progress = float(arc_lengths[nearest_index] + shares[nearest_index] * lengths[nearest_index])
+    return progress, recorded_progress
 
 
-def _unusable(scene: PlanningScene, margin: float, recorded_contacts: Contacts) -> str:
-    """Return why an accident does not count, as half a sentence; empty if it does.
+def _reason_to_leave_out(scene: PlanningScene, margin: float, recorded_contacts: Contacts) -> str:
+    """Return why an accident does not count, as half a sentence; empty if it counts.
 
-    The recorded path must meet the partner.
+    It only counts if the ego on its recorded path touches the partner.
     """
     if not scene.partner.any():
         return "no label shows the partner from here on"
     if recorded_contacts.overlapping[scene.partner].any():
-        return "the pair touches at the present already"
-    if not margin <= MOST_MARGIN:
+        return "the pair already touches at the present moment"
+    if not margin <= MAX_END_GAP_M:
         return f"the pair is {margin:.2f} m apart at the end"
     contact_time = recorded_contacts.time[scene.partner][0]
     if contact_time <= scene.duration + _ROUNDING_TOLERANCE:

@@ -1,6 +1,4 @@
-"""`PlanningEvaluator`: plans by the definitions of four public codes, and by one for accidents."""
-
-from __future__ import annotations
+"""`PlanningEvaluator`: plans under the rules of four public implementations, or our own `clean`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -39,26 +37,29 @@ _Protocol = CleanPlanning | CellRules
 PLANNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType(
     {"clean": CleanPlanning(), **CELL_PROTOCOLS}
 )
-GIVEN: Final = "given"
+PLAN_ROW: Final = "given"
 TRIVIAL: Final = ("recorded", "standing", "constant velocity", "full braking")
-_MEAN: Final = "mean"
-_LEFT_OUT_NOTE: Final = (
-    "by these rules a plan that repeats the recorded accident has 0 % collisions: steps at which "
-    "the recorded path touches, or is not recorded, are left out; left_out is their share"
+_MEAN = "mean"
+_LEFT_OUT_NOTE = (
+    "by these rules a plan that repeats the recorded accident has 0 % collisions: steps at "
+    "which the recorded path touches another actor, or has ended, are left out; `steps left out` "
+    "is their share"
 )
-_CONTINUED_NOTE: Final = "continued straight on: {plan} ending before 3 s"
-_LARGE_YAW_NOTE: Final = (
-    "suspicious: {plan} with a yaw beyond 2π; yaw is in radians, not in degrees"
+_CONTINUED_NOTE = "continued straight on: {plan} ending before 3 s"
+_LARGE_YAW_NOTE = "suspicious: {plan} with a yaw beyond 2π; yaw is in radians, not in degrees"
+_POINT_FAR_OFF_NOTE = (
+    "ignore `collision rate of points`: it looks 25 m to the side of the path, as the released "
+    "code does"
 )
-_POINT_FAR_OFF_NOTE: Final = (
-    "point_collision looks 25 m beside the path, as the code does; ignore it"
-)
-_BY_HORIZON: Final = tuple(f"{horizon} s" for horizon in HORIZONS)
+_BY_HORIZON = tuple(f"{horizon} s" for horizon in HORIZONS)
 BY_LEAD: Final = tuple(f"lead {lead:g} s" for lead in CleanPlanning().leads)
 
 
 class PlanningResult(MeansResult):
-    """Tables by horizon, and in `clean` by lead; rows are the evaluated and the trivial plans."""
+    """Tables by horizon; in the protocol `clean` also by lead time.
+
+    Rows are the evaluated plan and the trivial plans.
+    """
 
     __slots__ = ()
     rows: ClassVar[tuple[Row, ...]] = table_rows(
@@ -87,16 +88,16 @@ class PlanningResult(MeansResult):
             Row("braking_twins", "%", is_headline=False),
         ),
         main_tables=(*BY_LEAD, *_BY_HORIZON, _MEAN),
-        main_row=GIVEN,
+        main_row=PLAN_ROW,
     )
 
 
 class PlanningEvaluator(MeansEvaluator[PlanningResult]):
-    """Collisions and errors of planned paths.
+    """Evaluator of planned paths: their collisions and errors.
 
-    For every protocol, rows of plans that need no planner stand beside the evaluated ones: a plan
-    equal to the recorded accident has no collision by any of the four public definitions, as they
-    leave out the steps at which the recorded path touches.
+    Every protocol also evaluates trivial plans that need no planner. Under all four public
+    implementations, a plan that repeats the recorded accident has no collision, because steps at
+    which the recorded path touches an object do not collide.
 
     >>> PlanningEvaluator("uniad").compute().samples
     0
@@ -123,91 +124,110 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
         ),
         *_BY_HORIZON,
         _MEAN,
-        GIVEN,
+        PLAN_ROW,
         *TRIVIAL,
     )
 
     def truth(self, dataset: Dataset, token: str, /, *_unused: Any) -> tuple[PlanningScene]:
-        """Return what happens around the ego vehicle; public codes count complete recordings."""
-        return (planning_scene(dataset, token, cut=isinstance(self.protocol, CleanPlanning)),)
+        """Return the scene around the ego, up to the cut.
+
+        Under the rules of the public implementations it covers the whole recording.
+        """
+        cut = isinstance(self.protocol, CleanPlanning)
+        return (planning_scene(dataset, token, cut=cut),)
 
     def update(self, token: str, plans: Iterable[Plan], scene: PlanningScene) -> None:
         """Count one sample.
 
         Args:
             token: Token of the sample.
-            plans: One or more plans; the one with the highest score counts, the first of equal
-                ones.
-            scene: Scene from `planning_scene(dataset, token)`; for the rules of the public codes
-                with `cut=False`.
+            plans: One or more plans; only the one with the highest score counts (ties: the first).
+            scene: Scene from `planning_scene(dataset, token)`; under the rules of the public
+                implementations, pass `cut=False` to it.
 
         Raises:
-            EvaluationError: there is no plan, it ends before the 3 s of the public codes, or the
-                sample came before with other counts.
+            EvaluationError: If there is no plan, the sample was counted before with other counts,
+                or under the rules of the public implementations the plan ends before 3 s.
         """
         items: list[Any] = list(plans)
-        non_plans = [item for item in items if not isinstance(item, Plan)]
-        if non_plans or not items:
-            found_name = type(non_plans[0]).__name__ if non_plans else "none"
-            raise EvaluationError(f"{token}: expected one Plan or more, found {found_name}")
-        plan = max(items, key=lambda item: item.score)
-        rows = {GIVEN: plan, **trivial_plans(scene)}
+        if not items:
+            raise EvaluationError(f"{token}: expected one Plan or more, found none")
+        for item in items:
+            if not isinstance(item, Plan):
+                found_name = type(item).__name__
+                raise EvaluationError(f"{token}: expected one Plan or more, found {found_name}")
+        best_plan: Plan = max(items, key=lambda plan: plan.score)
+        plans_by_row = {PLAN_ROW: best_plan, **trivial_plans(scene)}
+        plan_end = best_plan.times[-1]
         sums = Sums()
-        sums.note(LONG_PATHS, plan.times[-1] > LONGEST_PATH)
-        sums.note(_LARGE_YAW_NOTE, plan.yaw is not None and np.abs(plan.yaw).max() > 2 * np.pi)
+        sums.note(LONG_PATHS, plan_end > LONGEST_PATH)
+        has_large_yaw = best_plan.yaw is not None and np.abs(best_plan.yaw).max() > 2 * np.pi
+        sums.note(_LARGE_YAW_NOTE, has_large_yaw)
         if isinstance(self.protocol, CleanPlanning):
-            sums.note(_CONTINUED_NOTE, plan.times[-1] < HORIZONS[-1] - FRAME_PERIOD / 2)
-            add_clean(sums, rows, scene, self.protocol)
+            sums.note(_CONTINUED_NOTE, plan_end < HORIZONS[-1] - FRAME_PERIOD / 2)
+            add_clean(sums, plans_by_row, scene, self.protocol)
         else:
-            _add_cells(sums, token, rows, scene, self.protocol)
+            _add_cell_numbers(sums, token, plans_by_row, scene, self.protocol)
         self.add(token, sums.counts())
 
 
-def _add_cells(
-    sums: Sums, token: str, rows: Mapping[str, Plan], scene: PlanningScene, rules: CellRules
+def _add_cell_numbers(
+    sums: Sums, token: str, plans: Mapping[str, Plan], scene: PlanningScene, rules: CellRules
 ) -> None:
-    """Add the numbers of plans by a public code's rules to the sums; raises EvaluationError."""
+    """Add the numbers of plans under a public implementation's rules to the sums.
+
+    Raises:
+        EvaluationError: If the evaluated plan ends before the last step, at 3 s.
+    """
     sums.note(_LEFT_OUT_NOTE)
     if rules.point_far_off:
         sums.note(_POINT_FAR_OFF_NOTE)
     times = steps_of(STEP, STEPS * STEP)
-    plan_end = rows[GIVEN].times[-1]
+    plan_end = plans[PLAN_ROW].times[-1]
     if plan_end < times[-1] - FRAME_PERIOD / 2:
         raise EvaluationError(
-            f"{token}: the plan ends after {plan_end:g} s; these rules look {times[-1]:g} s "
+            f"{token}: the plan ends after {plan_end:g} s; this protocol looks {times[-1]:g} s "
             "ahead: plan so far, or evaluate by the protocol clean"
         )
     frames = np.rint(times / FRAME_PERIOD).astype(np.int64)
-    valid = frames < len(scene.recorded)
+    is_recorded = frames < len(scene.recorded)
     cells = _occupied_cells(scene, frames, rules)
-    ego = float(scene.size[0]), float(scene.size[1])
-    paths = {name: plan.poses(times)[:, :2] for name, plan in rows.items()}
-    touched = {name: touching(path, cells, ego, rules) for name, path in paths.items()}
-    recorded = paths[TRIVIAL[0]]
+    ego_size = float(scene.size[0]), float(scene.size[1])
+    paths = {name: plan.poses(times)[:, :2] for name, plan in plans.items()}
+    touched = {name: touching(path, cells, ego_size, rules) for name, path in paths.items()}
+    recorded_path = paths[TRIVIAL[0]]
     recorded_touched = touched[TRIVIAL[0]]
-    for name, path in paths.items():
-        numbers = cell_numbers(path, recorded, valid, (touched[name], recorded_touched), rules)
+    for row, path in paths.items():
+        both_touched = touched[row], recorded_touched
+        numbers = cell_numbers(path, recorded_path, is_recorded, both_touched, rules)
         for column, values in numbers.items():
+            # distances are in metres, shares in percent
             scaled = values if column.startswith("l2") else 100.0 * values
-            for table, value in zip((*_BY_HORIZON, _MEAN), (*scaled, scaled.mean()), strict=True):
-                sums.add(table, name, column, float(value))
+            for table, value in zip(_BY_HORIZON, scaled, strict=True):
+                sums.add(table, row, column, float(value))
+            sums.add(_MEAN, row, column, float(scaled.mean()))
 
 
 def _occupied_cells(scene: PlanningScene, frames: IntArray, rules: CellRules) -> BoolArray:
-    """Return the cells that others cover at frames (T,), shape (T, H, W); none after the end."""
-    drawn = _drawn(scene, rules)
-    nobody = np.zeros((0, 5))
-    cells = []
-    for frame in frames.tolist():
-        boxes = scene.footprint[frame, drawn] if frame < len(scene.recorded) else nobody
-        boxes = boxes[np.isfinite(boxes[:, 0])]
-        corners = corner_offsets(boxes) + boxes[:, None, :2]
-        cells.append(occupied(corners, rules))
-    return np.stack(cells)
+    """Mark the cells that other actors cover at frames (T,), shape (T, H, W) bool.
+
+    After the recording's end no cell is covered.
+    """
+    is_drawn = _is_drawn(scene, rules)
+    occupied_cells = np.zeros((len(frames), rules.size, rules.size), dtype=bool)
+    for cells, frame in zip(occupied_cells, frames, strict=True):
+        if frame < len(scene.recorded):
+            footprints = scene.footprint[frame, is_drawn]
+            footprints = footprints[np.isfinite(footprints[:, 0])]
+            corners = corner_offsets(footprints) + footprints[:, None, :2]
+            cells[:] = occupied(corners, rules)
+    return occupied_cells
 
 
-def _drawn(scene: PlanningScene, rules: CellRules) -> BoolArray:
-    """Return the actors with boxes that the rules draw, a mask (A,)."""
+def _is_drawn(scene: PlanningScene, rules: CellRules) -> BoolArray:
+    """Find the actors whose boxes the rules draw, shape (A,) bool."""
     if rules.objects == "vehicles":
         return ~scene.is_pedestrian
-    return scene.seen if rules.objects == "seen" else np.isfinite(scene.footprint[0, :, 0])
+    if rules.objects == "seen":
+        return scene.seen
+    return np.isfinite(scene.footprint[0, :, 0])

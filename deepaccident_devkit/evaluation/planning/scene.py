@@ -1,6 +1,4 @@
-"""`Plan`: a planned path of an agent; `PlanningScene`: what it meets; plans without a planner."""
-
-from __future__ import annotations
+"""`Plan`: a planned path of an agent; `PlanningScene`: what happens around it; trivial plans."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from deepaccident_devkit.collisions.recorded import Accident, accident_of, tried
+from deepaccident_devkit.collisions.recorded import Accident, accident_of, try_scenario
 from deepaccident_devkit.collisions.replay import braking_plans, motion_of, replay
 from deepaccident_devkit.collisions.twins import twin_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
@@ -30,16 +28,16 @@ from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
-# Seconds for which paths go straight on after their end.
-_EXTRAPOLATION_S: Final = 1000.0
-# Metres: a shorter step keeps the heading.
-_MIN_TURNING_STEP_M: Final = 0.1
-# m/s² of full braking.
+# Paths are extended straight on after their end by this many seconds.
+_EXTRAPOLATION_S = 1000.0
+# A step shorter than this keeps the heading of the previous step, metres.
+_MIN_TURNING_STEP_M = 0.1
+# Deceleration of full braking, m/s².
 BRAKING: Final = 8.0
-# Seconds that the trivial plans look ahead, at least.
-_MIN_PLAN_S: Final = 3.0
-# Share of a step by which a decimal time may miss its step.
-_STEP_TOLERANCE: Final = 1e-6
+# The trivial plans look at least this many seconds ahead.
+_MIN_PLAN_S = 3.0
+# A decimal time may differ from its step by this fraction of a step.
+_STEP_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,10 +45,11 @@ class Plan(FrozenArrays):
     """A path that the sample's agent plans to drive; arrays are read-only.
 
     Attributes:
-        times: (T,) seconds after the present, ascending.
-        path: (T, 2) origins of its ego frame, x forward, y left, metres in the present ego frame.
+        times: (T,) seconds after the current frame, ascending.
+        path: (T, 2) planned origins of the agent's ego frame, x forward, y left, metres in the
+            current ego frame.
         score: How good the plan is; higher is better.
-        yaw: (T,) headings, radians, counter-clockwise; None for the directions of the steps.
+        yaw: (T,) headings, radians, counter-clockwise; None takes the directions of the steps.
     """
 
     times: FloatArray
@@ -59,16 +58,22 @@ class Plan(FrozenArrays):
     yaw: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        """Check and freeze; raises GeometryError."""
+        """Check and freeze the arrays.
+
+        Raises:
+            GeometryError: If the plan ends before t = 0, or a shape or a value is invalid.
+        """
         times = ascending_times(self.times)
         path = checked("path", self.path, (len(times), 2)).copy()
-        yaw = None if self.yaw is None else checked("yaw", self.yaw, (len(times),)).copy()
+        yaw = self.yaw
+        if yaw is not None:
+            yaw = checked("yaw", yaw, (len(times),)).copy()
         if not times[-1] > 0:
             raise GeometryError(
-                "times: expected a plan for after the present, found the present alone"
+                "times: expected at least one time after the present, found only the present"
             )
         if not np.isfinite(path).all() or (yaw is not None and not np.isfinite(yaw).all()):
-            raise GeometryError("path: not all numbers are finite; leave out what is not planned")
+            raise GeometryError("path: not all numbers are finite; remove the times without a plan")
         score = checked_number("score", self.score)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "path", path)
@@ -77,57 +82,77 @@ class Plan(FrozenArrays):
         FrozenArrays.__post_init__(self)
 
     def poses(self, times: FloatArray) -> FloatArray:
-        """Return x, y and yaw at times (N,), shape (N, 3).
+        """Interpolate the plan's poses at times (N,), shape (N, 3: x, y, yaw), metres and radians.
 
-        Poses are linear between the stated ones from the present on, and go straight on after the
-        last one. Without stated yaw, it is the direction of the step, kept where the step is
-        shorter than 0.1 m.
+        A plan that begins later than t = 0 starts at the origin with yaw 0. After its last pose it
+        goes straight on. If the plan has no yaw, it is the direction of the step; a step shorter
+        than 0.1 m keeps the previous yaw.
         """
-        missing = int(self.times[0] > 0)
-        moments = np.append(np.zeros(missing), self.times)
-        path = np.vstack([np.zeros((missing, 2)), self.path])
+        plan_times = self.times
+        path = self.path
+        yaw = self.yaw
+        if plan_times[0] > 0:
+            # the plan begins at t = 0, at the origin
+            plan_times = np.append(0.0, plan_times)
+            path = np.vstack([np.zeros(2), path])
+            if yaw is not None:
+                yaw = np.append(0.0, yaw)
         steps = np.diff(path, axis=0)
-        if self.yaw is None:
-            # the first pose has no step that turns it
-            turns = np.append(True, np.hypot(*steps.T) >= _MIN_TURNING_STEP_M)
-            last_turn = np.maximum.accumulate(np.where(turns, np.arange(len(path)), 0))
-            yaw = np.append(0.0, np.arctan2(steps[:, 1], steps[:, 0]))[last_turn]
-        else:
-            yaw = np.append(np.zeros(missing), self.yaw)
-        values = np.column_stack([path, np.unwrap(yaw)])
-        if len(path) > 1:
-            last_period = moments[-1] - moments[-2]
-            extension = (*steps[-1] * (_EXTRAPOLATION_S / last_period), 0.0)
-            moments = np.append(moments, moments[-1] + _EXTRAPOLATION_S)
-            values = np.vstack([values, values[-1] + extension])
-        return np.column_stack([np.interp(times, moments, column) for column in values.T])
+        if yaw is None:
+            yaw = _directions(steps)
+        poses = np.column_stack([path, np.unwrap(yaw)])
+        if len(poses) > 1:
+            last_period = plan_times[-1] - plan_times[-2]
+            extension = steps[-1] * (_EXTRAPOLATION_S / last_period)
+            plan_times = np.append(plan_times, plan_times[-1] + _EXTRAPOLATION_S)
+            poses = np.vstack([poses, poses[-1]])
+            poses[-1, :2] += extension
+        return np.column_stack([np.interp(times, plan_times, column) for column in poses.T])
+
+
+def _directions(steps: FloatArray) -> FloatArray:
+    """Derive the yaw of a path's poses from its steps, shape (N + 1,), radians.
+
+    Args:
+        steps: (N, 2) steps between the poses, metres.
+    """
+    dx, dy = steps.T
+    # no step leads to the first pose, so its yaw is 0
+    yaw = np.append(0.0, np.arctan2(dy, dx))
+    turns = np.append(True, np.hypot(dx, dy) >= _MIN_TURNING_STEP_M)
+    last_turn = np.maximum.accumulate(np.where(turns, np.arange(len(yaw)), 0))
+    return np.asarray(yaw[last_turn])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlanningScene(FrozenArrays):
-    """What a plan meets from a sample's present on; present ego frame, metres, seconds, radians.
+    """What happens around a plan from a sample's frame on, in the current ego frame.
 
-    Arrays are read-only. F frames at 10 Hz from the present to the recording's end; A other actors.
+    Units are metres, seconds and radians; arrays are read-only. There are F frames at 10 Hz, from
+    the current one to the recording's end, and A other actors.
 
     Attributes:
         scenario: Token of the scenario.
-        recorded: (F, 3) x, y, yaw of the ego frame.
-        before: (2,) velocity of the ego over the frame before the present, m/s; at the first frame,
-            over the frame after it.
+        recorded: (F, 3) recorded x, y, yaw of the ego frame.
+        before: (2,) velocity of the ego from the previous to the current frame, m/s; in the
+            recording's first frame, from the current to the next one.
         size: (2,) length and width of the ego's box.
         offset: (2,) centre of the ego's box in the ego frame.
-        actor_id: (A,) ids of the others.
-        footprint: (F, A, 5) x, y, length, width, yaw of the others; NaN where nobody annotated
-            them.
-        is_pedestrian: (A,) whether the actor is a pedestrian.
-        seen: (A,) whether the agent sees the actor at the present (docs/released_code.md,
-            Visibility and attributes).
-        is_twin: Whether nobody collides here, but somebody does in the scenario's twin.
-        is_collider: Whether the agent is one of the colliding pair, for a twin in its accident.
-        partner: (A,) the other actor of the pair; none unless the agent collides here.
-        to_end: Seconds to the last frame of the accident, also for a twin; NaN without an accident.
-        to_contact: Seconds to the frame at which the pair begins to touch
-            (`Contact.contact_frame`); NaN without one.
+        actor_id: (A,) ids of the other actors.
+        footprint: (F, A, 5) x, y, length, width, yaw of the other actors; NaN where no agent
+            annotated them.
+        is_pedestrian: (A,) bool, True for pedestrians.
+        seen: (A,) bool, True for actors that the agent sees in the current frame (section
+            "Visibility and attributes" of docs/released_code.md).
+        is_twin: Whether there is no collision here, but there is one in the scenario's twin.
+        is_collider: Whether the agent is one of the colliding pair; for a twin, of the pair that
+            collides in its accident.
+        partner: (A,) bool, True for the actor that the agent collides with; False for all if the
+            agent does not collide here.
+        to_end: Seconds to the last frame of the accident, or for a twin, of its accident; NaN if
+            there is no accident.
+        to_contact: Seconds to the frame in which the pair begins to touch
+            (`Contact.contact_frame`); NaN if there is no such frame.
     """
 
     scenario: str
@@ -147,45 +172,46 @@ class PlanningScene(FrozenArrays):
 
     @property
     def duration(self) -> float:
-        """Seconds to the last frame."""
+        """Seconds from the current to the last frame."""
         return float((len(self.recorded) - 1) * FRAME_PERIOD)
 
 
 def planning_scene(dataset: Dataset, sample: RowArgument, *, cut: bool = True) -> PlanningScene:
-    """Return what a plan of a sample's agent meets, from the labels of all agents.
+    """Collect what happens around a sample's agent, from the labels of all agents.
 
     Args:
-        dataset: The release.
+        dataset: Release with the sample.
         sample: Token or record of the sample.
-        cut: Whether a twin ends where its accident does, and an accident at the last frame that
-            shows the pair.
+        cut: Whether to cut recordings: a twin where its accident ends, and an accident after the
+            last frame that shows the pair.
 
     Raises:
-        TokenError: no such sample.
-        EvaluationError: the label has no row of the agent itself, like that of the roadside.
-        NotAvailableError: the sample has no label, or the scenario no meta file.
+        TokenError: If the release does not have the sample.
+        EvaluationError: If the label has no row for the agent itself, as for the infrastructure.
+        NotAvailableError: If the sample has no label, or the scenario has no meta file.
     """
     record = labelled_sample(dataset, sample)
     token = record["token"]
     agent = dataset.get("agent", record["agent_token"])
     boxes = dataset.boxes(token, "ego")
-    own = np.flatnonzero(boxes.actor_id == OWN_ACTOR_ID)
-    if not len(own):
+    own_rows = np.flatnonzero(boxes.actor_id == OWN_ACTOR_ID)
+    if not len(own_rows):
         raise EvaluationError(
-            f"{token}: its label has no row of the agent itself (id {OWN_ACTOR_ID}), as that of "
-            "the roadside, which does not drive; leave such samples out (--agents vehicles)"
+            f"{token}: its label has no row of the agent itself (id {OWN_ACTOR_ID}); labels of "
+            "the infrastructure never have one. Leave out samples of the infrastructure "
+            "(--agents vehicles)"
         )
     scenario = dataset.scenario.get(record["scenario_token"])
-    present = int(token.rsplit("/", 1)[1])
-    last = scenario["num_frames"]
-    accident = _accident_of_story(dataset, scenario)
+    present_frame = int(token.rsplit("/", 1)[1])
+    last_frame = scenario["num_frames"]
+    accident = _accident_of_scenario_or_twin(dataset, scenario)
     if accident is not None and cut:
-        last = max(present, min(last, accident.last_frame))
-    truth = box_truth(dataset, token, (last - present) * FRAME_PERIOD)
-    other_rows = np.flatnonzero(truth.actor_id != agent["actor_id"])
-    actors = truth.actor_id[other_rows]
+        last_frame = max(present_frame, min(last_frame, accident.last_frame))
+    truth = box_truth(dataset, token, (last_frame - present_frame) * FRAME_PERIOD)
+    is_other = truth.actor_id != agent["actor_id"]
+    actor_ids = truth.actor_id[is_other]
     tracks = scenario_tracks(dataset, scenario)
-    is_walker = tracks.boxes.category == CATEGORIES.index("pedestrian")
+    is_pedestrian = tracks.boxes.category == CATEGORIES.index("pedestrian")
     is_twin = False
     is_collider = False
     pair: tuple[int, ...] = ()
@@ -196,98 +222,114 @@ def planning_scene(dataset: Dataset, sample: RowArgument, *, cut: bool = True) -
         is_collider = agent["name"] in accident.agents
         if is_collider and not is_twin:
             pair = accident.actor_ids
-        to_end = (accident.last_frame - present) * FRAME_PERIOD
+        to_end = (accident.last_frame - present_frame) * FRAME_PERIOD
         if accident.touching is not None:
             to_contact = to_end - accident.touching
-    poses = _ego_poses(dataset, token, present, last)
-    visible = visible_actors(dataset, token, agents=[agent["name"]])
+    poses = _ego_poses(dataset, token, present_frame, last_frame)
+    visible_ids = visible_actors(dataset, token, agents=[agent["name"]])
     return PlanningScene(
         scenario=scenario["token"],
         recorded=poses[1:],
         before=(poses[1] - poses[0])[:2] / FRAME_PERIOD,
-        size=boxes.size[own[0], :2].copy(),
-        offset=boxes.center[own[0], :2].copy(),
-        actor_id=actors,
-        footprint=truth.footprint[:, other_rows],
-        is_pedestrian=np.isin(actors, tracks.actor_id[is_walker]),
-        seen=np.isin(actors, visible),
+        size=boxes.size[own_rows[0], :2].copy(),
+        offset=boxes.center[own_rows[0], :2].copy(),
+        actor_id=actor_ids,
+        footprint=truth.footprint[:, is_other],
+        is_pedestrian=np.isin(actor_ids, tracks.actor_id[is_pedestrian]),
+        seen=np.isin(actor_ids, visible_ids),
         is_twin=is_twin,
         is_collider=is_collider,
-        partner=np.isin(actors, pair),
+        partner=np.isin(actor_ids, pair),
         to_end=to_end,
         to_contact=to_contact,
     )
 
 
-def _accident_of_story(dataset: Dataset, scenario: ScenarioRecord) -> Accident | None:
-    """Return the recorded accident of a scenario, otherwise that of its twin; None without one."""
-    outcomes = [tried(accident_of, dataset, scenario)]
+def _accident_of_scenario_or_twin(dataset: Dataset, scenario: ScenarioRecord) -> Accident | None:
+    """Return the recorded accident of a scenario or else of its twin; None if there is neither."""
+    outcome = try_scenario(accident_of, dataset, scenario)
+    if isinstance(outcome, Accident):
+        return outcome
     twin = twin_of(dataset, scenario)
-    if twin is not None:
-        outcomes.append(tried(accident_of, dataset, twin))
-    return next((outcome for outcome in outcomes if isinstance(outcome, Accident)), None)
+    if twin is None:
+        return None
+    outcome = try_scenario(accident_of, dataset, twin)
+    return outcome if isinstance(outcome, Accident) else None
 
 
-def _ego_poses(dataset: Dataset, token: str, present: int, last: int) -> FloatArray:
-    """Return x, y, yaw of the ego frame from the frame before the present on, shape (1 + F, 3).
+def _ego_poses(dataset: Dataset, token: str, present_frame: int, last_frame: int) -> FloatArray:
+    """Return x, y, yaw of the ego frame from the previous frame on, shape (1 + F, 3).
 
-    At the recording's first frame, the one before is extrapolated from the one after it.
+    In the recording's first frame, which has the number 1, the previous pose is extrapolated from
+    the current and the next one.
     """
-    row = dataset.getind("sample", token)
-    frames = row + np.arange(1 - min(present, 2), last - present + 1)
-    world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][frames])
-    present_from_world = inverses(world_from_ego[[min(present, 2) - 1]])
-    present_from_ego = present_from_world @ world_from_ego
-    yaw = np.unwrap(np.arctan2(present_from_ego[:, 1, 0], present_from_ego[:, 0, 0]))
-    poses = np.column_stack([present_from_ego[:, 0, 3], present_from_ego[:, 1, 3], yaw])
-    if present > 1:
+    frames_before = 1 if present_frame > 1 else 0
+    offsets = np.arange(-frames_before, last_frame - present_frame + 1)
+    rows = dataset.getind("sample", token) + offsets
+    world_from_ego = stored_transforms(dataset.columns("ego_pose")["matrix"][rows])
+    present_from_world = inverses(world_from_ego[[frames_before]])
+    matrices = present_from_world @ world_from_ego
+    yaw = np.unwrap(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]))
+    poses = np.column_stack([matrices[:, :2, 3], yaw])
+    if frames_before:
         return poses
-    return np.vstack([2 * poses[0] - poses[min(1, len(poses) - 1)], poses])
+    later_pose = poses[min(1, len(poses) - 1)]
+    return np.vstack([2 * poses[0] - later_pose, poses])
 
 
 def trivial_plans(scene: PlanningScene) -> Mapping[str, Plan]:
-    """Return the plans that every evaluation is compared with; they need no planner.
+    """Build the trivial plans, which need no planner and are evaluated for comparison.
 
-    `recorded` (what is left of the recording) and `full braking` (on the recorded path at 8 m/s²,
-    never faster than recorded) have steps of 0.1 s, `standing` (at once) and `constant velocity` of
-    0.5 s; they look at least 3 s ahead.
+    `recorded` repeats the rest of the recording. `full braking` brakes with 8 m/s² on the recorded
+    path, and is never faster than recorded. `standing` stands from t = 0 on. `constant velocity`
+    keeps the velocity. The first two have steps of 0.1 s, the others of 0.5 s. All look at least
+    3 s ahead.
     """
-    fine = steps_of(FRAME_PERIOD, max(_MIN_PLAN_S, scene.duration))
-    coarse = steps_of(0.5, _MIN_PLAN_S)
+    fine_times = steps_of(FRAME_PERIOD, max(_MIN_PLAN_S, scene.duration))
+    coarse_times = steps_of(0.5, _MIN_PLAN_S)
+    displacement = np.append(scene.before, 0.0)
     return {
-        "recorded": _plan_of(fine, recorded_poses(scene, fine)),
-        "standing": _plan_of(coarse, np.zeros((len(coarse), 3))),
-        "constant velocity": _plan_of(coarse, coarse[:, None] * np.append(scene.before, 0.0)),
-        "full braking": _plan_of(fine, recorded_poses(scene, fine, 0.0)),
+        "recorded": _plan(fine_times, recorded_poses(scene, fine_times)),
+        "standing": _plan(coarse_times, np.zeros((len(coarse_times), 3))),
+        "constant velocity": _plan(coarse_times, coarse_times[:, None] * displacement),
+        "full braking": _plan(fine_times, recorded_poses(scene, fine_times, braking_from=0.0)),
     }
 
 
-def _plan_of(times: FloatArray, poses: FloatArray) -> Plan:
-    """Return the plan of poses (N, 3) x, y, yaw at times (N,)."""
-    return Plan(times=times, path=poses[:, :2], yaw=poses[:, 2])
+def _plan(times: FloatArray, poses: FloatArray) -> Plan:
+    """Build a plan from poses (N, 3: x, y, yaw) at times (N,)."""
+    path = poses[:, :2]
+    yaw = poses[:, 2]
+    return Plan(times=times, path=path, yaw=yaw)
 
 
 def steps_of(step: float, duration: float) -> FloatArray:
-    """Return the seconds (N,) of steps up to a duration, from the first step on."""
+    """Return the times (N,) of steps up to a duration, seconds; t = 0 is not included.
+
+    Args:
+        step: Seconds from one step to the next.
+        duration: Time of the last step at the latest, seconds.
+    """
     count = math.floor(duration / step + _STEP_TOLERANCE)
-    numbers = np.arange(1, count + 1, dtype=np.float64)
-    return np.asarray(numbers * step)
+    return np.arange(1, count + 1, dtype=np.float64) * step
 
 
 def recorded_poses(
     scene: PlanningScene, times: FloatArray, braking_from: float = np.inf
 ) -> FloatArray:
-    """Return x, y, yaw of the recorded ego frame at times (N,), shape (N, 3).
+    """Interpolate the recorded poses of the ego frame at times (N,), shape (N, 3: x, y, yaw).
 
-    After its end the path goes straight on.
+    After the recording's end the path goes straight on.
 
     Args:
         scene: Scene with the recording.
-        times: (N,) seconds after the present.
-        braking_from: Seconds after the present from which on the ego brakes fully.
+        times: (N,) seconds after the current frame.
+        braking_from: Seconds after the current frame at which the ego begins full braking; inf for
+            no braking.
     """
     if len(scene.recorded) < 2:
         return np.zeros((len(times), 3))
     motion = motion_of(scene.recorded, horizon=_EXTRAPOLATION_S)
     plans = braking_plans(motion, [braking_from], BRAKING)
-    return replay(motion, plans, np.zeros(len(times), dtype=np.int64), times).poses
+    plan_index = np.zeros(len(times), dtype=np.int64)
+    return replay(motion, plans, plan_index, times).poses

@@ -1,6 +1,7 @@
-"""Results files: a model's predictions of many samples, in formats that others can write and check.
+"""Results files: a model's predictions for many samples, in formats that others can write.
 
-schema/results/README.md describes them; `ResultsWriter` writes, `read_results` reads.
+schema/results/README.md describes the formats; `ResultsWriter` writes results and `read_results`
+reads them.
 """
 
 from deepaccident_devkit.evaluation.results.motion import MotionForm

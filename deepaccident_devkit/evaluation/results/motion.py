@@ -1,6 +1,6 @@
-"""Motion results in a folder: their form, the manifest of their shards, and the shards' arrays.
+"""Motion results in a folder: their format, the manifest of their shards, and the shards' arrays.
 
-Arrays are never unpickled, and never larger than expected.
+Arrays are never unpickled, and arrays that are larger than expected are never read.
 """
 
 from __future__ import annotations
@@ -48,40 +48,40 @@ from deepaccident_devkit.support.reading import (
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# Path of an array in the archive, for a sample's token and the array's name.
+# Template of an array's path in the archive, from the sample token and the name of the array.
 MEMBER: Final = "{}/{}.npy"
-# Map → number of its channels.
+# Name of a head → its number of channels.
 HEADS: Final[Mapping[str, int]] = {"segmentation": 2, "centerness": 1, "offset": 2, "flow": 2}
-# Arrays that earlier files have beside their maps, with the same content.
+# Arrays that older files contain, too; they only repeat what the maps say.
 NOT_READ: Final = ("trajectory_id", "trajectory")
-# Number of cells over all frames and predictions of a sample, twenty times that of ten released
-# predictions. A small archive can hold more, but memory cannot.
-_MAX_CELLS: Final = 2**26
-# Bytes of a number, and of the header of an array.
-_MAX_NUMBER_BYTES: Final = 8
-_MAX_HEADER_BYTES: Final = 1 << 16
-# First bytes of an array's file.
-_NPY_MAGIC: Final = b"\x93NUMPY\x01\x00"
-_KIND_NAMES: Final = {"u": "unsigned whole numbers", "i": "whole numbers", "f": "floats"}
-_MAX_ID: Final = 2**31 - 1
-_MAX_OPEN_FILES: Final = 8
-# Tolerance of a step in frames.
-_FRAME_TOLERANCE: Final = 1e-6
+# Largest number of cells of a sample, summed over frames and predictions: twenty times the number
+# in ten released predictions. A small archive can hold more, but memory cannot.
+_MAX_CELLS = 2**26
+# Largest sizes of a single number, and of the header of an array, in bytes.
+_MAX_NUMBER_BYTES = 8
+_MAX_HEADER_BYTES = 1 << 16
+# First bytes of an array file.
+_NPY_MAGIC = b"\x93NUMPY\x01\x00"
+_KIND_NAMES = {"u": "unsigned whole numbers", "i": "whole numbers", "f": "floats"}
+_MAX_ID = 2**31 - 1
+_MAX_OPEN_FILES = 8
+# A step may differ from a whole number of frames by this fraction of a frame.
+_FRAME_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionForm:
-    """How motion results are stored: the same for all samples of a file.
+    """Layout of stored motion results, which all samples of a file share.
 
     Attributes:
-        stored: `instances`: maps of ids; `heads`: the model's own maps.
-        grid: BEV grid of the maps, with their orientation.
-        predictions: Largest number K of predictions of a sample; of several, the last one is the
-            mean.
-        frames: Number T of frames, the present one first.
+        stored: `instances` for maps of ids, `heads` for the outputs of the model.
+        grid: BEV grid and orientation of the maps.
+        predictions: Largest number K of predictions per sample; if there are several, the last one
+            is the mean.
+        frames: Number T of frames; the current frame is the first.
         step: Seconds between frames, a whole number of recorded frames (0.1 s).
-        labels: Name of the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned from;
-            None if not known.
+        labels: Name of the label protocol (`motion.LABEL_PROTOCOLS`) that the model was trained on;
+            None if unknown.
     """
 
     stored: Stored
@@ -92,7 +92,7 @@ class MotionForm:
     labels: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the values; raises ResultsError that names the field."""
+        """Check the fields; raise a ResultsError that names the first invalid one."""
         if not isinstance(self.grid, BevGrid):
             raise ResultsError(f"grid: expected a BevGrid, found {type(self.grid).__name__}")
         allowed = {"stored": get_args(Stored), "labels": (*LABEL_PROTOCOLS, None)}
@@ -106,7 +106,7 @@ class MotionForm:
         if self.predictions * self.frames * self.grid.cells > _MAX_CELLS:
             raise ResultsError(
                 f"form: {self.predictions} predictions of {self.frames} frames of "
-                f"{self.grid.cells} cells are more than memory holds; store fewer"
+                f"{self.grid.cells} cells do not fit into memory; store fewer"
             )
 
     def _check_step(self) -> None:
@@ -115,12 +115,12 @@ class MotionForm:
         is_positive = math.isfinite(frames) and frames > 0.5
         if not (is_positive and abs(frames - round(frames)) < _FRAME_TOLERANCE):
             raise ResultsError(
-                "step: expected seconds, a whole number of recorded frames of 0.1 s, found "
+                "step: expected seconds that are a multiple of 0.1 s (one frame), found "
                 f"{self.step!r}"
             )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the form as JSON."""
+        """Convert the form to JSON-compatible values."""
         return {
             "stored": self.stored,
             "x": list(self.grid.x),
@@ -134,7 +134,7 @@ class MotionForm:
 
     @classmethod
     def from_record(cls, record: FormRecord) -> MotionForm:
-        """Return the form of a JSON record; raises ContentError that names the field."""
+        """Build the form from a record; raise a ContentError that names the first invalid field."""
         try:
             return cls(
                 grid=BevGrid(record.x, record.y, record.orientation),
@@ -149,23 +149,24 @@ class MotionForm:
 
 
 class MotionContents:
-    """Motion in the shards of a folder; the counterpart of `reader.EntryContents`."""
+    """Motion results in the shards of a folder; `reader.EntryContents` holds all other results."""
 
     task: ResultsTask = "motion"
 
     def __init__(self, path: Path, meta: Mapping[str, Any], document: MotionFile) -> None:
-        """Check the manifest, and the existence and size of its shards; raises ContentError."""
-        self._path, self._root = path, path.parent
+        """Check the manifest; raise ContentError if a shard is missing or has the wrong size."""
+        self._path = path
+        self._root = path.parent
         self.meta = meta
         self.shards = document.shards
         with locate_errors("form"):
             self.form = MotionForm.from_record(document.form)
-        self._shard_of = _shards_of(document.shards, path.parent)
-        self.tokens: Collection[str] = self._shard_of.keys()
+        self._shard_by_token = _map_shards(document.shards, path.parent)
+        self.tokens: Collection[str] = self._shard_by_token.keys()
 
     def prediction(self, token: str) -> MotionOutput:
-        """Return the prediction of a sample; raises ResultsError."""
-        shard = self._shard_of[token]
+        """Read the prediction of a sample; raise ResultsError if it is missing or damaged."""
+        shard = self._shard_by_token[token]
         failed_token = ""
         try:
             archive = shared_archive(self._root, shard, os.getpid())
@@ -175,37 +176,39 @@ class MotionContents:
             raise fault_of(self._path, error, shard.file, failed_token) from error
 
     def check(self, **engine: Any) -> None:
-        """Read every array; raises ResultsError that names shard, token and array.
+        """Read every array; raise a ResultsError with shard, token and array if one is invalid.
 
         Args:
             **engine: Arguments of `run_batch`.
         """
         check = partial(check_shard, self._root, self.form)
-        run_batch(check, self.shards, label="shards", places=Places(reads=(self._root,)), **engine)
+        places = Places(reads=(self._root,))
+        run_batch(check, self.shards, label="Checking shards", places=places, **engine)
 
 
-def _shards_of(shards: Sequence[Shard], root: Path) -> dict[str, Shard]:
-    """Return token → its shard, in the order of the shards.
+def _map_shards(shards: Sequence[Shard], root: Path) -> dict[str, Shard]:
+    """Map each token to its shard, in the order of the shards.
 
-    Raises ContentError that names the field, or the shard.
+    Raise a ContentError that names the field or the shard if a shard is invalid or lists a token
+    that occurs twice.
     """
-    shard_of: dict[str, Shard] = {}
-    files: set[str] = set()
+    shard_by_token: dict[str, Shard] = {}
+    seen_files: set[str] = set()
     for number, shard in enumerate(shards):
         with locate_errors(f"shards[{number}]"):
-            _check_file(shard, root, files)
-        files.add(shard.file)
+            _check_file(shard, root, seen_files)
+        seen_files.add(shard.file)
         for token in shard.tokens:
             with locate_errors(f"shards[{number}].tokens"):
                 check_token(token)
-            if token in shard_of:
-                owner = shard_of[token]
-                repetition = "twice" if owner is shard else f"also in {owner.file}"
-                raise ContentError(
-                    f"{shard.file}: {token}: stands there {repetition}; store a sample once"
-                )
-            shard_of[token] = shard
-    return shard_of
+            if token in shard_by_token:
+                earlier_shard = shard_by_token[token]
+                repetition = f"also appears in {earlier_shard.file}"
+                if earlier_shard is shard:
+                    repetition = "appears twice"
+                raise ContentError(f"{shard.file}: {token}: {repetition}; store a sample once")
+            shard_by_token[token] = shard
+    return shard_by_token
 
 
 def _check_file(shard: Shard, root: Path, other_files: AbstractSet[str]) -> None:
@@ -218,17 +221,18 @@ def _check_file(shard: Shard, root: Path, other_files: AbstractSet[str]) -> None
         )
     path = root / shard.file
     if shard.file in other_files:
-        raise ContentError(f"file: {shard.file} is another entry's too; list each file once")
+        raise ContentError(f"file: {shard.file} is listed twice; list each file once")
     try:
         status = path.stat()
         is_in_folder = path.resolve().is_relative_to(root.resolve())
     except OSError as error:
         raise ContentError(
-            f"file: {shard.file} cannot be opened ({error.strerror}); copy it to its place"
+            f"file: {shard.file} cannot be opened ({error.strerror}); copy it to this path"
         ) from error
     if not is_in_folder:
         raise ContentError(
-            f"file: {shard.file} is a link that leads out of the folder; put the file itself there"
+            f"file: {shard.file} is a link to a file outside the folder; replace the link "
+            "with the file itself"
         )
     irregular = irregular_text(status.st_mode)
     if irregular:
@@ -241,38 +245,45 @@ def _check_file(shard: Shard, root: Path, other_files: AbstractSet[str]) -> None
 
 
 def _is_inside(path: PurePosixPath) -> bool:
-    return not path.is_absolute() and path.parts != () and ".." not in path.parts
+    """Return whether a relative path stays inside the folder that it starts from."""
+    if path.is_absolute() or not path.parts:
+        return False
+    return ".." not in path.parts
 
 
 @lru_cache(maxsize=_MAX_OPEN_FILES)
 def shared_archive(root: Path, shard: Shard, _process: int) -> zipfile.ZipFile:
-    """Return a shard's archive; the most recent archives stay open. Raises ContentError.
+    """Return a shard's open archive; the most recently used archives stay open.
 
-    Threads may share it, so the garbage collector closes it. A fork shares positions in open files
-    with its parent, and so must pass its own process id.
+    Raise ContentError if the archive cannot be read. Threads may share an archive, so the garbage
+    collector closes it. A forked process shares file positions with its parent, so it must pass its
+    own process id.
     """
     return open_archive(root, shard)
 
 
 def open_archive(root: Path, shard: Shard) -> zipfile.ZipFile:
-    """Open a shard's archive; raises ContentError."""
+    """Open a shard's archive; raise ContentError if it cannot be read."""
     try:
         return open_zip(root / shard.file)
     except DAMAGED_ARCHIVE as error:
-        raise ContentError(
-            f"is no npz archive that can be read ({error}); copy it again"
-        ) from error
+        raise ContentError(f"is not a readable npz archive ({error}); copy it again") from error
 
 
 def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
-    """Read a shard of the results in a folder; raises ResultsError with shard, token and array."""
+    """Read a shard completely; raise a ResultsError with shard, token and array if it is invalid.
+
+    Args:
+        root: Folder of the results.
+        form: Layout of the results.
+        shard: Entry of the manifest.
+    """
     path = root / shard.file
     token = ""
     try:
         if path.stat().st_size != shard.bytes or file_checksum(path) != shard.checksum:
             raise ContentError(
-                "its bytes are not those that the checksum is of; copy it again from where it was "
-                "made"
+                "its content does not match its checksum; copy it again from where it was made"
             )
         with open_archive(root, shard) as archive:
             _check_members(archive, shard, form)
@@ -283,37 +294,42 @@ def check_shard(root: Path, form: MotionForm, shard: Shard) -> None:
 
 
 def _check_members(archive: zipfile.ZipFile, shard: Shard, form: MotionForm) -> None:
-    """Raise ContentError if an archive has foreign or repeated members."""
+    """Raise ContentError if an archive has unknown or repeated members."""
     tokens = set(shard.tokens)
-    arrays = {f"{name}.npy" for name in (*array_layout(form), *NOT_READ)}
-    for name, count in Counter(archive.namelist()).items():
-        token, _, array = name.rpartition("/")
-        if token not in tokens or array not in arrays:
+    file_names = {f"{name}.npy" for name in (*array_layout(form), *NOT_READ)}
+    for member, count in Counter(archive.namelist()).items():
+        token, _, file_name = member.rpartition("/")
+        if token not in tokens or file_name not in file_names:
             raise ContentError(
-                f"{name}: belongs to no sample of the shard; store the arrays of its tokens alone"
+                f"{member}: belongs to no sample of the shard; store only arrays of its tokens"
             )
         if count > 1:
-            raise ContentError(f"{name}: stands there {count} times; store each array once")
+            raise ContentError(f"{member}: appears {count} times; store each array once")
 
 
 def array_layout(form: MotionForm) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return array of each sample → its shape and numpy's letters of its kinds.
+    """Return the expected shapes and dtype kinds of a sample's arrays.
 
-    The first axis may be shorter.
+    Returns:
+        Name of an array → its shape, whose first axis may be shorter, and the letters of the numpy
+        dtype kinds that it may have.
     """
-    maps, cells = (form.predictions, form.frames), form.grid.shape
+    map_counts = (form.predictions, form.frames)
     if form.stored == "instances":
-        return {"instance": ((*maps, *cells), "ui")}
-    return {name: ((*maps, channels, *cells), "f") for name, channels in HEADS.items()}
+        return {"instance": ((*map_counts, *form.grid.shape), "ui")}
+    layout: dict[str, tuple[tuple[int, ...], str]] = {}
+    for name, channels in HEADS.items():
+        layout[name] = ((*map_counts, channels, *form.grid.shape), "f")
+    return layout
 
 
 def read_output(archive: zipfile.ZipFile, token: str, form: MotionForm) -> MotionOutput:
-    """Return the prediction of a sample; raises ContentError that begins with the array's name."""
+    """Read the prediction of a sample; raise a ContentError that names the first invalid array."""
     arrays: dict[str, AnyArray] = {}
     name = ""
     try:
         for name, (shape, kinds) in array_layout(form).items():
-            arrays[name] = read_array(archive, MEMBER.format(token, name), shape, kinds)
+            arrays[name] = read_checked_array(archive, MEMBER.format(token, name), shape, kinds)
     except ContentError as error:
         raise ContentError(f"{name}: {error}") from error
     if form.stored == "instances":
@@ -329,22 +345,25 @@ def read_output(archive: zipfile.ZipFile, token: str, form: MotionForm) -> Motio
         raise ContentError(str(error)) from error
 
 
-def read_array(archive: zipfile.ZipFile, member: str, shape: Sequence[int], kinds: str) -> AnyArray:
-    """Return an array of an archive, as long as the shape or shorter; raises ContentError.
+def read_checked_array(
+    archive: zipfile.ZipFile, member: str, shape: Sequence[int], kinds: str
+) -> AnyArray:
+    """Read an array from an archive; raise ContentError if it is not as expected.
 
-    An array that takes more bytes is not decompressed.
+    An array with more bytes than expected is not decompressed.
 
     Args:
-        archive: The archive.
-        member: Path in the archive.
-        shape: Expected shape.
-        kinds: numpy's letters of the expected kinds.
+        archive: Open archive.
+        member: Path of the array in the archive.
+        shape: Expected shape; the first axis may be shorter.
+        kinds: Letters of the accepted numpy dtype kinds.
     """
     try:
         entry = archive.getinfo(member)
     except KeyError:
         raise ContentError(f"is missing; expected the member {member}") from None
-    expected = f"expected shape (1 to {shape[0]}, {', '.join(map(str, shape[1:]))})"
+    max_length, *other_lengths = shape
+    expected = f"expected shape (1 to {max_length}, {', '.join(map(str, other_lengths))})"
     max_bytes = math.prod(shape) * _MAX_NUMBER_BYTES + _MAX_HEADER_BYTES
     if entry.file_size > max_bytes:
         raise ContentError(
@@ -360,10 +379,9 @@ def read_array(archive: zipfile.ZipFile, member: str, shape: Sequence[int], kind
     if not content.startswith(_NPY_MAGIC):
         raise ContentError("expected npy format 1.0, as numpy.save writes numbers")
     if array.dtype.kind not in kinds:
-        raise ContentError(
-            f"expected {' or '.join(_KIND_NAMES[kind] for kind in kinds)}, found {array.dtype}"
-        )
-    has_shape = array.ndim == len(shape) and array.shape[1:] == tuple(shape[1:])
-    if not has_shape or not 1 <= len(array) <= shape[0]:
+        expected_kinds = " or ".join(_KIND_NAMES[kind] for kind in kinds)
+        raise ContentError(f"expected {expected_kinds}, found {array.dtype}")
+    has_shape = array.ndim == len(shape) and [*array.shape[1:]] == other_lengths
+    if not has_shape or not 1 <= len(array) <= max_length:
         raise ContentError(f"{expected}, found {array.shape}")
     return array

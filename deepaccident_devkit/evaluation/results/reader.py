@@ -1,6 +1,7 @@
-"""`Results`: a model's predictions of many samples, read strictly from a results file.
+"""`Results`: a model's predictions for many samples, read strictly from a results file.
 
-Accidents and detected boxes are read as columns over all entries; motion stays in its shards.
+Accidents and detected boxes are read into columns of all entries; motion stays in its shards until
+it is needed.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import copy
 import gc
 import hashlib
 import math
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ from deepaccident_devkit.evaluation.results.records import (
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import NO_NAME, fault_text, irregular_text, read_bytes
-from deepaccident_devkit.support.text import counted, path_of
+from deepaccident_devkit.support.text import PathType, counted, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 
 if TYPE_CHECKING:
@@ -55,41 +55,45 @@ if TYPE_CHECKING:
 
 Prediction = MotionOutput | list[Accident] | DetectedBoxes | list[Plan] | list[Forecast]
 Columns = dict[str, AnyArray]
-# Tolerance of a quaternion's norm; `Boxes` normalises it.
-_UNIT_TOLERANCE: Final = 1e-3
-_UNKNOWN_VELOCITY: Final = (math.nan, math.nan)
-# Number of parsed files that a process caches.
-_MAX_CACHED_FILES: Final = 4
-# Name of the column of plans or forecasts.
-_OBJECT: Final = "object"
+# Token → records of the boxes that were detected in the sample.
+_BoxRecords = Mapping[str, Sequence[BoxEntry]]
+# The length of a quaternion may differ from 1 by this much, since `Boxes` normalises quaternions.
+_UNIT_TOLERANCE = 1e-3
+_UNKNOWN_VELOCITY = (math.nan, math.nan)
+# Largest number of parsed files that a process caches.
+_MAX_CACHED_FILES = 4
+# Name of the column that holds plans or forecasts as objects.
+_OBJECT = "object"
 
 
 class Results:
     """Predictions by sample token; `read_results` opens them.
 
-    Cheap to pickle, since copies read the file again, once a process; safe in threads and in forked
-    workers.
+    Results are cheap to pickle, because each process reads the file itself, once. They can be used
+    in threads and in forked workers.
 
     Attributes:
         path: Path of the file, or of the folder of motion results.
         task: Kind of the predictions.
-        fingerprint: Hash of the file's bytes; the file of motion results holds the shards'
-            checksums.
+        fingerprint: Hash of the file's bytes. For motion results it covers the shards, too, since
+            the file holds their checksums.
     """
 
     def __init__(self, path: Path, task: ResultsTask, fingerprint: str) -> None:
-        """Store the properties of results that `read_results` has read; call it to open results."""
+        """Store the fields; call `read_results` to open results."""
         self.path = path
         self.task = task
         self.fingerprint = fingerprint
         self._file = path / RESULTS_FILE if task == "motion" else path
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle without the contents."""
+        """Return what pickle stores: everything but the contents."""
         return Results, (self.path, self.task, self.fingerprint)
 
     def __repr__(self) -> str:
-        return f"<{self.task} results: {counted(len(self), 'sample')} in {self.path}>"
+        """Return the task, the number of samples and the path."""
+        samples = counted(len(self), "sample")
+        return f"<{self.task} results: {samples} in {self.path}>"
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -101,12 +105,12 @@ class Results:
 
     @property
     def tokens(self) -> tuple[str, ...]:
-        """The samples, in the file's order."""
+        """Tokens of the samples, in the file's order."""
         return tuple(self._contents.tokens)
 
     @property
     def meta(self) -> dict[str, Any]:
-        """The notes of the file's author; a copy."""
+        """A copy of the author's notes in the file."""
         return copy.deepcopy(dict(self._contents.meta))
 
     @property
@@ -115,36 +119,34 @@ class Results:
         return self._contents.form
 
     def prediction(self, token: str) -> Prediction:
-        """Return the prediction of a sample.
+        """Return the prediction for a sample.
 
         Returns:
-            For motion a MotionOutput; for accidents, plans and forecasts a list, empty if there is
-            none; for detection the boxes, in the world frame.
+            For motion, a MotionOutput. For detection, boxes in the world frame. For accidents,
+            plans and forecasts, a list; it is empty if nothing is predicted.
 
         Raises:
-            TokenError: the results do not have the sample.
-            ResultsError: its arrays are missing or damaged, or the file was changed.
+            TokenError: If the results do not contain the sample.
+            ResultsError: If arrays of the sample are missing or damaged, or the file was changed.
         """
         contents = self._contents
         if token not in contents.tokens:
             raise TokenError(
-                f"{self.path}: has no prediction of {token!r}; `tokens` lists those that it has"
+                f"{self.path}: has no prediction for {token!r}; `tokens` lists all samples "
+                "that have one"
             )
         return contents.prediction(token)
 
-    def check(
-        self,
-        **engine: Unpack[Engine],
-    ) -> None:
-        """Read and check everything: call it before long work and before publishing.
+    def check(self, **engine: Unpack[Engine]) -> None:
+        """Read and check everything; do this before a long job or before you publish the results.
 
         Args:
-            **engine: `workers` (1 by default), `executor` and `progress`, see `parallel.Engine`.
+            **engine: `workers` (1 by default), `executor` and `progress`; see `parallel.Engine`.
 
         Raises:
-            ResultsError: names the shard, the token and the array of the first fault, or the file
-                was changed.
-            WorkerError: a worker was killed, or does not see the results.
+            ResultsError: If an array is invalid (the message names the shard, the token and the
+                array of the first fault), or if the file was changed.
+            WorkerError: If a worker was killed, or cannot see the results.
         """
         _read_content(self._file, self.fingerprint)
         contents = self._contents
@@ -153,44 +155,53 @@ class Results:
 
     @property
     def _contents(self) -> Contents:
-        return contents_of(self._file, self.fingerprint)[0]
+        """Contents of the file, parsed on first use; raises ResultsError if they are invalid."""
+        contents, _ = contents_of(self._file, self.fingerprint)
+        return contents
 
 
-def read_results(path: str | os.PathLike[str]) -> Results:
-    """Open results (schema/results/README.md).
+def read_results(path: PathType) -> Results:
+    """Open results in the format that schema/results/README.md describes.
 
-    All accidents and boxes are checked; of motion only the manifest.
+    All entries are checked; for motion results, only the manifest is checked.
 
     Args:
-        path: A JSON file, or a folder with a results.json, as for motion results.
+        path: Path of a JSON file, or of a folder that contains a results.json, as motion results
+            do.
 
     Raises:
-        ResultsError: there is none, it is of another version, or against its format; the message
-            names the first wrong entry by its token and field.
+        ResultsError: If there are no results at the path, their version is not supported, or they
+            violate the format; the message names the token and field of the first invalid entry.
     """
-    file = _file_of(path_of(path, error=ResultsError).absolute())
+    file = _find_file(path_of(path, error=ResultsError).absolute())
     contents, fingerprint = contents_of(file)
-    task = contents.task
-    if task == "motion" and file.name != RESULTS_FILE:
+    if contents.task != "motion":
+        return Results(file, contents.task, fingerprint)
+    if file.name != RESULTS_FILE:
         raise ResultsError(
-            f"{file}: is the manifest of motion results; call it {RESULTS_FILE}, as others look "
-            "for it"
+            f"{file}: is the manifest of motion results; rename it to {RESULTS_FILE}, the name "
+            "that all readers expect"
         )
-    return Results(file.parent if task == "motion" else file, task, fingerprint)
+    return Results(file.parent, contents.task, fingerprint)
 
 
-def _file_of(path: Path) -> Path:
-    """Return the JSON file of results at a path; raises ResultsError."""
+def _find_file(path: Path) -> Path:
+    """Return the path of the JSON file, for the path of a file or of a folder with results.
+
+    Raise ResultsError if there is no such file.
+    """
     file = path
     try:
         file = path / RESULTS_FILE if path.is_dir() else path
         irregular = irregular_text(file.stat().st_mode)
     except FileNotFoundError:
-        fault = "no such file or folder" if file == path else f"holds no {RESULTS_FILE}"
-        raise ResultsError(f"{path}: {fault}; give the results that ResultsWriter made") from None
+        fault = "no such file or folder" if file == path else f"contains no {RESULTS_FILE}"
+        raise ResultsError(
+            f"{path}: {fault}; give results written by `deepaccident predict` or ResultsWriter"
+        ) from None
     except (OSError, ValueError) as error:
         fault = fault_text(error) if isinstance(error, OSError) else NO_NAME
-        raise ResultsError(f"{path}: {fault}; give results that can be read") from error
+        raise ResultsError(f"{path}: {fault}; give readable results") from error
     if irregular:
         raise ResultsError(f"{file}: {irregular}; give a results file")
     return file
@@ -198,14 +209,14 @@ def _file_of(path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EntryContents:
-    """Accidents or detected boxes, all in memory and checked.
+    """Contents of a results file, except for motion; all entries are in memory and checked.
 
     Attributes:
         task: Kind of the predictions.
-        meta: Notes of the file's author.
-        tokens: The samples.
-        prediction: Returns the prediction of a token.
-        form: None, since only motion has a form.
+        meta: The author's notes.
+        tokens: Tokens of the samples.
+        prediction: Function that returns the prediction for a token.
+        form: None, since only motion results have a form.
     """
 
     task: ResultsTask
@@ -215,24 +226,25 @@ class EntryContents:
     form: MotionForm | None = None
 
 
-# The content of a file; callers ask only for tokens that it has.
+# Contents of a file. Callers must only ask for tokens that it contains.
 Contents = EntryContents | MotionContents
-# Path and fingerprint → contents of the files that this process parsed most recently.
+# Path and fingerprint of a file → its contents, for the files that this process parsed most
+# recently.
 cached_contents: Final[dict[tuple[Path, str], Contents]] = {}
 
 
 def contents_of(path: Path, fingerprint: str = "") -> tuple[Contents, str]:
     """Return the contents of a file and its fingerprint.
 
-    A process parses a file once for all copies of `Results`.
+    Each process parses a file only once, however many copies of `Results` refer to it.
 
     Args:
         path: Path of the file.
-        fingerprint: Fingerprint that the bytes must have, not read again if they were parsed; empty
-            for any.
+        fingerprint: Fingerprint that the file must have; empty accepts any. If contents with this
+            fingerprint are cached, they are returned and the file is not read again.
 
     Raises:
-        ResultsError: the file cannot be read, violates its format, or has other bytes now.
+        ResultsError: If the file cannot be read, violates its format, or has changed.
     """
     contents = cached_contents.get((path, fingerprint))
     if contents is not None:
@@ -249,9 +261,9 @@ def contents_of(path: Path, fingerprint: str = "") -> tuple[Contents, str]:
 
 
 def _read_content(path: Path, fingerprint: str) -> tuple[bytes, str]:
-    """Return a file's bytes, and their hash of 32 hexadecimal digits.
+    """Read a file's bytes, and hash them to 32 hexadecimal digits.
 
-    Raises ResultsError if the file cannot be read, or has another fingerprint than expected.
+    Raise ResultsError if the file cannot be read, or its hash is not the expected fingerprint.
     """
     try:
         content = read_bytes(path, "results")
@@ -264,7 +276,7 @@ def _read_content(path: Path, fingerprint: str) -> tuple[bytes, str]:
 
 
 def _parse(content: bytes, path: Path) -> Contents:
-    """Return the contents of a file's bytes; raises ResultsError."""
+    """Parse the bytes of a results file; raise ResultsError if they violate the format."""
     try:
         document, meta = read_document(content, path)
         if isinstance(document, MotionFile):
@@ -281,8 +293,8 @@ def _parse(content: bytes, path: Path) -> Contents:
 def _collector_paused() -> Iterator[None]:
     """Pause the garbage collector.
 
-    Parsing makes millions of objects, none in a cycle; scanning them repeatedly would double the
-    time.
+    Parsing creates millions of objects, none of them in a cycle; scanning them repeatedly would
+    double the time.
     """
     is_enabled = gc.isenabled()
     gc.disable()
@@ -295,12 +307,12 @@ def _collector_paused() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entries:
-    """All entries of a results file.
+    """The N entries of a results file with S samples, as columns.
 
     Attributes:
-        number: Token → number of the sample, in the file's order; S samples.
-        first: Row of each sample's first entry, then the number of entries N; shape (S + 1,).
-        columns: Field → values, shape (N, …).
+        number: Token → index of the sample in the file.
+        first: (S + 1,) index of each sample's first entry, followed by N.
+        columns: Field → values of all entries, shape (N, …).
     """
 
     number: Mapping[str, int]
@@ -313,41 +325,42 @@ class Entries:
         results: Mapping[str, Sequence[Any]],
         make_columns: Callable[[Mapping[str, Any]], Columns],
     ) -> Entries:
-        """Return the entries by token; raises ContentError with token, entry (from 0), and field.
+        """Convert records to columns; raise a ContentError with token, entry and field on a fault.
 
         Args:
             results: Token → records of the sample.
-            make_columns: Returns the columns of the records.
+            make_columns: Function that converts all records to columns.
         """
         with locate_errors("results"):
             for token in results:
                 check_token(token)
-        counts = list(map(len, results.values()))
+        counts = [len(records) for records in results.values()]
         first = np.concatenate([[0], np.cumsum(counts)])
         numbers = {token: number for number, token in enumerate(results)}
         return cls(numbers, first, make_columns(results))
 
-    def of(self, token: str) -> Columns:
-        """Return the columns of a sample's entries; raises KeyError for an unknown sample."""
+    def sample_columns(self, token: str) -> Columns:
+        """Return the columns of a sample's entries; raise KeyError if the sample is unknown."""
         number = self.number[token]
         rows = slice(self.first[number], self.first[number + 1])
-        return {name: column[rows] for name, column in self.columns.items()}
+        return {field: column[rows] for field, column in self.columns.items()}
 
 
 def accident_columns(results: Mapping[str, Sequence[AccidentEntry]]) -> Columns:
-    """Return the columns of N accidents.
+    """Convert N accidents to columns.
 
-    These are positions (N, 2, 2) metres, time (N,) seconds, score (N,), ids (N, 2), identified
-    (N,) bool.
+    The columns are positions (N, 2, 2) in metres, time (N,) in seconds, score (N,), ids (N, 2), and
+    identified (N,) bool, which is True for accidents with ids.
     """
     accidents = list(chain.from_iterable(results.values()))
-    positions = [(*accident.positions[0], *accident.positions[1]) for accident in accidents]
+    positions = [chain(*accident.positions) for accident in accidents]
+    times = [accident.time for accident in accidents]
     scores = [accident.score for accident in accidents]
     ids = [accident.ids or (0, 0) for accident in accidents]
     is_identified = [bool(accident.ids) for accident in accidents]
     return {
-        "positions": _floats(positions, 2, 2),
-        "time": np.array([accident.time for accident in accidents], dtype=np.float64),
+        "positions": _make_floats(positions, 2, 2),
+        "time": np.array(times, dtype=np.float64),
         "score": np.array(scores, dtype=np.float64),
         "ids": np.array(ids, dtype=np.int64).reshape(-1, 2),
         "identified": np.array(is_identified, dtype=bool),
@@ -355,80 +368,83 @@ def accident_columns(results: Mapping[str, Sequence[AccidentEntry]]) -> Columns:
 
 
 def accidents_at(entries: Entries, token: str) -> list[Accident]:
-    """Return the accidents of a sample; raises KeyError for an unknown sample."""
-    columns = entries.of(token)
-    is_identified, ids = columns["identified"].tolist(), columns["ids"].tolist()
+    """Return the predicted accidents of a sample; raise KeyError if the sample is unknown."""
+    columns = entries.sample_columns(token)
     accidents = []
-    for row, (first_id, second_id) in enumerate(ids):
-        accidents.append(
-            Accident(
-                positions=columns["positions"][row],
-                time=float(columns["time"][row]),
-                score=float(columns["score"][row]),
-                ids=(first_id, second_id) if is_identified[row] else None,
-            )
+    for row, is_identified in enumerate(columns["identified"].tolist()):
+        ids = None
+        if is_identified:
+            ids = columns["ids"][row].tolist()
+        accident = Accident(
+            positions=columns["positions"][row],
+            time=columns["time"].item(row),
+            score=columns["score"].item(row),
+            ids=ids,
         )
+        accidents.append(accident)
     return accidents
 
 
-def detection_columns(results: Mapping[str, Sequence[BoxEntry]]) -> Columns:
-    """Return the columns of N boxes in the world frame.
+def detection_columns(results: _BoxRecords) -> Columns:
+    """Convert N boxes in the world frame to columns.
 
-    These are center (N, 3) metres, rotation (N, 4) unit quaternions w, x, y, z, size (N, 3)
-    length, width, height in metres, velocity (N, 3) m/s, NaN where unknown, category (N,), score
-    (N,). Raises ContentError: a box names another sample, or its quaternion has another length
-    than 1.
+    The columns are center (N, 3) in metres, rotation (N, 4) as unit quaternions w, x, y, z, size
+    (N, 3) as length, width and height in metres, velocity (N, 3) in m/s (NaN if unknown), category
+    (N,) and score (N,). Raise ContentError if a box names another sample, or if the length of its
+    quaternion is not 1.
     """
     _check_sample_tokens(results)
     boxes = list(chain.from_iterable(results.values()))
-    rotation = _floats([box.rotation for box in boxes], 4)
+    rotation = _make_floats([box.rotation for box in boxes], 4)
     _check_unit_length(rotation, results)
-    velocity = _floats([box.velocity or _UNKNOWN_VELOCITY for box in boxes], 2)
+    velocity = _make_floats([box.velocity or _UNKNOWN_VELOCITY for box in boxes], 2)
     velocity_z = np.where(np.isnan(velocity[:, :1]), np.nan, 0.0)
-    codes = {name: number for number, name in enumerate(CATEGORIES)}
+    code_by_name = {name: code for code, name in enumerate(CATEGORIES)}
+    codes = [code_by_name[box.detection_name] for box in boxes]
     scores = [box.detection_score for box in boxes]
+    sizes = _make_floats([box.size for box in boxes], 3)
     return {
-        "center": _floats([box.translation for box in boxes], 3),
-        "size": _floats([box.size for box in boxes], 3)[:, LENGTH_FIRST],
+        "center": _make_floats([box.translation for box in boxes], 3),
+        "size": sizes[:, LENGTH_FIRST],
         "rotation": rotation,
         "velocity": np.column_stack([velocity, velocity_z]),
-        "category": np.array([codes[box.detection_name] for box in boxes], dtype=np.int8),
+        "category": np.array(codes, dtype=np.int8),
         "score": np.array(scores, dtype=np.float64),
     }
 
 
-def _check_sample_tokens(results: Mapping[str, Sequence[BoxEntry]]) -> None:
-    """Raise ContentError if a box names another sample than its own."""
+def _check_sample_tokens(results: _BoxRecords) -> None:
+    """Raise ContentError if a box names another sample than the one that lists it."""
     for token, boxes in results.items():
         for number, box in enumerate(boxes):
             if box.sample_token != token:
                 raise ContentError(
-                    f"{entry_place(token, number)}.sample_token: expected {token}, under which it "
-                    f"stands, found {shortened(box.sample_token)!r}"
+                    f"{entry_place(token, number)}.sample_token: expected {token}, the key of the "
+                    f"entry, found {shortened(box.sample_token)!r}"
                 )
 
 
-def _check_unit_length(rotation: FloatArray, results: Mapping[str, Sequence[BoxEntry]]) -> None:
-    """Raise ContentError if one of N quaternions, shape (N, 4), has another length than 1."""
+def _check_unit_length(rotation: FloatArray, results: _BoxRecords) -> None:
+    """Raise ContentError if the length of one of N quaternions, shape (N, 4), is not 1."""
     with np.errstate(over="ignore"):
-        length = np.linalg.norm(rotation, axis=1)
-    wrong_rows = np.flatnonzero(np.abs(length - 1) > _UNIT_TOLERANCE)
-    if not len(wrong_rows):
+        lengths = np.linalg.norm(rotation, axis=1)
+    is_wrong = np.abs(lengths - 1) > _UNIT_TOLERANCE
+    if not is_wrong.any():
         return
-    row = int(wrong_rows[0])
-    entries = [
-        (token, number, box) for token, boxes in results.items() for number, box in enumerate(boxes)
-    ]
-    token, number, box = entries[row]
-    raise ContentError(
-        f"{entry_place(token, number)}.rotation: expected a unit quaternion [w, x, y, z], found "
-        f"{list(box.rotation)}, {length[row]:.3g} long"
-    )
+    row = 0
+    for token, boxes in results.items():
+        for number, box in enumerate(boxes):
+            if is_wrong[row]:
+                raise ContentError(
+                    f"{entry_place(token, number)}.rotation: expected a unit quaternion "
+                    f"[w, x, y, z], found {list(box.rotation)} of length {lengths[row]:.3g}"
+                )
+            row += 1
 
 
 def boxes_at(entries: Entries, token: str) -> DetectedBoxes:
-    """Return the boxes of a sample, in the world frame; raises KeyError for an unknown sample."""
-    columns: dict[str, Any] = entries.of(token)
+    """Return the boxes of a sample in the world frame; raise KeyError if the sample is unknown."""
+    columns: dict[str, Any] = entries.sample_columns(token)
     scores = columns.pop("score")
     count = len(scores)
     boxes = Boxes(
@@ -442,46 +458,50 @@ def boxes_at(entries: Entries, token: str) -> DetectedBoxes:
     return DetectedBoxes(boxes=boxes, scores=scores)
 
 
-def _floats(values: Sequence[Iterable[float]], *shape: int) -> FloatArray:
-    """Return the float64 array (N, *shape) of N flat tuples."""
-    flat = np.fromiter(chain.from_iterable(values), np.float64, len(values) * math.prod(shape))
-    return flat.reshape(len(values), *shape)
+def _make_floats(rows: Sequence[Iterable[float]], *shape: int) -> FloatArray:
+    """Convert N rows of numbers to a float64 array (N, *shape)."""
+    size = len(rows) * math.prod(shape)
+    numbers = np.fromiter(chain.from_iterable(rows), np.float64, size)
+    return numbers.reshape(len(rows), *shape)
 
 
 def plan_columns(results: Mapping[str, Sequence[PlanEntry]]) -> Columns:
-    """Return the column of N plans.
+    """Convert N plans to a column of `Plan` objects.
 
-    Raises ContentError for a plan with lists of different lengths, or a sample without plans.
+    Raise ContentError if the lists of a plan differ in length, or if a sample has no plan.
     """
     for token, plans in results.items():
         if not plans:
             raise ContentError(
-                f"{entry_place(token)}: expected one plan or more, found none; leave the sample out"
+                f"{entry_place(token)}: expected at least one plan, found none; omit the sample"
             )
-    return _objects(results, _plan)
+    return _make_objects(results, _make_plan)
 
 
-def _plan(entry: Any) -> Plan:
-    return Plan(times=entry.times, path=entry.path, score=entry.score, yaw=entry.yaw or None)
+def _make_plan(entry: Any) -> Plan:
+    """Convert an entry to a `Plan`."""
+    yaw = entry.yaw or None
+    return Plan(times=entry.times, path=entry.path, score=entry.score, yaw=yaw)
 
 
 def forecast_columns(results: Mapping[str, Sequence[ForecastEntry]]) -> Columns:
-    """Return the column of N forecasts.
+    """Convert N forecasts to a column of `Forecast` objects.
 
-    Raises ContentError for a forecast with lists of different lengths, or a repeated actor.
+    Raise ContentError if the lists of a forecast differ in length, or if an actor occurs twice.
     """
     for token, forecasts in results.items():
         ids: set[int] = set()
         for number, forecast in enumerate(forecasts):
             if forecast.id in ids:
                 raise ContentError(
-                    f"{entry_place(token, number)}.id: actor {forecast.id} comes twice"
+                    f"{entry_place(token, number)}.id: actor {forecast.id} appears twice"
                 )
             ids.add(forecast.id)
-    return _objects(results, _forecast)
+    return _make_objects(results, _make_forecast)
 
 
-def _forecast(entry: Any) -> Forecast:
+def _make_forecast(entry: Any) -> Forecast:
+    """Convert an entry to a `Forecast`."""
     return Forecast(
         actor_id=entry.id,
         times=entry.times,
@@ -490,8 +510,10 @@ def _forecast(entry: Any) -> Forecast:
     )
 
 
-def _objects(results: Mapping[str, Sequence[Any]], make_object: Callable[[Any], Any]) -> Columns:
-    """Return a column of objects made from records; raises ContentError that names the entry."""
+def _make_objects(
+    results: Mapping[str, Sequence[Any]], make_object: Callable[[Any], Any]
+) -> Columns:
+    """Convert records to a column of objects; raise a ContentError that names an invalid entry."""
     objects = []
     for token, records in results.items():
         for number, record in enumerate(records):
@@ -505,13 +527,14 @@ def _objects(results: Mapping[str, Sequence[Any]], make_object: Callable[[Any], 
 
 
 def objects_at(entries: Entries, token: str) -> list[Any]:
-    """Return the plans or forecasts of a sample; raises KeyError for an unknown sample."""
-    objects: list[Any] = entries.of(token)[_OBJECT].tolist()
+    """Return the plans or forecasts of a sample; raise KeyError if the sample is unknown."""
+    columns = entries.sample_columns(token)
+    objects: list[Any] = columns[_OBJECT].tolist()
     return objects
 
 
-# Task → function that makes the columns of its records, and function that makes a sample's
-# prediction from them.
+# Task → function that converts records to columns, and function that converts the columns of a
+# sample to its prediction.
 ENTRIES: Final[Mapping[str, tuple[Callable[..., Columns], Callable[[Entries, str], Any]]]] = {
     "accident": (accident_columns, accidents_at),
     "detection": (detection_columns, boxes_at),

@@ -1,6 +1,4 @@
-"""Records of results files, which schema/results is made of, and their strict reader."""
-
-from __future__ import annotations
+"""Records of results files, and their strict reader; schema/results is generated from them."""
 
 import json
 import re
@@ -17,7 +15,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, UnsetType, inspect
 
-from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
+from deepaccident_devkit.errors import MAX_REASON_LENGTH, ResultsError, shortened
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
 from deepaccident_devkit.support import json_text
@@ -34,31 +32,32 @@ FORMAT_VERSION: Final = get_args(Version)[0]
 RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(
     {name: name if name == "motion" else f"{name}.json" for name in get_args(ResultsTask)}
 )
-"""Task → name of its file (for motion a folder), if results of all tasks share a folder."""
-# Name of the manifest of motion results in their folder, and of other results in a folder.
+"""Task → name of its file (of its folder for motion) if results of all tasks share a folder."""
+# Name of the JSON file in a folder: the manifest of motion results, or results of another task.
 RESULTS_FILE: Final = "results.json"
-# Regular expression of tokens: words separated by `/`.
+# Regular expression that tokens match: words separated by `/`.
 WORDS: Final = r"^[^/\\]+(/[^/\\]+)*$"
-# Largest value in metres, seconds, or metres a second: larger numbers are mistakes, and squares of
-# the largest floats overflow.
+# Largest value in metres, seconds, or metres per second. Larger numbers are mistakes, and the
+# squares of very large floats would overflow.
 MAX_MEASURE: Final = 1e6
 _Measure = Annotated[float, Meta(ge=-MAX_MEASURE, le=MAX_MEASURE)]
 FromZero = Annotated[float, Meta(ge=0, le=MAX_MEASURE)]
 Count = Annotated[int, Meta(ge=1)]
 ActorId = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Token = Annotated[str, Meta(extra_json_schema={"pattern": WORDS})]
-# A further field of the nuScenes devkit; this dataset has no attributes.
+# Type of fields that the nuScenes devkit writes but this dataset does not use.
 Ignored = Annotated[msgspec.Raw | UnsetType, Meta(description="Ignored.")]
 Kind = TypeVar("Kind")
 Entry = TypeVar("Entry", bound=msgspec.Struct)
-# Order of axes between nuScenes' width, length, height and the devkit's length, width, height.
+# Indices that reorder nuScenes' width, length, height to the devkit's length, width, height, or
+# vice versa.
 LENGTH_FIRST: Final = [1, 0, 2]
-# Number of characters of a wrong value that an error shows.
-_MAX_VALUE_LENGTH: Final = 80
-# The largest depth of nested objects and lists in `meta`, which people and reports read.
-_MAX_META_LEVELS: Final = 30
-# In characters.
-_MAX_TOKEN_LENGTH: Final = 1000
+# Errors show at most this many characters of an invalid value.
+_MAX_VALUE_LENGTH = 80
+# Largest nesting depth of objects and lists in `meta`, which people and reports read.
+_MAX_META_LEVELS = 30
+# Largest number of characters of a token.
+_MAX_TOKEN_LENGTH = 1000
 
 
 class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
@@ -67,24 +66,22 @@ class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     positions: Annotated[
         tuple[tuple[_Measure, _Measure], tuple[_Measure, _Measure]],
         Meta(
-            description="Of the two that collide: x forward, y left, metres, in the present ego "
-            "frame of the sample's agent."
+            description="Positions of the two colliders: x forward, y left, metres, in the "
+            "present ego frame of the sample's agent."
         ),
     ]
     time: Annotated[FromZero, Meta(description="Seconds after the present.")]
-    score: Annotated[float, Meta(description="How sure the model is, the more the higher.")]
+    score: Annotated[float, Meta(description="How sure the model is; higher means surer.")]
     ids: Annotated[
         tuple[ActorId, ActorId] | UnsetType | None,
-        Meta(description="Their actor ids, in the order of the positions; null if not known."),
+        Meta(description="Actor ids of the two, in the order of the positions; null if unknown."),
     ] = UNSET
 
 
 class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     """A detected box, with nuScenes' fields."""
 
-    sample_token: Annotated[
-        Token, Meta(description="The sample's token, under which the box stands.")
-    ]
+    sample_token: Annotated[Token, Meta(description="Token of the sample that contains the box.")]
     translation: Annotated[
         tuple[_Measure, _Measure, _Measure],
         Meta(description="Centre x, y, z in the world, right-handed, metres."),
@@ -102,11 +99,11 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     ]
     detection_name: Annotated[Literal[CATEGORIES], Meta(description="Category.")]  # type: ignore[valid-type]
     detection_score: Annotated[
-        float, Meta(description="How sure the model is, the more the higher.")
+        float, Meta(description="How sure the model is; higher means surer.")
     ]
     velocity: Annotated[
         tuple[_Measure, _Measure] | UnsetType | None,
-        Meta(description="x and y in the world over the ground, m/s; null if not known."),
+        Meta(description="Velocity over the ground in the world, x and y, m/s; null if unknown."),
     ] = UNSET
     attribute_name: Ignored = UNSET
     ego_translation: Ignored = UNSET
@@ -127,18 +124,19 @@ class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
         list[Place],
         Meta(
             min_length=1,
-            description="Where its ego frame is at these times: x forward, y left, metres, in the "
-            "present ego frame.",
+            description="Origin of the agent's ego frame at these times: x forward, y left, "
+            "metres, in the present ego frame.",
         ),
     ]
     score: Annotated[
-        float, Meta(description="How good the plan is; the one with the highest is evaluated.")
+        float,
+        Meta(description="How good the plan is; the plan with the highest score is evaluated."),
     ]
     yaw: Annotated[
         list[_Measure] | UnsetType | None,
         Meta(
-            description="Its headings at these times, radians, counter-clockwise; null for those "
-            "of the steps."
+            description="Headings at these times, radians, counter-clockwise; null to use the "
+            "headings of the steps."
         ),
     ] = UNSET
 
@@ -146,19 +144,20 @@ class PlanEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 class ForecastEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     """How an actor may go on."""
 
-    id: Annotated[ActorId, Meta(description="Its actor id.")]
+    id: Annotated[ActorId, Meta(description="Actor id.")]
     times: Times
     paths: Annotated[
         list[list[Place]],
         Meta(
             min_length=1,
-            description="Of each mode where its box's centre is at these times: x forward, y "
-            "left, metres, in the present ego frame of the sample's agent.",
+            description="For each mode, the centre of the actor's box at these times: x "
+            "forward, y left, metres, in the present ego frame of the sample's "
+            "agent.",
         ),
     ]
     probabilities: Annotated[
         list[Annotated[float, Meta(ge=0, le=1)]],
-        Meta(min_length=1, description="Of the modes; not normalised."),
+        Meta(min_length=1, description="Probabilities of the modes; not normalised."),
     ]
 
 
@@ -182,12 +181,12 @@ class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     y: Annotated[
         Axis, Meta(description="Start, end and cell size, metres, y left in the present ego frame.")
     ]
-    orientation: Annotated[Orientation, Meta(description="How cells lie in the maps.")]
+    orientation: Annotated[Orientation, Meta(description="Orientation of the cells in the maps.")]
     predictions: Annotated[
-        Count, Meta(description="K: how many a sample has at most; the last one is the mean.")
+        Count, Meta(description="K: most predictions of a sample; the last prediction is the mean.")
     ]
     frames: Annotated[
-        Count, Meta(description="T: how many a prediction has, the present one first.")
+        Count, Meta(description="T: number of frames of a prediction, the present frame first.")
     ]
     step: Annotated[float, Meta(gt=0, description="Seconds from one frame to the next.")]
     labels: Annotated[
@@ -206,7 +205,7 @@ class Shard(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, frozen=Tru
     ]
     bytes: Annotated[int, Meta(ge=0, description="Its size.")]
     checksum: Annotated[
-        str, Meta(description="BLAKE2b of its bytes, 16 bytes as hexadecimal digits.")
+        str, Meta(description="BLAKE2b of the archive's bytes, 16 bytes as hexadecimal digits.")
     ]
 
 
@@ -216,24 +215,22 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, kw_only=True, tag_field=
     meta: Annotated[
         msgspec.Raw,
         Meta(
-            description="What the author says: the method, its training.",
+            description="Notes of the author, such as the method and its training.",
             extra_json_schema={"type": "object"},
         ),
     ]
 
     @property
     def task(self) -> ResultsTask:
-        """Kind of its predictions."""
+        """Kind of the file's predictions."""
         task: ResultsTask = self.__struct_config__.tag  # type: ignore[assignment]  # the class has it
         return task
 
 
-_BY_TOKEN: Final = Meta(
+_BY_TOKEN = Meta(
     min_length=1,
-    description="Sample token to what is predicted of it; [] for nothing.",
-    extra_json_schema={
-        "propertyNames": {"pattern": WORDS}
-    },  # which msgspec finds itself from 0.22 on
+    description="Sample token → predictions for this sample; [] for nothing.",
+    extra_json_schema={"propertyNames": {"pattern": WORDS}},  # msgspec adds this itself since 0.22
 )
 
 
@@ -272,6 +269,7 @@ ResultsFile: TypeAlias = MotionFile | AccidentFile | DetectionFile | PlanningFil
 
 
 def _schema(file_type: type[_File]) -> dict[str, Any]:
+    """Build the JSON schema of a type of file."""
     title = f"{FORMAT}: {file_type.__struct_config__.tag}"
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -286,7 +284,7 @@ RESULT_SCHEMAS: Final = MappingProxyType(
         for file_type in get_args(ResultsFile)
     }
 )
-"""Task → schema of its JSON file: for motion that is the manifest.
+"""Task → schema of its JSON file (the manifest for motion).
 
 `read_results` also checks what a schema cannot express: repeated names, NaN, unit quaternions,
 arrays.
@@ -294,12 +292,12 @@ arrays.
 
 
 class ContentError(ValueError):
-    """A fault of a file, as half a sentence; `fault_of` makes a ResultsError of it."""
+    """A fault in a file, described by half a sentence; `fault_of` turns it into a ResultsError."""
 
 
 @contextmanager
 def locate_errors(location: str) -> Iterator[None]:
-    """Put a location before the message of a ContentError."""
+    """Prefix the location to the message of each ContentError that is raised in the block."""
     try:
         yield
     except ContentError as error:
@@ -307,18 +305,18 @@ def locate_errors(location: str) -> Iterator[None]:
 
 
 def fault_of(path: Path, error: ContentError | OSError, *locations: str) -> ResultsError:
-    """Return the ResultsError for a fault at a location in a file, or for an unreadable file.
+    """Build a ResultsError for a fault in a file, or for a file that cannot be read.
 
-    Its message includes the remedy.
+    The message explains where the fault is and how to fix it.
     """
     if isinstance(error, ContentError):
         message = ": ".join(filter(None, (str(path), *locations, str(error))))
         return ResultsError(f"{message}; the format is described in schema/results/README.md")
-    return ResultsError(f"{path}: {fault_text(error)}; give a results file that can be read")
+    return ResultsError(f"{path}: {fault_text(error)}; give a readable results file")
 
 
 def json_excerpt(value: object) -> str:
-    """Return a value as JSON text, cut if it is long."""
+    """Format a value as JSON text, and truncate it if it is long."""
     text = json.dumps(value, ensure_ascii=False, default=repr)
     if len(text) <= _MAX_VALUE_LENGTH:
         return text
@@ -326,7 +324,7 @@ def json_excerpt(value: object) -> str:
 
 
 def parsed_json(content: bytes, levels: int = json_text.MAX_LEVELS) -> Any:
-    """Return the value of JSON text; raises ContentError that names the location of a fault."""
+    """Parse JSON text; raise a ContentError that locates the fault if it is invalid."""
     try:
         return json_text.parsed_json(content, levels=levels)
     except ValueError as error:
@@ -334,51 +332,53 @@ def parsed_json(content: bytes, levels: int = json_text.MAX_LEVELS) -> Any:
 
 
 def decode_record(content: bytes, record_type: type[Kind]) -> Kind:
-    """Return the record that JSON text describes.
+    """Decode JSON text to a record.
 
-    A name that is repeated in an object is not noticed. A ContentError names the location of a
-    fault, and the value there.
+    Repeated names in an object are not detected. If the text is invalid, raise a ContentError that
+    locates the fault and shows the value there.
     """
     try:
         return msgspec.json.decode(content, type=record_type)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        value = parsed_json(content)  # names the location of NaN, which msgspec does not
+        value = parsed_json(content)  # raises for NaN with its location, which msgspec omits
         text, _, location = str(error).partition(" - at `$")
         location = location.strip(".`")
-        fault = shortened(text[:1].lower() + text[1:], MOST_TOLD)
+        fault = shortened(text[:1].lower() + text[1:], MAX_REASON_LENGTH)
         message = _explain_fault(fault, value, inspect.type_info(record_type), location)
         raise ContentError(f"{location}: {message}" if location else message) from error
 
 
 def _explain_fault(fault: str, value: Any, value_type: inspect.Type, location: str) -> str:
-    """Return the fault as msgspec reports it, with the value, and its expected values or meaning.
+    """Describe a fault that msgspec reports, with the invalid value and what was expected.
 
     Args:
-        fault: Message of msgspec.
+        fault: msgspec's message.
         value: The parsed JSON.
-        value_type: Its expected type.
-        location: Location in the value, as in the message of msgspec.
+        value_type: Expected type of `value`.
+        location: Location of the fault in `value`, as in msgspec's message.
     """
-    types, meaning = _single_types(value_type), ""
+    types = _single_types(value_type)
+    meaning = ""
     if isinstance(value, dict):
-        tagged = [kind for kind in types if getattr(kind, "tag", None) == value.get("task")]
-        types = tagged or types
+        task = value.get("task")
+        types = [kind for kind in types if getattr(kind, "tag", None) == task] or types
     for part in re.findall(r"\w+|\.\.\.", location):
-        if part == "...":  # a name, which msgspec does not report
+        if part == "...":  # replaces a name that msgspec does not report
             return fault
         value = value[int(part) if isinstance(value, list) else part]
-        inner_types = [inner for outer in types for inner in _inner_types(outer, part)]
-        types = [single for inner in inner_types for single in _single_types(inner)]
-        meaning = _meaning(inner_types) or meaning
-    if fault.startswith("object "):  # lacks a field, or has one too many
+        inner_types: list[inspect.Type] = []
+        for outer_type in types:
+            inner_types += _inner_types(outer_type, part)
+        types = []
+        for inner_type in inner_types:
+            types += _single_types(inner_type)
+        meaning = _describe_types(inner_types) or meaning
+    if fault.startswith("object "):  # a field is missing or unknown
         names = _field_names(types)
         if "unknown" in fault and names:
             return f"{fault} (expected {', '.join(names)})"
         return fault
-    choices: list[str] = []
-    for kind in types:
-        if isinstance(kind, inspect.LiteralType):
-            choices += map(str, kind.values)
+    choices = _literal_values(types)
     if choices:
         one_of = ""
         if len(choices) > 1:
@@ -387,8 +387,17 @@ def _explain_fault(fault: str, value: Any, value_type: inspect.Type, location: s
     return f"{fault.partition(', got ')[0]}, found {json_excerpt(value)}{meaning}"
 
 
-def _meaning(types: Sequence[inspect.Type]) -> str:
-    """Return the first description of types, in brackets; empty without any."""
+def _literal_values(types: Sequence[inspect.Type]) -> list[str]:
+    """Return, as text, all values that the literal types among `types` allow."""
+    values: list[str] = []
+    for kind in types:
+        if isinstance(kind, inspect.LiteralType):
+            values += map(str, kind.values)
+    return values
+
+
+def _describe_types(types: Sequence[inspect.Type]) -> str:
+    """Return the first description of any of the types, in brackets; empty if none has one."""
     for kind in types:
         if isinstance(kind, inspect.Metadata):
             schema = kind.extra_json_schema or {}
@@ -398,7 +407,7 @@ def _meaning(types: Sequence[inspect.Type]) -> str:
 
 
 def _field_names(types: Sequence[inspect.Type]) -> list[str]:
-    """Return the names of all fields of records."""
+    """Return the field names of all record types among `types`."""
     names = []
     for kind in types:
         if isinstance(kind, inspect.StructType):
@@ -407,7 +416,12 @@ def _field_names(types: Sequence[inspect.Type]) -> list[str]:
 
 
 def _inner_types(outer: inspect.Type, part: str) -> Sequence[inspect.Type]:
-    """Return the possible types of a field, or of an entry, of a value of a type."""
+    """Return the types that a part of a value can have.
+
+    Args:
+        outer: Type of the value.
+        part: Field name, or index of an entry.
+    """
     if isinstance(outer, inspect.StructType):
         types = [field.type for field in outer.fields if field.encode_name == part]
         return types or [inspect.LiteralType((outer.tag,))]
@@ -419,7 +433,7 @@ def _inner_types(outer: inspect.Type, part: str) -> Sequence[inspect.Type]:
 
 
 def _single_types(joined: inspect.Type) -> list[inspect.Type]:
-    """Return the members of a union, without metadata."""
+    """Split a union into its types, without their metadata."""
     if isinstance(joined, inspect.Metadata):
         return _single_types(joined.type)
     if not isinstance(joined, inspect.UnionType):
@@ -431,10 +445,10 @@ def _single_types(joined: inspect.Type) -> list[inspect.Type]:
 
 
 def json_meta(meta: object) -> dict[str, Any]:
-    """Return a copy of `meta` in JSON form; raises ContentError."""
+    """Copy the notes `meta` as JSON values; raise ContentError if they cannot be stored as JSON."""
     if not isinstance(meta, Mapping):
         raise ContentError(
-            f"meta: expected a mapping of names to what JSON holds, found {type(meta).__name__}"
+            f"meta: expected a mapping of names to JSON values, found {type(meta).__name__}"
         )
     try:
         text = json.dumps(dict(meta), allow_nan=False)
@@ -446,14 +460,14 @@ def json_meta(meta: object) -> dict[str, Any]:
 
 
 def check_token(token: object) -> str:
-    """Return a sample's token; raises ContentError unless it is words separated by `/`."""
+    """Return a sample's token; raise ContentError unless it consists of words separated by `/`."""
     if not isinstance(token, str):
-        raise ContentError(f"expected a sample's token, a text, found {json_excerpt(token)}")
+        raise ContentError(f"expected a sample token (text), found {json_excerpt(token)}")
     is_short = len(token) <= _MAX_TOKEN_LENGTH
     has_words = is_short and token.isprintable() and re.fullmatch(WORDS, token)
     if not has_words or {".", ".."} & set(token.split("/")):
         raise ContentError(
-            "expected a sample's token, <scenario_type>/<name>/<agent>/<NNN>, found "
+            "expected a sample token <scenario_type>/<name>/<agent>/<NNN>, found "
             f"{shortened(token)!r}"
         )
     return token
@@ -466,52 +480,56 @@ class _Texts(msgspec.Struct):
 
 
 def read_document(content: bytes, path: Path) -> tuple[ResultsFile, dict[str, Any]]:
-    """Return the records of a results file, and its meta.
+    """Decode a results file to its records and its notes `meta`.
 
-    Raises ContentError that names token and field, or ResultsError.
+    If the content is invalid, raise a ContentError that names token and field, or a ResultsError.
     """
     try:
         document: ResultsFile = decode_record(content, ResultsFile)  # type: ignore[arg-type]  # a union is a type too
     except ContentError:
         _raise_located_fault(content, path)
         raise
-    return document, json_meta(_strict_meta(content, document))
+    return document, json_meta(_read_meta(content, document))
 
 
-def _strict_meta(content: bytes, document: ResultsFile) -> object:
-    """Return the meta of a document.
+def _read_meta(content: bytes, document: ResultsFile) -> object:
+    """Return the notes of a document, and check the parts of it that were not decoded.
 
-    No name in the document may be repeated, and all parts that were not decoded must be JSON for
-    `parsed_json`. The records have as many names as the text has colons outside texts. If the text
-    has more, the strict reader finds the fault; it takes four times as long.
+    No name may be repeated, and these parts must be JSON that `parsed_json` accepts. Repeated names
+    are found by counting: without them, the text has as many colons as the records have names and
+    the raw parts have colons. If the numbers differ, the strict reader locates the fault, which
+    takes four times as long.
     """
     if not isinstance(document, MotionFile):
         record_type = ENTRY_RECORDS[document.task]
         fields = record_type.__struct_fields__
-        optional = fields[len(fields) - len(record_type.__struct_defaults__) :]
+        optional_fields = fields[len(fields) - len(record_type.__struct_defaults__) :]
         entries = list(chain.from_iterable(document.results.values()))
-        values_by_field = (map(attrgetter(name), entries) for name in optional)
-        type_counts = Counter(chain.from_iterable(map(type, values) for values in values_by_field))
-        parts = [document.meta]
+        type_counts: Counter[type] = Counter()
+        for field in optional_fields:
+            type_counts.update(map(type, map(attrgetter(field), entries)))
+        raw_parts = [document.meta]
         if type_counts[msgspec.Raw]:
-            optional_values = (getattr(entry, name) for entry in entries for name in optional)
-            parts += [value for value in optional_values if isinstance(value, msgspec.Raw)]
-        unread = b"[%s]" % b",".join(parts)
-        # the file's own names, the task among them, those of samples, and those of entries
-        names = (
-            len(document.__struct_fields__) + 1 + len(document.results) + len(entries) * len(fields)
-        )
-        present_names = names - type_counts[msgspec.UnsetType] + unread.count(b":")
-        colons = np.count_nonzero(np.frombuffer(content, np.uint8) == ord(":"))
+            for entry in entries:
+                values = [getattr(entry, field) for field in optional_fields]
+                raw_parts += [value for value in values if isinstance(value, msgspec.Raw)]
+        raw_text = b"[%s]" % b",".join(raw_parts)
+        file_names = len(document.__struct_fields__) + 1  # including the task
+        entry_names = len(entries) * len(fields) - type_counts[msgspec.UnsetType]
+        name_count = file_names + len(document.results) + entry_names
+        colon_count = np.count_nonzero(np.frombuffer(content, np.uint8) == ord(":"))
         with suppress(ContentError):
-            meta, *_ = parsed_json(unread)
-            if present_names == colons:
+            meta, *_ = parsed_json(raw_text)
+            if name_count + raw_text.count(b":") == colon_count:
                 return meta
     return parsed_json(content)["meta"]
 
 
 def _raise_located_fault(content: bytes, path: Path) -> None:
-    """Raise the fault of a results file with its token or its remedy, where one is known."""
+    """Raise the fault of a results file with its token, or with a way to fix it.
+
+    Return if neither is known.
+    """
     payload = parsed_json(content)
     if not isinstance(payload, dict):
         raise ContentError(f"expected a JSON object, found {json_excerpt(payload)}")
@@ -522,9 +540,11 @@ def _raise_located_fault(content: bytes, path: Path) -> None:
         )
     version = payload.get("version")
     if payload.get("format") == FORMAT and type(version) is int and version != FORMAT_VERSION:
-        age, remedy = "an older", "write it again"
+        age = "an older"
+        remedy = "write it again"
         if version > FORMAT_VERSION:
-            age, remedy = "a newer", "update the devkit"
+            age = "a newer"
+            remedy = "update the devkit"
         raise ResultsError(
             f"{path}: version: {age} results format ({json_excerpt(version)}, this devkit's is "
             f"{FORMAT_VERSION}); {remedy}"
@@ -537,11 +557,13 @@ def _raise_located_fault(content: bytes, path: Path) -> None:
 
 
 def read_entries(content: bytes, record_type: type[Entry]) -> list[Entry]:
-    """Return a sample's entries; raises ContentError that names entry number and field."""
+    """Decode a sample's entries; raise a ContentError with entry number and field on a fault."""
     return decode_record(content, list[record_type])  # type: ignore[valid-type]  # a type at run time
 
 
 def entry_place(token: str, number: int | None = None) -> str:
-    """Return how errors name a sample's entries, or one of them."""
-    suffix = "" if number is None else f": [{number}]"
+    """Return how errors refer to a sample's entries, or to the entry with a number."""
+    suffix = ""
+    if number is not None:
+        suffix = f": [{number}]"
     return f"results of {shortened(token)!r}{suffix}"

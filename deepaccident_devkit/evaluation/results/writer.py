@@ -1,11 +1,10 @@
-"""`ResultsWriter` writes predictions of many samples to results, completely or not at all."""
+"""`ResultsWriter` writes the predictions for many samples, completely or not at all."""
 
 from __future__ import annotations
 
 import io
 import json
 import math
-import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -44,24 +43,27 @@ from deepaccident_devkit.motion import predict_instances
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing, replacing_folder
 from deepaccident_devkit.support.reading import file_checksum, open_file, read_bytes
-from deepaccident_devkit.support.text import choice, counted, differing_text, path_of
+from deepaccident_devkit.support.text import PathType, choice, counted, differing_text, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-# Texts before and after the entries in a file; the notes have no line ends.
-_BODY_START, _BODY_END = ',\n"results": {', "\n}\n}\n"
-# The earliest date of a zip archive.
-_ARCHIVE_DATE: Final = (1980, 1, 1, 0, 0, 0)
-# Number of samples, and of bytes, at which a shard is complete.
-_MAX_SHARD_SAMPLES: Final = 64
+# Text before the entries in a file. The notes before it do not contain line ends.
+_BODY_START = ',\n"results": {'
+# Text after the entries in a file.
+_BODY_END = "\n}\n}\n"
+# Date of all members of an archive: the earliest one that zip can store.
+_ARCHIVE_DATE = (1980, 1, 1, 0, 0, 0)
+# A shard is complete when it has this many samples,
+_MAX_SHARD_SAMPLES = 64
+# or this many bytes.
 MAX_SHARD_BYTES: Final = 32 * 2**20
 
 
 class ResultsWriter:
-    """Writes results that `read_results` reads; used in a `with` statement.
+    """Writer of results that `read_results` can read; use it in a `with` statement.
 
-    The file, or for motion the folder, appears when the block ends without an exception; otherwise
-    nothing does. Memory does not grow with the samples, and the same predictions give the same
-    bytes.
+    The file (for motion, the folder) appears when the block ends without an exception; otherwise
+    nothing appears. Memory does not grow with the number of samples, and the same predictions
+    always lead to the same bytes.
 
         with ResultsWriter("results/motion", "motion", meta={"method": "mine"}) as writer:
             for token in tokens:
@@ -70,7 +72,7 @@ class ResultsWriter:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: PathType,
         task: ResultsTask,
         *,
         meta: Mapping[str, Any] | None = None,
@@ -79,26 +81,27 @@ class ResultsWriter:
         labels: str | None = "released",
         store: Stored = "instances",
     ) -> None:
-        """Prepare to write; touches nothing.
+        """Prepare to write; no file is created yet.
 
         Args:
-            path: Path of a new file; for motion of a new or empty folder.
+            path: Path of a new file; for motion, of a new or empty folder.
             task: Name from `RESULTS_NAMES`.
-            meta: Notes for readers in JSON form: method, training, author.
-            grid: For motion, the BEV grid of all predictions; None for that of the first
+            meta: Notes for readers, such as method, training and author; JSON-compatible values.
+            grid: For motion, the BEV grid of all predictions; None takes the grid of the first
                 prediction.
             step: For motion, seconds between two frames.
-            labels: For motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model learned
-                from, which it is compared with; None if it is not known.
-            store: For motion, `instances` stores instance maps, about 30 KB a sample of five
-                predictions; heads are post-processed as in the released evaluation of motion
-                (docs/released_code.md, Post-processing). The released accident evaluation does that
-                in its own way, and from instance maps its numbers differ slightly. `heads` stores
-                the maps of the model unchanged: 34 MB a sample of six predictions.
+            labels: For motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model was
+                trained on and is compared with; None if unknown.
+            store: For motion, `instances` stores instance maps, about 30 KB for a sample with five
+                predictions. Heads are post-processed as in the released evaluation of motion
+                (docs/released_code.md, section "Post-processing"). The released accident evaluation
+                post-processes heads differently, so its numbers differ slightly if they are
+                computed from instance maps. `heads` stores the model's outputs unchanged, 34 MB for
+                a sample with six predictions.
 
         Raises:
-            ChoiceError: no such task.
-            ResultsError: a value that cannot be written, or something exists at `path`.
+            ChoiceError: If `task` is not a name from `RESULTS_NAMES`.
+            ResultsError: If a value cannot be written, or something already exists at `path`.
         """
         self.task = choice("task", task, get_args(ResultsTask))
         self.path = path_of(path).absolute()
@@ -127,11 +130,12 @@ class ResultsWriter:
         self._body: EntryWriter | ShardWriter | None = None
 
     def __repr__(self) -> str:
-        """Return its task and path, and how many samples it has written."""
-        return f"ResultsWriter({self.task} to {self.path}: {counted(len(self._tokens), 'sample')})"
+        """Return the task, the path and the number of samples written."""
+        samples = counted(len(self._tokens), "sample")
+        return f"ResultsWriter({self.task} to {self.path}: {samples})"
 
     def __enter__(self) -> ResultsWriter:
-        """Begin beside the path; raises ResultsError if nothing can be written there."""
+        """Open a temporary file or folder next to the path; raise ResultsError on failure."""
         self._check_free()
         with _naming_results(self.path), ExitStack() as stack:
             if self.task == "motion":
@@ -149,15 +153,16 @@ class ResultsWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Move the results to their path, or after an exception remove what was written."""
-        body, self._body = self._body, None
+        """Move the results to their path; after an exception, remove what was written instead."""
+        body = self._body
+        self._body = None
         if error_type is not None:
             self._stack.__exit__(error_type, error, trace)
             return
         with _naming_results(self.path), self._stack:
             if body is None:
                 raise ResultsError(
-                    "a prediction could not be written, so that none is kept; write all of them "
+                    "a prediction could not be written, so none was kept; write all predictions "
                     "again"
                 )
             body.finish()
@@ -171,24 +176,25 @@ class ResultsWriter:
         | Iterable[Plan]
         | Iterable[Forecast],
     ) -> None:
-        """Write the prediction of a sample.
+        """Write the prediction for a sample.
 
         Args:
-            token: Token of the sample, each once. It is not checked against the release:
-                `check results --dataroot` does that.
-            prediction: For motion a MotionOutput, all of one grid and number of frames; for
-                accidents the expected ones, [] for none; for detection the boxes, in the world
-                frame; for planning one or more Plans; for forecasting the Forecasts, one an actor.
+            token: Token of the sample; add each sample only once. `check results --dataroot` checks
+                whether the release has the sample; this method does not.
+            prediction: For motion, a MotionOutput; all outputs must have the same grid and number
+                of frames. For accidents, a list of predicted accidents, [] if there are none. For
+                detection, boxes in the world frame. For planning, one or more Plans. For
+                forecasting, one Forecast per actor.
 
         Raises:
-            ResultsError: the prediction is of another kind, grid or frame, the sample was added
-                before, or nothing can be written; the message begins with path and token.
+            ResultsError: If the prediction has the wrong type, grid or frame, the sample was added
+                before, or writing fails; the message begins with the path and the token.
         """
-        body = self._opened()
+        body = self._check_open()
         try:
             check_token(token)
             if token in self._tokens:
-                raise ResultsError("was added before; give each sample one prediction")
+                raise ResultsError("was already added; add one prediction per sample")
             body.add(token, prediction)
         except (ContentError, ResultsError) as error:
             raise ResultsError(f"{self.path}: {token}: {error}") from error
@@ -198,21 +204,22 @@ class ResultsWriter:
         self._tokens.add(token)
 
     def add_part(self, part: Results) -> None:
-        """Write all predictions of results that a `ResultsWriter` of the same arguments wrote.
+        """Copy all predictions from results that another writer with the same arguments wrote.
 
-        The bytes are copied.
+        The bytes are copied without decoding them.
 
         Raises:
-            ResultsError: nothing can be read or written.
+            ResultsError: If reading or writing fails.
         """
-        body, self._body = self._opened(), None  # as `add` leaves it after an error of the system
+        body = self._check_open()
+        self._body = None  # stays None after an error, as in `add`
         with _naming_results(self.path):
             body.add_part(part)
         self._body = body
         self._tokens.update(part.tokens)
 
-    def _opened(self) -> EntryWriter | ShardWriter:
-        """Return the open writer; raises ResultsError outside a `with` statement."""
+    def _check_open(self) -> EntryWriter | ShardWriter:
+        """Return the open writer; raise ResultsError if there is none, outside a `with` block."""
         if self._body is None:
             raise ResultsError(
                 f"{self.path}: is not open; add predictions inside `with ResultsWriter(…) as "
@@ -221,90 +228,101 @@ class ResultsWriter:
         return self._body
 
     def _check_free(self) -> None:
-        """Raise ResultsError if anything but an empty folder for motion exists at the path."""
+        """Raise ResultsError if the path exists; an empty folder is accepted for motion."""
         with _naming_results(self.path):
             is_empty = self.task == "motion" and self.path.is_dir() and not any(self.path.iterdir())
             if not is_empty and (self.path.exists() or self.path.is_symlink()):
                 raise ResultsError(
-                    f"{self.path}: is there already{self._existing_notes_text()}; choose another "
+                    f"{self.path}: already exists{self._existing_notes_text()}; choose another "
                     "path, or remove it"
                 )
 
     def _existing_notes_text(self) -> str:
-        """Return how the notes of existing results differ, in brackets; empty if there are none."""
+        """Say in brackets how the notes of existing results differ; empty if there are none."""
         try:
             existing = read_results(self.path)
         except ResultsError:
             return ""
-        old_meta, new_meta = existing.meta, self._header["meta"]
-        old_method, new_method = old_meta.get("method"), new_meta.get("method")
-        if old_method != new_method:  # all other notes differ with it
-            old_text, new_text = shortened(repr(old_method)), shortened(repr(new_method))
-            return f" (of method {old_text}, not of {new_text})"
-        text = differing_text(_without_bytes(old_meta), _without_bytes(new_meta))
+        old_meta = existing.meta
+        new_meta = dict(self._header["meta"])
+        old_method = old_meta.get("method")
+        new_method = new_meta.get("method")
+        if old_method != new_method:  # then the other notes differ, too
+            old_text = shortened(repr(old_method))
+            new_text = shortened(repr(new_method))
+            return f" (with method {old_text}, not {new_text})"
+        for meta in (old_meta, new_meta):
+            meta.pop("bytes", None)  # they follow from the other notes
+        text = differing_text(old_meta, new_meta)
         return f" ({text or 'of other samples'})"
-
-
-def _without_bytes(meta: Mapping[str, Any]) -> dict[str, Any]:
-    """Return notes without `bytes`, which follow from the other notes."""
-    return {name: note for name, note in meta.items() if name != "bytes"}
 
 
 @contextmanager
 def _naming_results(path: Path) -> Iterator[None]:
-    """Turn errors of the system into a ResultsError that names the results."""
+    """Prefix the path to ResultsErrors, and turn OSErrors into ResultsErrors with it."""
     try:
         yield
     except ResultsError as error:
         text = str(error)
-        raise ResultsError(text if text.startswith(str(path)) else f"{path}: {text}") from error
+        if not text.startswith(str(path)):
+            text = f"{path}: {text}"
+        raise ResultsError(text) from error
     except OSError as error:
         raise _write_error(path, error) from error
 
 
 def _write_error(path: Path, error: OSError) -> ResultsError:
+    """Build the ResultsError for results that cannot be written."""
     return ResultsError(
-        f"{path}: results cannot be written ({error}); make room there, or choose another path"
+        f"{path}: results cannot be written ({error}); free space there, or choose another path"
     )
 
 
 class EntryWriter:
-    """Writes the file of accident or detection results from its header to its last sample."""
+    """Writer of a results file, from the header to the last sample; motion has `ShardWriter`."""
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
-        """Begin a new file."""
+        """Open a new file and write the header."""
         task = header["task"]
-        self._make_entries, self._record_type = _ENTRIES[task], ENTRY_RECORDS[task]
+        self._make_entries = _ENTRIES[task]
+        self._record_type = ENTRY_RECORDS[task]
         self._count = 0
         self._file = path.open("w", encoding="utf-8", newline="\n")
         for name, value in header.items():
-            separator = "," if self._file.tell() else "{"
+            if self._file.tell():
+                separator = ","
+            else:
+                separator = "{"
             self._file.write(f"{separator}\n{json.dumps(name)}: {json.dumps(value)}")
         self._file.write(_BODY_START)
 
     def add(self, token: str, prediction: object) -> None:
         """Write the entries of a sample.
 
-        Raises ResultsError or ContentError, and then writes nothing of the sample.
+        Raise ResultsError or ContentError if they are invalid; then nothing of the sample is
+        written.
         """
         entries = json.dumps(self._make_entries(token, prediction))
         read_entries(entries.encode(), self._record_type)
-        separator = "," if self._count else ""
-        self._file.write(f"{separator}\n{json.dumps(token)}: {entries}")
-        self._count += 1
+        self._write_body(f"\n{json.dumps(token)}: {entries}", 1)
 
     def add_part(self, part: Results) -> None:
         """Copy the entries of a file that another writer of this class wrote."""
         text = read_bytes(part.path, "results").decode()
         body = text.partition(_BODY_START)[2].removesuffix(_BODY_END)
-        separator = "," if self._count else ""
-        self._file.write(f"{separator}{body}")
-        self._count += len(part)
+        self._write_body(body, len(part))
+
+    def _write_body(self, text: str, sample_count: int) -> None:
+        """Append the text of further samples, after a separator if there are earlier ones."""
+        if self._count:
+            self._file.write(",")
+        self._file.write(text)
+        self._count += sample_count
 
     def finish(self) -> None:
-        """Write the end; raises ResultsError if nothing was added."""
+        """Write the end of the file and close it; raise ResultsError if no sample was added."""
         if not self._count:
-            raise ResultsError("no prediction was added; results of no sample cannot be read")
+            raise ResultsError("no prediction was added; add at least one prediction")
         self._file.write(_BODY_END)
         self.close()
 
@@ -313,7 +331,8 @@ class EntryWriter:
         self._file.close()
 
 
-def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
+def _accident_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+    """Convert the accidents of a sample to entries; raise ResultsError if one is invalid."""
     del token
     try:
         accidents = checked_prediction(prediction)
@@ -321,7 +340,7 @@ def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
         raise ResultsError(str(error)) from error
     if isinstance(accidents, MotionOutput):
         raise ResultsError(
-            "expected a list of Accidents, found a MotionOutput; write that to results of task "
+            "expected a list of Accidents, found a MotionOutput; write it to results of the task "
             "'motion'"
         )
     return [
@@ -335,7 +354,8 @@ def _accidents(token: str, prediction: object) -> list[dict[str, Any]]:
     ]
 
 
-def _boxes(token: str, prediction: object) -> list[dict[str, Any]]:
+def _box_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+    """Convert the boxes of a sample to entries; raise ResultsError if they are invalid."""
     if not isinstance(prediction, DetectedBoxes):
         raise ResultsError(
             f"expected DetectedBoxes, found {type(prediction).__name__}; make them with "
@@ -351,9 +371,9 @@ def _boxes(token: str, prediction: object) -> list[dict[str, Any]]:
 
 
 def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any]]:
-    """Return a sample's boxes, which are in the world frame, as entries of a file."""
+    """Convert a sample's boxes, which are in the world frame, to entries of a results file."""
     boxes = detected.boxes
-    columns = zip(
+    rows = zip(
         boxes.center.tolist(),
         boxes.size[:, LENGTH_FIRST].tolist(),
         boxes.rotation.tolist(),
@@ -372,14 +392,15 @@ def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any
             "detection_name": CATEGORIES[category],
             "detection_score": score,
         }
-        for center, size, rotation, velocity, category, score in columns
+        for center, size, rotation, velocity, category, score in rows
     ]
 
 
-def _plans(token: str, prediction: object) -> list[dict[str, Any]]:
+def _plan_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+    """Convert the plans of a sample to entries; raise ResultsError if an item is not a Plan."""
     del token
     entries = []
-    for plan in _checked_list(Plan, prediction):
+    for plan in _check_items(Plan, prediction):
         entry: dict[str, Any] = {
             "times": plan.times.tolist(),
             "path": plan.path.tolist(),
@@ -391,7 +412,8 @@ def _plans(token: str, prediction: object) -> list[dict[str, Any]]:
     return entries
 
 
-def _forecasts(token: str, prediction: object) -> list[dict[str, Any]]:
+def _forecast_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+    """Convert the forecasts of a sample to entries; raise ResultsError if one is not a Forecast."""
     del token
     return [
         {
@@ -400,34 +422,34 @@ def _forecasts(token: str, prediction: object) -> list[dict[str, Any]]:
             "paths": forecast.paths.tolist(),
             "probabilities": forecast.probabilities.tolist(),
         }
-        for forecast in _checked_list(Forecast, prediction)
+        for forecast in _check_items(Forecast, prediction)
     ]
 
 
-def _checked_list(item_type: type[Kind], prediction: object) -> list[Kind]:
-    """Return the items of a prediction; raises ResultsError if one is of another type."""
+def _check_items(item_type: type[Kind], prediction: object) -> list[Kind]:
+    """Return the items of a prediction as a list; raise ResultsError if one has another type."""
     items = list(prediction) if isinstance(prediction, Iterable) else [prediction]
     checked = []
     for item in items:
         if not isinstance(item, item_type):
             raise ResultsError(
-                f"expected a list of {item_type.__name__}s, found {type(item).__name__} in it"
+                f"expected a list of {item_type.__name__}s, found {type(item).__name__} in the list"
             )
         checked.append(item)
     return checked
 
 
-# Task → function that makes the entries of a sample from its token and prediction.
-_ENTRIES: Final[Mapping[str, Callable[[str, object], list[dict[str, Any]]]]] = {
-    "accident": _accidents,
-    "detection": _boxes,
-    "planning": _plans,
-    "forecasting": _forecasts,
+# Task → function that converts a sample's token and prediction to entries.
+_ENTRIES: Mapping[str, Callable[[str, object], list[dict[str, Any]]]] = {
+    "accident": _accident_entries,
+    "detection": _box_entries,
+    "planning": _plan_entries,
+    "forecasting": _forecast_entries,
 }
 
 
 class ShardWriter:
-    """Writes the folder of motion results, the manifest last."""
+    """Writer of a folder of motion results: first the shards, then the manifest."""
 
     def __init__(
         self,
@@ -439,57 +461,64 @@ class ShardWriter:
         labels: str | None,
         store: Stored,
     ) -> None:
-        """Create the folder of shards in an empty folder; other arguments as in ResultsWriter."""
-        self._folder, self._header = folder, header
-        self._grid, self._step, self._labels, self._store = grid, step, labels, store
-        self._frames = self._predictions = 0
+        """Create the folder of shards in an empty folder; see `ResultsWriter` for the arguments."""
+        self._folder = folder
+        self._header = header
+        self._grid = grid
+        self._step = step
+        self._labels = labels
+        self._store = store
+        self._frames = 0
+        self._predictions = 0
         self._shards: list[Shard] = []
         self._archive: zipfile.ZipFile | None = None
-        self._in_shard: list[str] = []
+        self._shard_tokens: list[str] = []
         (folder / "shards").mkdir()
 
     def add(self, token: str, prediction: object) -> None:
-        """Write the prediction of a sample; raises ResultsError, and then writes nothing of it."""
-        output = self._checked(prediction)
-        arrays = self._arrays(output)
+        """Write a sample's prediction; if it is invalid, raise ResultsError and write nothing."""
+        output = self._check_output(prediction)
+        arrays = self._make_arrays(output)
         predictions, frames = next(iter(arrays.values())).shape[:2]
         if self._frames not in (0, frames):
             raise ResultsError(
-                f"expected {self._frames} frames as of the samples before, found {frames}"
+                f"expected {self._frames} frames, as in earlier samples, found {frames}"
             )
-        self._form(output.grid, predictions, frames)  # raises for an invalid form
-        self._grid, self._frames = output.grid, frames
+        self._make_form(output.grid, predictions, frames)  # raises if a value is invalid
+        self._grid = output.grid
+        self._frames = frames
         self._predictions = max(self._predictions, predictions)
         if self._archive is None:
-            self._archive = zipfile.ZipFile(self._folder / self._file, "w")
+            self._archive = zipfile.ZipFile(self._folder / self._shard_file, "w")
         for name, array in arrays.items():
             put_array(self._archive, MEMBER.format(token, name), array)
-        self._in_shard.append(token)
+        self._shard_tokens.append(token)
         written_bytes = sum(entry.compress_size for entry in self._archive.infolist())
-        if len(self._in_shard) >= _MAX_SHARD_SAMPLES or written_bytes >= MAX_SHARD_BYTES:
+        if len(self._shard_tokens) >= _MAX_SHARD_SAMPLES or written_bytes >= MAX_SHARD_BYTES:
             self._end_shard()
 
     def add_part(self, part: Results) -> None:
         """Copy the shards of a folder that another writer of this class wrote.
 
-        Its predictions are of the same grid and number of frames.
+        The predictions of both must have the same grid and number of frames.
         """
         self._end_shard()
         contents: Any = contents_of(part.path / RESULTS_FILE)[0]
-        self._grid, self._frames = contents.form.grid, contents.form.frames
+        self._grid = contents.form.grid
+        self._frames = contents.form.frames
         self._predictions = max(self._predictions, contents.form.predictions)
         for shard in contents.shards:
-            target_path = self._folder / self._file
+            target_path = self._folder / self._shard_file
             with open_file(part.path / shard.file) as source, target_path.open("wb") as target:
                 shutil.copyfileobj(source, target)
-            self._shards.append(msgspec.structs.replace(shard, file=self._file))
+            self._shards.append(msgspec.structs.replace(shard, file=self._shard_file))
 
     def finish(self) -> None:
-        """Write the manifest; raises ResultsError if nothing was added."""
+        """Write the manifest; raise ResultsError if no sample was added."""
         self._end_shard()
         if self._grid is None or not self._shards:
-            raise ResultsError("no prediction was added; results of no sample cannot be read")
-        form = self._form(self._grid, self._predictions, self._frames)
+            raise ResultsError("no prediction was added; add at least one prediction")
+        form = self._make_form(self._grid, self._predictions, self._frames)
         shards = msgspec.to_builtins(self._shards)
         manifest = {**self._header, "form": form.as_dict(), "shards": shards}
         text = f"{json.dumps(manifest, indent=1)}\n"
@@ -497,15 +526,19 @@ class ShardWriter:
 
     def close(self) -> None:
         """Close the archive that is being written, if any."""
-        archive, self._archive = self._archive, None
+        archive = self._archive
+        self._archive = None
         if archive is not None:
             archive.close()
 
     @property
-    def _file(self) -> str:
-        return f"shards/{len(self._shards):05d}.npz"
+    def _shard_file(self) -> str:
+        """Path of the next shard, relative to the folder."""
+        number = len(self._shards)
+        return f"shards/{number:05d}.npz"
 
-    def _form(self, grid: BevGrid, predictions: int, frames: int) -> MotionForm:
+    def _make_form(self, grid: BevGrid, predictions: int, frames: int) -> MotionForm:
+        """Build the form of the results; raise ResultsError if a value is invalid."""
         return MotionForm(
             stored=self._store,
             grid=grid,
@@ -515,20 +548,22 @@ class ShardWriter:
             labels=self._labels,
         )
 
-    def _checked(self, prediction: object) -> MotionOutput:
+    def _check_output(self, prediction: object) -> MotionOutput:
+        """Return the prediction; raise ResultsError if it has the wrong type or grid."""
         if not isinstance(prediction, MotionOutput):
             raise ResultsError(
                 f"expected a MotionOutput, found {type(prediction).__name__}; make one with "
-                "MotionOutput.from_arrays(…), or of instance maps with instances_of(…)"
+                "MotionOutput.from_arrays(…), or from instance maps with instances_of(…)"
             )
         if self._grid not in (None, prediction.grid):
             raise ResultsError(
                 f"expected a prediction on {self._grid}, found one on {prediction.grid}; write "
-                "others to other results"
+                "predictions on different grids to different results"
             )
         return prediction
 
-    def _arrays(self, output: MotionOutput) -> dict[str, AnyArray]:
+    def _make_arrays(self, output: MotionOutput) -> dict[str, AnyArray]:
+        """Return the arrays to store by name; raise ResultsError if they cannot be stored."""
         if output.instances is not None and output.instances.min() < 0:
             raise ResultsError(
                 f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}"
@@ -537,60 +572,66 @@ class ShardWriter:
             return instance_arrays(output)
         if output.heads is None:
             raise ResultsError(
-                "expected heads, found instance maps; write those with store='instances'"
+                "expected heads, found instance maps; write instance maps with store='instances'"
             )
         if any(heads.ignore_index is not None for heads in output.heads):
             raise ResultsError(
-                "expected a model's heads, found those of labels, which hold values to ignore; "
-                "write them with store='instances'"
+                "expected the heads of a model, found heads made from labels, which contain "
+                "values to ignore; write the instance maps of the labels with store='instances'"
             )
         return head_arrays(output)
 
     def _end_shard(self) -> None:
+        """Close the archive that is being written, and list it as a shard."""
         if self._archive is None:
             return
         self.close()
-        path = self._folder / self._file
-        self._shards.append(
-            Shard(
-                file=self._file,
-                tokens=tuple(self._in_shard),
-                bytes=path.stat().st_size,
-                checksum=file_checksum(path),
-            )
+        path = self._folder / self._shard_file
+        shard = Shard(
+            file=self._shard_file,
+            tokens=tuple(self._shard_tokens),
+            bytes=path.stat().st_size,
+            checksum=file_checksum(path),
         )
-        self._in_shard = []
+        self._shards.append(shard)
+        self._shard_tokens = []
 
 
 def head_arrays(output: MotionOutput) -> dict[str, AnyArray]:
-    """Return the heads of a prediction, float32 arrays of shape (K, T, channels, H, W)."""
-    heads = output.heads or ()
-    return {name: np.stack([getattr(frame_heads, name) for frame_heads in heads]) for name in HEADS}
+    """Return the heads of K predictions by name: float32 arrays (K, T, channels, H, W)."""
+    arrays = {}
+    for name in HEADS:
+        maps = [getattr(heads, name) for heads in output.heads or ()]
+        arrays[name] = np.stack(maps)
+    return arrays
 
 
 def instance_arrays(output: MotionOutput) -> dict[str, AnyArray]:
-    """Return the instance maps of a prediction; heads are post-processed for them."""
+    """Return the instance maps of K predictions, extracted from the heads if necessary."""
     maps = output.instances
     if maps is None:
         predicted = [predict_instances(heads, "motion").instance for heads in output.heads or ()]
         maps = np.stack(predicted)
     max_id = int(maps.max(initial=0))
+    id_type: type[np.integer[Any]] = np.int32
     if max_id < 2**8:
-        return {"instance": maps.astype(np.uint8)}
-    if max_id < 2**16:
-        return {"instance": maps.astype(np.uint16)}
-    return {"instance": maps.astype(np.int32)}
+        id_type = np.uint8
+    elif max_id < 2**16:
+        id_type = np.uint16
+    return {"instance": maps.astype(id_type)}
 
 
 def put_array(archive: zipfile.ZipFile, member: str, array: AnyArray) -> None:
-    """Add an array to an archive; the bytes do not depend on the time."""
+    """Add an array to an archive with a fixed date, so that equal contents have equal bytes."""
     buffer = io.BytesIO()
-    np.lib.format.write_array(
-        buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False
-    )
+    contiguous = np.ascontiguousarray(array)
+    np.lib.format.write_array(buffer, contiguous, version=(1, 0), allow_pickle=False)
     entry = zipfile.ZipInfo(member, _ARCHIVE_DATE)
     entry.external_attr = 0o644 << 16
-    # maps of floats are noise: deflating them takes a second and saves nothing
+    # maps of floats look like noise: compressing them takes a second and saves nothing
     is_noise = array.dtype.kind == "f" and array.ndim > 3
-    compression = zipfile.ZIP_STORED if is_noise else zipfile.ZIP_DEFLATED
+    if is_noise:
+        compression = zipfile.ZIP_STORED
+    else:
+        compression = zipfile.ZIP_DEFLATED
     archive.writestr(entry, buffer.getvalue(), compression, compresslevel=6)

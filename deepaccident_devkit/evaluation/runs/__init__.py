@@ -1,7 +1,7 @@
 """Whole evaluations: from a results file to a bundle of numbers that others can check and compare.
 
-`evaluate_results` makes an `EvaluationRun`, `save_run` writes it, `verify_bundle` makes it again,
-`compare_bundles` decides which differences between two are real.
+`evaluate_results` computes an `EvaluationRun`, `save_run` writes it as a bundle, `verify_bundle`
+repeats it, and `compare_bundles` decides which differences between two bundles are real.
 """
 
 from deepaccident_devkit.evaluation.runs.bundles import (

@@ -1,10 +1,10 @@
 """`compare_bundles`: two evaluations side by side, and which of their differences are real.
 
 The tests are fixed beforehand: the task's first headline is tested by itself, the other headlines
-together by Holm's rule. If both evaluations are equally good, it is chance which of them has which
-counts of a cluster (an accident and its twin). A paired permutation test swaps the counts of some
-clusters and asks how often the two then differ as much. So clusters that are hard for both do not
-hide a difference.
+together by Holm's rule. If both evaluations are equally good, only chance decides which of them has
+the better counts of a cluster (an accident and its twin). So a paired permutation test swaps the
+counts of random clusters, and asks how often the evaluations then differ at least as much. Clusters
+that are hard for both evaluations do not hide a difference.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,50 +34,53 @@ from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.runs.verification import find_differences
 from deepaccident_devkit.evaluation.task import Headline, headlines, plain
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, ShortRepr, known
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, ShortRepr, json_numbers
+from deepaccident_devkit.support.human_names import metric_name, rules_name, with_unit
 from deepaccident_devkit.support.reports import Report, Row, record_rows
-from deepaccident_devkit.support.text import columns_text, counted, path_of
+from deepaccident_devkit.support.text import PathType, columns_text, counted, path_of
 
-# How a number is tested: by itself, with all other headlines, or not at all.
+# How a number is tested: by itself, together with the other headlines, or not at all.
 Family = Literal["main", "headlines", "other"]
-# Keys of a summary that both evaluations must have in common.
-_SETUP_KEYS: Final = ("task", "protocol", "switches", "horizon", "settings")
-# Number of differing rules, and of names, that an error lists.
-_MAX_LISTED: Final = 3
-# Differences that differ by at most this share of them count as equal.
-_RELATIVE_TOLERANCE: Final = 1e-9
-_IMPOSSIBLE: Final = "no decision is possible with"
-# Stands for that text in a table, which explains it below.
-_TOO_FEW: Final = "too few"
-# Chance that the stated number of scenarios decides a difference.
-_POWER: Final = 0.8
+# Keys of a summary that must have the same values in both evaluations.
+_SETUP_KEYS = ("task", "protocol", "switches", "horizon", "settings")
+# An error lists at most this many differing rules, or names.
+_MAX_LISTED = 3
+# Differences count as equal if they deviate by at most this fraction.
+_RELATIVE_TOLERANCE = 1e-9
+_IMPOSSIBLE = "no decision is possible with"
+# Replaces such a decision in a table; the explanation is printed below the table.
+_TOO_FEW = "too few"
+# Probability that the stated number of scenarios decides a difference.
+_POWER = 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedNumber(ShortRepr):
-    """A number of both results.
+    """One number in two evaluations, a and b.
 
     Attributes:
-        number: Path in the result, such as `ranges/30x30/iou`.
-        headline: Short name, if it is one of the task's headlines; otherwise None.
-        unit: Unit of a headline; otherwise None.
-        a: Value of the first; None where it has nothing to count.
-        b: Value of the second; likewise.
+        number: Path of the number in the result, such as `ranges/30x30/iou`.
+        headline: Short name of a headline; None for other numbers.
+        unit: Unit of a headline; None for other numbers.
+        a: Value in the first evaluation; None if there is nothing to count.
+        b: Value in the second evaluation; None if there is nothing to count.
         difference: b − a; None if either is None.
-        low: Lower end of the interval of the true difference; None for no interval.
-        high: Upper end.
+        low: Lower end of the interval of the true difference; None if there is no interval.
+        high: Upper end of the interval; None if there is no interval.
         family: `main` for the task's first headline, which is tested by itself; `headlines` for the
-            others, which are tested together; `other` for numbers for exploration, which are not
-            tested.
-        p: p of the paired permutation test of this number by itself; None without difference or
-            resamples.
-        adjusted_p: The same by Holm's rule over the headlines; equal to p for other numbers.
+            other headlines, which are tested together; `other` for all other numbers, which are
+            only meant for exploration and are not tested.
+        p: p of the paired permutation test of this number by itself; None if there is no difference
+            or there are no resamples.
+        adjusted_p: p adjusted by Holm's rule over the headlines; equal to `p` for other numbers.
         real: Whether the adjusted p is at most 1 − confidence; False for numbers that are not
             tested.
-        better: `a` or `b`, if a difference is real and it is known whether more is better;
-            otherwise None.
-        decision: Text for readers: `b is better`, or why nothing is decided, and how many scenarios
-            would decide it.
+        better: `a` or `b` if the difference is real and it is known whether higher or lower numbers
+            are better; otherwise None.
+        decision: Text such as `b is better`; if nothing is decided, it explains why, and how many
+            scenarios would decide it.
+        higher_is_better: Whether higher values of a headline are better; None if neither higher
+            nor lower are, and for other numbers.
     """
 
     number: str
@@ -93,26 +97,27 @@ class ComparedNumber(ShortRepr):
     real: bool
     better: str | None
     decision: str
+    higher_is_better: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison(Report):
-    """Two evaluations by the same rules.
+    """Comparison of two evaluations under the same rules.
 
     Attributes:
-        a: Folder of the first.
-        b: Folder of the second.
-        task: Task of both.
-        protocol: Protocol of both.
-        samples: Number of samples compared.
-        scenarios: Number of their scenarios.
-        clusters: Number of their clusters, where an accident and its twin are one.
-        left_out: Number of samples that only one of them has.
-        partial: Marks of the evaluations that are partial themselves.
-        resampling: How differences were tested.
-        swaps: Number of swaps of the two runs' counts, cluster by cluster, that p is a share of.
-        all_swaps: Whether these are all possible swaps (apart from the sign); otherwise they are
-            random.
+        a: Folder of the first evaluation.
+        b: Folder of the second evaluation.
+        task: Task of both evaluations.
+        protocol: Protocol of both evaluations.
+        samples: Number of compared samples.
+        scenarios: Number of scenarios that the samples belong to.
+        clusters: Number of clusters that the samples belong to; an accident and its twin are one.
+        left_out: Number of samples that only one evaluation has.
+        partial: Marks of the partial evaluations among the two.
+        resampling: Settings of the intervals and tests.
+        swaps: Number of swaps that the p values are based on; a swap exchanges the counts of
+            clusters between the two runs.
+        all_swaps: Whether these are all possible swaps (up to the sign); otherwise they are random.
         numbers: Compared numbers, headlines first.
     """
 
@@ -130,18 +135,25 @@ class Comparison(Report):
     all_swaps: bool
     numbers: tuple[ComparedNumber, ...]
 
+    @property
+    def title(self) -> str:
+        """The task, its protocol and the number of common samples, in words."""
+        samples = counted(self.samples, "sample")
+        scenarios = counted(self.scenarios, "scenario")
+        return f"{rules_name(self.task, self.protocol)}; {samples} of {scenarios}"
+
     def to_text(self) -> str:
-        """Return a table of the headlines, how many other numbers differ, and how to read it."""
-        samples, scenarios = counted(self.samples, "sample"), counted(self.scenarios, "scenario")
+        """Format a table of the headlines, with notes on how to read it and on other numbers."""
         head = [
-            f"{self.task}, protocol {self.protocol}: {samples} of {scenarios}",
-            f"clusters: {self.clusters} (an accident and its twin are one)",
+            self.title,
+            f"clusters: {self.clusters} (an accident and its twin form one cluster)",
             f"a: {self.a}",
             f"b: {self.b}",
             *self.partial,
         ]
         if self.left_out:
-            head.append(f"a, b: only the samples that both have; {self.left_out} left out")
+            left_out = counted(self.left_out, "sample")
+            head.append(f"excluded: {left_out} that only one of the two evaluations has")
         interval_title = f"{self.resampling.confidence:.0%} interval"
         rows: list[Sequence[str]] = [("number", "a", "b", "b − a", interval_title, "p", "decision")]
         explanations: list[str] = []
@@ -151,106 +163,121 @@ class Comparison(Report):
             rows.append(text_row(number))
             if number.decision.startswith(_IMPOSSIBLE):
                 explanations = [f"{_TOO_FEW}: {number.decision}"]
-        # the first headline is tested by itself and needs fewer clusters, so the last explanation
-        # stays
+        # show only the last explanation: the first headline, which is tested by itself, needs fewer
+        # clusters than the others
         return "\n".join([*head, "", columns_text(rows), "", *explanations, *self.notes()])
 
     def notes(self) -> list[str]:
-        """Return notes for readers of the table."""
+        """Return notes that explain the table."""
         if not self.resampling.resamples:
-            return ["no intervals and no tests: no resamples were asked for"]
+            return ["no confidence intervals and no tests, since the resamples were set to 0"]
         level = 1 - self.resampling.confidence
-        main = next((number.headline for number in self.numbers if number.family == "main"), None)
-        drawn = f"all {self.swaps:,}" if self.all_swaps else f"{self.swaps:,} random"
+        main_headline = None
+        other_p = []
+        for number in self.numbers:
+            if number.family == "main":
+                main_headline = metric_name(str(number.headline))
+            elif number.family == "other" and number.p is not None:
+                other_p.append(number.p)
+        swaps = "all swaps" if self.all_swaps else "random swaps"
         notes = [
             (
-                f"p: share of {drawn} swaps of clusters between a and b after which they differ at "
-                "least as much"
+                f"p is the share of {swaps} of clusters between a and b after which the two differ "
+                f"at least as much; number of swaps: {self.swaps:,}"
             ),
             (
-                f"tested at {level:.0%}: {main}; and the other headlines together, whose p is "
-                "adjusted by Holm's rule"
+                f"{main_headline} is tested at {level:.0%}; the other headlines are tested "
+                "together, with p adjusted by Holm's rule"
             ),
             (
-                "scenarios that would decide: with a chance of 80 %, if the true difference is the "
-                "observed one"
+                "the number of scenarios needed is the number at which a test would find the "
+                "difference with a probability of 80 %, if the observed difference is the true "
+                "one"
             ),
         ]
-        p_values = [number.p for number in self.numbers if number.family == "other"]
-        tested = [p for p in p_values if p is not None]
-        if tested:
-            low = sum(p <= level for p in tested)
+        if other_p:
+            low_count = sum(p <= level for p in other_p)
             notes.append(
-                f"for exploration: {low} of {len(tested)} other numbers have a p of at most "
-                f"{level:.0%}; between equally good runs about {level * len(tested):.1f} would, by "
-                "chance"
+                f"exploratory: p is at most {level:.0%} for {low_count} of {len(other_p)} other "
+                f"numbers; about {level * len(other_p):.1f} are expected by chance if both runs "
+                "are equally good"
             )
         return notes
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all values in JSON form."""
-        values = asdict(self) | {"a": os.fspath(self.a), "b": os.fspath(self.b)}
+        """Convert all fields to JSON-compatible values."""
+        values = asdict(self)
+        values["a"] = os.fspath(self.a)
+        values["b"] = os.fspath(self.b)
+        values["notes"] = self.notes()
         payload: dict[str, Any] = plain(values)
-        return payload | {"notes": self.notes()}
+        return payload
 
     def named_tables(self) -> dict[str, list[Row]]:
-        """Return a table with a row for each number."""
+        """Return a single table with one row per number."""
         return {"numbers": record_rows(ComparedNumber, self.numbers)}
 
 
 def text_row(number: ComparedNumber) -> tuple[str, ...]:
-    """Return the cells of a number's row."""
-    unit = ""
-    if number.unit and number.unit != "share":
-        unit = f" ({number.unit})"
-    interval = "–"
-    if number.low is not None and number.high is not None:
-        interval = f"[{number.low:+.3f}, {number.high:+.3f}]"
-    is_impossible = number.decision.startswith(_IMPOSSIBLE)
+    """Format the cells of a number's row in the text of a comparison."""
+    decision = number.decision
+    if decision.startswith(_IMPOSSIBLE):
+        decision = _TOO_FEW
     return (
-        f"{number.headline}{unit}",
-        _number_text(number.a),
-        _number_text(number.b),
-        "–" if number.difference is None else f"{number.difference:+.3f}",
-        interval,
-        _number_text(number.adjusted_p),
-        _TOO_FEW if is_impossible else number.decision,
+        with_unit(metric_name(str(number.headline)), number.unit),
+        decimal_text(number.a),
+        decimal_text(number.b),
+        decimal_text(number.difference, "+"),
+        interval_text(number.low, number.high, "+"),
+        decimal_text(number.adjusted_p),
+        decision,
     )
 
 
-def _number_text(value: float | None) -> str:
+def decimal_text(value: float | None, sign: str = "") -> str:
+    """Format a number with three decimals; None is a dash, and `sign="+"` always shows a sign."""
     if value is None:
         return "–"
-    return f"{value:.3f}"
+    return f"{value:{sign}.3f}"
+
+
+def interval_text(low: float | None, high: float | None, sign: str = "") -> str:
+    """Format an interval like `decimal_text`; a dash if an end is unknown."""
+    if low is None or high is None:
+        return "–"
+    return f"[{low:{sign}.3f}, {high:{sign}.3f}]"
 
 
 def compare_bundles(
-    a: str | os.PathLike[str],
-    b: str | os.PathLike[str],
+    a: PathType,
+    b: PathType,
     resampling: Resampling | None = None,
     *,
     common: bool = False,
 ) -> Comparison:
-    """Compare two bundles' numbers; the release and the results are not needed.
+    """Compare the numbers of two bundles; neither the release nor the results are needed.
 
     Args:
-        a: Folder of the first, as written by `save_run`.
-        b: Folder of the second.
-        resampling: How differences are tested; None for the defaults.
-        common: Whether to compare only the samples that both have, if they differ.
+        a: Folder of the first bundle, as written by `save_run`.
+        b: Folder of the second bundle.
+        resampling: Settings of the intervals and tests; None for the defaults.
+        common: Whether to compare only the common samples if the samples differ.
 
     Raises:
-        ResultsError: one of them is no bundle.
-        EvaluationError: they differ in task, rules, labels or samples, or were made by another
-            devkit.
+        ResultsError: If one of the folders does not contain a bundle.
+        EvaluationError: If the two differ in task, rules, labels or samples, or were written by
+            another version of the devkit.
     """
     resampling = resampling or Resampling()
-    bundles = read_bundle(path_of(a)), read_bundle(path_of(b))
+    bundles = (read_bundle(path_of(a)), read_bundle(path_of(b)))
     evaluators, tokens = comparable(bundles, common=common)
-    scenarios = list(dict.fromkeys(map(scenario_of, tokens)))
+    evaluator_a, evaluator_b = evaluators
+    scenarios = set(map(scenario_of, tokens))
     setup = bundles[0].setup
     results = [evaluator.compute(tokens) for evaluator in evaluators]
-    headlines_by_path = {line.path: line for result in results for line in headlines(result)}
+    headlines_by_path = {}
+    for headline in chain(*map(headlines, results)):
+        headlines_by_path[headline.path] = headline
     numbers_a, numbers_b = map(numbers_of, results)
     all_paths = {**numbers_a, **numbers_b}
     headline_paths = [path for path in headlines_by_path if path in all_paths]
@@ -259,9 +286,9 @@ def compare_bundles(
     values_b = [numbers_b.get(path, math.nan) for path in paths]
     values = np.array([values_a, values_b])
     cluster_names = {token: cluster_of(scenario_of(token)) for token in tokens}
-    clusters = evaluators[0].clustered(cluster_names), evaluators[1].clustered(cluster_names)
+    clusters = (evaluator_a.clustered(cluster_names), evaluator_b.clustered(cluster_names))
     differences = dict(zip(paths, values[1] - values[0], strict=True))
-    test = paired_test(evaluators[0], clusters, differences, resampling)
+    test = paired_test(evaluator_a, clusters, differences, resampling)
     marks = []
     for name, bundle in zip("ab", bundles, strict=True):
         partial = bundle.summary["partial"]
@@ -275,7 +302,7 @@ def compare_bundles(
         samples=len(tokens),
         scenarios=len(scenarios),
         clusters=test.clusters,
-        left_out=len(evaluators[0].tokens ^ evaluators[1].tokens),
+        left_out=len(evaluator_a.tokens ^ evaluator_b.tokens),
         partial=tuple(marks),
         resampling=resampling,
         swaps=len(test.swaps.swapped),
@@ -291,9 +318,17 @@ def _compare_numbers(
     headlines_by_path: Mapping[str, Headline],
     scenarios: int,
 ) -> tuple[ComparedNumber, ...]:
-    """Return the M numbers with their tests; values (2, M) of the first and the second."""
-    main = next(iter(headlines_by_path), None)
-    families = [_family(path, main, headlines_by_path) for path in paths]
+    """Combine M numbers with the results of their tests.
+
+    Args:
+        paths: Paths of the numbers.
+        values: (2, M) values in the first and in the second evaluation.
+        test: Test of the differences.
+        headlines_by_path: Path → headline, the most important first.
+        scenarios: Number of scenarios in both evaluations.
+    """
+    main_path = next(iter(headlines_by_path), None)
+    families = [_find_family(path, main_path, headlines_by_path) for path in paths]
     is_headline = np.array([family == "headlines" for family in families])
     is_tested = is_headline & np.isfinite(test.p)
     adjusted = test.p.copy()
@@ -304,43 +339,48 @@ def _compare_numbers(
         headline = headlines_by_path.get(path)
         is_low = bool(adjusted[index] <= 1 - test.resampling.confidence)
         is_real = family != "other" and is_low
-        better = _better(test.differences[index], headline) if is_real else None
+        better = None
         if family == "other":
             decision = "for exploration"
-        elif is_real:
-            decision = f"{better} is better" if better else "they differ"
-        else:
+        elif not is_real:
             decision = undecided_text(test, index, test_counts[family], scenarios)
-        numbers.append(
-            ComparedNumber(
-                number=path,
-                headline=None if headline is None else headline.name,
-                unit=None if headline is None else headline.unit,
-                a=known(values[0, index]),
-                b=known(values[1, index]),
-                difference=known(test.differences[index]),
-                low=known(test.low[index]),
-                high=known(test.high[index]),
-                family=family,
-                p=known(test.p[index]),
-                adjusted_p=known(adjusted[index]),
-                real=is_real,
-                better=better,
-                decision=decision,
-            )
+        else:
+            better = _better_side(test.differences[index], headline)
+            decision = f"{better} is better" if better else "they differ"
+        compared = ComparedNumber(
+            number=path,
+            headline=None if headline is None else headline.name,
+            unit=None if headline is None else headline.unit,
+            a=json_numbers(values[0, index]),
+            b=json_numbers(values[1, index]),
+            difference=json_numbers(test.differences[index]),
+            low=json_numbers(test.low[index]),
+            high=json_numbers(test.high[index]),
+            family=family,
+            p=json_numbers(test.p[index]),
+            adjusted_p=json_numbers(adjusted[index]),
+            real=is_real,
+            better=better,
+            decision=decision,
+            higher_is_better=None if headline is None else headline.higher_is_better,
         )
+        numbers.append(compared)
     return tuple(numbers)
 
 
-def _family(path: str, main: str | None, headlines_by_path: Mapping[str, Headline]) -> Family:
-    if path == main:
+def _find_family(
+    path: str, main_path: str | None, headlines_by_path: Mapping[str, Headline]
+) -> Family:
+    """Return in which family the number at a path is tested."""
+    if path == main_path:
         return "main"
     if path in headlines_by_path:
         return "headlines"
     return "other"
 
 
-def _better(difference: float, headline: Headline | None) -> str | None:
+def _better_side(difference: float, headline: Headline | None) -> str | None:
+    """Return which evaluation has the better value, `a` or `b`; None if unknown."""
     if headline is None or headline.higher_is_better is None:
         return None
     if (difference > 0) == headline.higher_is_better:
@@ -351,18 +391,24 @@ def _better(difference: float, headline: Headline | None) -> str | None:
 def comparable(
     bundles: Sequence[Bundle], *, common: bool
 ) -> tuple[list[Evaluator[Any]], list[str]]:
-    """Return the counts of bundles, and the samples that all of them have.
+    """Return evaluators with the counts of bundles, and the tokens that all bundles have.
 
-    Arguments and errors are the same as for `compare_bundles`.
+    Raise the errors of `compare_bundles` if the bundles cannot be compared.
+
+    Args:
+        bundles: Bundles to compare; the first is compared with each of the others.
+        common: Whether to compare only the common samples if the samples differ.
     """
-    reference = bundles[0]
-    for bundle in bundles[1:]:
+    reference, *other_bundles = bundles
+    for bundle in other_bundles:
         _check_rules(reference, bundle)
     evaluators = [bundle.evaluator() for bundle in bundles]
-    tokens = set(evaluators[0].tokens)
-    for bundle, evaluator in zip(bundles[1:], evaluators[1:], strict=True):
-        tokens &= set(
-            _shared_tokens((reference, bundle), (evaluators[0], evaluator), common=common)
+    reference_evaluator, *other_evaluators = evaluators
+    tokens = reference_evaluator.tokens
+    for bundle, evaluator in zip(other_bundles, other_evaluators, strict=True):
+        evaluator_pair = (reference_evaluator, evaluator)
+        tokens.intersection_update(
+            _shared_tokens((reference, bundle), evaluator_pair, common=common)
         )
         scenarios = dict.fromkeys(map(scenario_of, sorted(tokens)))
         _check_truth(reference, bundle, list(scenarios))
@@ -370,17 +416,21 @@ def comparable(
 
 
 def _check_rules(bundle: Bundle, other: Bundle) -> None:
-    """Raise EvaluationError if two bundles were evaluated by different rules."""
-    task, other_task = bundle.setup.task, other.setup.task
+    """Raise EvaluationError if two bundles were evaluated under different rules."""
+    task = bundle.setup.task
+    other_task = other.setup.task
     if task != other_task:
         raise EvaluationError(
-            f"{bundle.folder} is an evaluation of the task {task}, {other.folder} one of "
-            f"{other_task}; compare two of the same task"
+            f"{bundle.folder} is an evaluation of the task {task}, and {other.folder} is an "
+            f"evaluation of the task {other_task}; compare two evaluations of the same task"
         )
-    rules, other_rules = _rules(bundle), _rules(other)
-    cells, other_cells = _cells(bundle), _cells(other)
+    rules = _read_rules(bundle)
+    other_rules = _read_rules(other)
+    cells = _read_cells(bundle)
+    other_cells = _read_cells(other)
     if cells and other_cells:
-        rules["cells"], other_rules["cells"] = cells, other_cells
+        rules["cells"] = cells
+        other_rules["cells"] = other_cells
     differences = list(find_differences(rules, other_rules))
     if not differences:
         return
@@ -388,41 +438,47 @@ def _check_rules(bundle: Bundle, other: Bundle) -> None:
     for path, value, other_value in differences[:_MAX_LISTED]:
         values = f"{shortened(repr(value))} and {shortened(repr(other_value))}"
         texts.append(f"{shortened(path)} {values}")
-    hidden = len(differences) - _MAX_LISTED
+    hidden_count = len(differences) - _MAX_LISTED
     more = ""
-    if hidden > 0:
-        more = f", and {hidden} more"
+    if hidden_count > 0:
+        more = f", and {hidden_count} more"
     raise EvaluationError(
         f"{bundle.folder} and {other.folder}: were not evaluated by the same rules: "
         f"{'; '.join(texts)}{more}; evaluate both in the same way"
     )
 
 
-def _rules(bundle: Bundle) -> dict[str, Any]:
+def _read_rules(bundle: Bundle) -> dict[str, Any]:
+    """Return the rules of an evaluation, under the keys that they have in the summary."""
     return {name: bundle.summary.get(name) for name in _SETUP_KEYS}
 
 
-def _cells(bundle: Bundle) -> dict[str, Any]:
-    """Return the cells of motion results; empty for other results.
+def _read_cells(bundle: Bundle) -> dict[str, Any]:
+    """Return a description of the cells of motion results; empty for other results.
 
-    The orientation of maps is left out, since it changes no number.
+    The orientation of the maps is left out, since it does not affect the numbers.
     """
     form = bundle.summary["results"]["form"] or {}
-    return {name: str(form[name]) for name in ("x", "y", "step") if name in form}
+    cells = {}
+    for name in ("x", "y", "step"):
+        if name in form:
+            cells[name] = str(form[name])
+    return cells
 
 
 def _check_truth(bundle: Bundle, other: Bundle, scenarios: list[str]) -> None:
-    """Raise EvaluationError if files of scenarios differ between two bundles' releases."""
-    hashes, other_hashes = bundle.scenarios(), other.scenarios()
+    """Raise EvaluationError if files of the scenarios differ between two bundles' releases."""
+    hashes = bundle.scenarios()
+    other_hashes = other.scenarios()
     changed = []
     for name in scenarios:
         if name not in hashes or not hashes[name].is_like(other_hashes.get(name)):
             changed.append(name)
     if changed:
         raise EvaluationError(
-            f"{bundle.folder} and {other.folder}: the label, meta or calib files of {len(changed)} "
-            f"scenarios are not the same ({', '.join(_shorten(changed))}); evaluate both results "
-            "with the same release"
+            f"{bundle.folder} and {other.folder}: the label, meta or calib files differ in "
+            f"{counted(len(changed), 'scenario')} ({', '.join(_shorten(changed))}); evaluate "
+            "both results with the same release"
         )
 
 
@@ -432,17 +488,20 @@ def _shared_tokens(
     *,
     common: bool,
 ) -> list[str]:
-    """Return the samples of both; raises EvaluationError without any, or if samples differ."""
-    tokens, other_tokens = evaluators[0].tokens, evaluators[1].tokens
+    """Return the tokens that two bundles have in common.
+
+    Raise EvaluationError if there are none, or if the samples differ and `common` is False.
+    """
+    tokens = evaluators[0].tokens
+    other_tokens = evaluators[1].tokens
     if tokens != other_tokens and not common:
-        unmatched = (tokens - other_tokens, other_tokens - tokens)
+        extra_tokens = (tokens - other_tokens, other_tokens - tokens)
         texts = []
-        for bundle, extra in zip(bundles, unmatched, strict=True):
+        for bundle, extra in zip(bundles, extra_tokens, strict=True):
             if extra:
-                texts.append(
-                    f"{counted(len(extra), 'sample')} only in {bundle.folder} "
-                    f"({', '.join(_shorten(sorted(extra)))})"
-                )
+                names = ", ".join(_shorten(sorted(extra)))
+                samples = counted(len(extra), "sample")
+                texts.append(f"{samples} only in {bundle.folder} ({names})")
         raise EvaluationError(
             f"{'; '.join(texts)}; evaluate both at the same samples, or compare those that both "
             "have with common=True (--common)"
@@ -456,7 +515,7 @@ def _shared_tokens(
 
 
 def _shorten(names: list[str]) -> Iterator[str]:
-    """Yield the first names, and dots for the others."""
+    """Yield the first names, followed by an ellipsis if there are more."""
     yield from map(shortened, names[:_MAX_LISTED])
     if len(names) > _MAX_LISTED:
         yield "…"
@@ -464,13 +523,13 @@ def _shorten(names: list[str]) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Swaps:
-    """Swaps of clusters between two runs.
+    """S swaps of C clusters between two runs.
 
     Attributes:
-        swapped: Whether a swap exchanges a cluster, shape (S, C) for S swaps of C clusters. It has
-            the half of all swaps that leave the first cluster unchanged: the other half swaps the
-            complement, and gives the same differences with the opposite sign.
-        complete: Whether these are all such swaps; otherwise they are drawn at random.
+        swapped: (S, C) bool, True if the swap exchanges the counts of the cluster. The first
+            cluster is never exchanged, since exchanging the complementary clusters leads to the
+            same differences with the opposite sign.
+        complete: Whether these are all possible swaps; otherwise they are drawn at random.
     """
 
     swapped: BoolArray
@@ -479,35 +538,40 @@ class Swaps:
     @property
     def least_p(self) -> float:
         """The smallest possible p."""
-        return 1 / (len(self.swapped) + (not self.complete))
+        swap_count = len(self.swapped)
+        if not self.complete:
+            swap_count += 1  # the observed assignment
+        return 1 / swap_count
 
 
 def swaps_of(clusters: int, resampling: Resampling) -> Swaps:
-    """Return all 2ⁿ⁻¹ swaps of n clusters, or `resamples` random ones if there are more."""
+    """Generate all 2ⁿ⁻¹ swaps of n clusters, or only `resamples` random swaps if fewer."""
     swap_count = 2 ** max(clusters - 1, 0)
-    if swap_count <= resampling.resamples:
-        numbers = np.arange(swap_count)[:, None]
-        return Swaps(swapped=(numbers << 1) >> np.arange(clusters) & 1 == 1, complete=True)
-    source = np.random.default_rng(resampling.seed)
-    bits = source.integers(2, size=(resampling.resamples, clusters))
-    return Swaps(swapped=bits == 1, complete=False)
+    is_complete = swap_count <= resampling.resamples
+    if is_complete:
+        numbers = np.arange(swap_count)[:, None] << 1  # bit 0, the first cluster, is never set
+        bits = numbers >> np.arange(clusters) & 1
+    else:
+        generator = np.random.default_rng(resampling.seed)
+        bits = generator.integers(2, size=(resampling.resamples, clusters))
+    return Swaps(swapped=bits == 1, complete=is_complete)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PairedTest:
-    """Differences of M numbers of two runs, and their uncertainty.
+    """Differences between two runs in M numbers, and their uncertainty.
 
     Attributes:
-        differences: Second − first, shape (M,); NaN where one of them has nothing to count.
-        low: Lower end of the interval of the true difference, shape (M,); NaN for no interval (see
-            `intervals.interval_ends`).
-        high: Upper end, shape (M,).
-        errors: Standard errors, shape (M,); NaN where unknown.
-        p: Two-sided p of each number by itself, shape (M,); NaN without a difference, or without
+        differences: (M,) second − first; NaN if one run has nothing to count.
+        low: (M,) lower ends of the intervals of the true differences; NaN if there is no interval
+            (see `intervals.interval_ends`).
+        high: (M,) upper ends of the intervals; NaN if there is no interval.
+        errors: (M,) standard errors; NaN if unknown.
+        p: (M,) two-sided p of each number by itself; NaN if there is no difference or there are no
             resamples.
-        swaps: Swaps that p is a share of.
+        swaps: Swaps on which p is based.
         clusters: Number of clusters.
-        resampling: How the differences were tested.
+        resampling: Settings of the intervals and tests.
     """
 
     differences: FloatArray
@@ -526,23 +590,28 @@ def paired_test(
     differences: Mapping[str, float],
     resampling: Resampling,
 ) -> PairedTest:
-    """Test the differences of two runs' counts of the same clusters.
+    """Test the differences between two runs that count the same clusters.
 
     Args:
         evaluator: Evaluator of the counts.
-        runs: Clusters of the first and the second run.
+        runs: Clusters of the first and of the second run, in the same order.
         differences: Path of a number → second − first.
-        resampling: How differences are tested.
+        resampling: Settings of the intervals and tests.
     """
-    resampling = resampling if evaluator.has_intervals else replace(resampling, resamples=0)
-    names, observed = list(differences), np.array(list(differences.values()))
-    low, high, errors, p = (np.full(len(names), math.nan) for _ in range(4))
+    if not evaluator.has_intervals:
+        resampling = replace(resampling, resamples=0)
+    names = list(differences)
+    observed = np.array([*differences.values()])
+    low, high, errors, p = np.full((4, len(names)), math.nan)
     is_changed = [cluster != other for cluster, other in zip(*runs, strict=True)]
     swaps = swaps_of(sum(is_changed), resampling)
     if resampling.resamples:
         changed_first = np.argsort(np.logical_not(is_changed), kind="stable")
-        ordered = [[run[index] for index in changed_first] for run in runs]
-        p = p_values(observed, swapped_differences(evaluator, ordered, swaps, names), swaps)
+        ordered_runs = []
+        for run in runs:
+            ordered_runs.append([run[index] for index in changed_first])
+        swapped = swapped_differences(evaluator, ordered_runs, swaps, names)
+        p = p_values(observed, swapped, swaps)
     if resampling.resamples and len(is_changed) > 1:
         low, high, errors = difference_intervals(evaluator, runs, differences, resampling)
     without_interval = [not has_interval(name) for name in names]
@@ -563,13 +632,21 @@ def paired_test(
 def swapped_differences(
     evaluator: Evaluator[Any], pairs: Sequence[Clusters], swaps: Swaps, names: Sequence[str]
 ) -> FloatArray:
-    """Return the differences second − first of M numbers after each of S swaps, shape (S, M).
+    """Compute the differences second − first of M numbers after each of S swaps, shape (S, M).
 
-    The swaps are of the first clusters of the pairs. Differences are NaN where there is none.
+    A difference is NaN if one of the runs has nothing to count.
+
+    Args:
+        evaluator: Evaluator of the counts.
+        pairs: Clusters of the first and of the second run. The C clusters that can be swapped come
+            first.
+        swaps: S swaps of these C clusters.
+        names: Paths of the M numbers.
     """
     first, second = pairs
-    fixed = np.zeros((len(swaps.swapped), len(first) - swaps.swapped.shape[1]), dtype=bool)
-    swapped = np.hstack([swaps.swapped, fixed])
+    swap_count, cluster_count = swaps.swapped.shape
+    unswapped = np.zeros((swap_count, len(first) - cluster_count), dtype=bool)
+    swapped = np.hstack([swaps.swapped, unswapped])
     parts = [*first, *second]
     draws_a = np.hstack((~swapped, swapped)).astype(np.int64)
     numbers_a = numbers_of_draws(evaluator, parts, draws_a, names)
@@ -579,34 +656,39 @@ def swapped_differences(
 
 
 def p_values(differences: FloatArray, swapped: FloatArray, swaps: Swaps) -> FloatArray:
-    """Return the two-sided p of each difference.
+    """Compute the two-sided p of each difference.
 
-    It is the share of swaps, the observed one included, that differ as much or more. Of random
-    swaps only half of the equal ones count, unless none differ more: such ties are many
-    where a number changes in few clusters, and counting all would make the test far too strict.
+    It is the share of swaps, including the observed assignment, with at least the observed
+    difference. If swaps are random, only half of those with exactly the observed difference count,
+    unless no swap has a larger one. Such ties are frequent if a number changes in few clusters, and
+    counting all of them would make the test far too strict.
 
     Args:
-        differences: Observed differences, shape (M,); the p of NaN is NaN.
-        swapped: Differences after the swaps, shape (S, M); NaN counts as more.
-        swaps: The swaps.
+        differences: (M,) observed differences; p is NaN where they are NaN.
+        swapped: (S, M) differences after the swaps; NaN counts as a larger difference.
+        swaps: Swaps that lead to `swapped`.
     """
-    observed, resampled = np.abs(differences), np.abs(swapped)
+    observed = np.abs(differences)
+    resampled = np.abs(swapped)
     with np.errstate(invalid="ignore"):
-        more = (~(resampled <= observed * (1 + _RELATIVE_TOLERANCE))).sum(axis=0)
-        less = (resampled < observed * (1 - _RELATIVE_TOLERANCE)).sum(axis=0)
+        is_more = ~(resampled <= observed * (1 + _RELATIVE_TOLERANCE))
+        is_less = resampled < observed * (1 - _RELATIVE_TOLERANCE)
+    more = is_more.sum(axis=0)
+    less = is_less.sum(axis=0)
     if swaps.complete:
         hits = len(swapped) - less
     else:
         ties = len(swapped) - more - less
-        hits = 1 + more + np.where((more == 0) | (observed == 0), ties, ties / 2)
+        counts_all_ties = (more == 0) | (observed == 0)
+        hits = 1 + more + np.where(counts_all_ties, ties, ties / 2)
     return np.where(np.isnan(differences), math.nan, hits * swaps.least_p)
 
 
 def holm(p: FloatArray) -> FloatArray:
-    """Return p (M,) adjusted by Holm's rule.
+    """Adjust p values (M,) by Holm's rule.
 
-    If differences with an adjusted p below a level are called real, the chance that any of them is
-    false is at most that level.
+    If differences with an adjusted p below a level are called real, the probability that any of
+    them is not real is at most that level.
     """
     order = np.argsort(p)
     scaled = p[order] * np.arange(len(p), 0, -1)
@@ -616,22 +698,22 @@ def holm(p: FloatArray) -> FloatArray:
 
 
 def undecided_text(test: PairedTest, index: int, test_count: int, scenarios: int) -> str:
-    """Return why a difference is not real, and how many scenarios would decide it.
+    """Explain why a difference is not decided, and how many scenarios would decide it.
 
     Args:
-        test: The test.
+        test: Test of the differences.
         index: Index of the number.
         test_count: Number of differences that are tested together.
-        scenarios: Number of scenarios tested.
+        scenarios: Number of scenarios in both evaluations.
     """
     difference = abs(float(test.differences[index]))
     level = (1 - test.resampling.confidence) / test_count
     if math.isnan(difference):
         return "nothing to compare"
     if difference == 0:
-        return "the difference is 0"
+        return "equal"
     if not test.resampling.resamples:
-        return "not tested: no resamples were asked for, or the protocol has none"
+        return "not tested: there are no resamples"
     if test.swaps.least_p > level:
         return f"{_IMPOSSIBLE} {_too_few_text(test, level)} are needed"
     from scipy.special import ndtri
@@ -639,12 +721,13 @@ def undecided_text(test: PairedTest, index: int, test_count: int, scenarios: int
     quantiles = ndtri(1 - level / 2) + ndtri(_POWER)
     deviations = float(test.errors[index]) / difference * quantiles
     if not deviations > 0:
-        return "not decided"
+        return "inconclusive"
     scenario_count = _rounded_up(max(deviations**2, 1) * scenarios)
-    return f"not decided: about {scenario_count} scenarios would decide it"
+    return f"inconclusive (would need about {scenario_count} scenarios)"
 
 
 def _too_few_text(test: PairedTest, level: float) -> str:
+    """Say how many resamples or clusters there are, and how many a decision at a level needs."""
     if not test.swaps.complete:
         return f"{len(test.swaps.swapped)} resamples; at least {math.ceil(1 / level) - 1}"
     changed_count = test.swaps.swapped.shape[1]
@@ -657,6 +740,8 @@ def _too_few_text(test: PairedTest, level: float) -> str:
 
 
 def _rounded_up(count: float) -> str:
-    """Return a count rounded up to two digits: `130`, `1,300`."""
-    unit = 10 ** max(math.floor(math.log10(count)) - 1, 0)
-    return f"{math.ceil(count / unit) * unit:,}"
+    """Format a count, rounded up to two digits: `130`, `1,300`."""
+    digits = math.floor(math.log10(count))
+    unit = 10 ** max(digits - 1, 0)
+    rounded = math.ceil(count / unit) * unit
+    return f"{rounded:,}"

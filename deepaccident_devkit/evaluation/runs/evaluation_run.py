@@ -1,4 +1,4 @@
-"""`evaluate_results`: from results and a release to an `EvaluationRun` with its numbers."""
+"""`evaluate_results` evaluates results against a release and returns an `EvaluationRun`."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ from deepaccident_devkit.evaluation.runs.setups import (
 from deepaccident_devkit.evaluation.task import headlines, plain
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint, scenario_hashes
 from deepaccident_devkit.support.arrays import ShortRepr
-from deepaccident_devkit.support.parallel import run_batch, workers_kept
-from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.parallel import keep_workers, run_batch
+from deepaccident_devkit.support.text import PathType, counted
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import SPLITS
 
@@ -68,29 +68,32 @@ BREAKDOWNS: Final = (
     "trajectory_type",
     "collision_status",
 )
-"""Default attributes of breakdowns; `all` for intervals of the result itself."""
-# Libraries whose arithmetic affects the numbers; a summary holds their versions.
-_LIBRARIES: Final = ("numpy", "scipy")
+"""Default attributes of breakdowns; `all` provides the intervals of the result itself."""
+# Libraries whose arithmetic affects the numbers; a summary states their versions.
+_LIBRARIES = ("numpy", "scipy")
+# Largest number of scenarios that an error names.
+_MAX_NAMED_SCENARIOS = 3
 
 
 def breakdowns_of(task: str) -> tuple[str, ...]:
     """Return the default attributes of a task's breakdowns.
 
-    Warnings are evaluated on whole recordings and have no attributes within recordings.
+    A task that needs whole recordings, such as warnings, is not broken down by attributes that
+    change within a recording.
     """
-    names = BREAKDOWNS
-    if evaluator_class(task).needs_whole_recordings:
-        return tuple(name for name in names if name not in WITHIN_RECORDINGS)
-    return names
+    if not evaluator_class(task).needs_whole_recordings:
+        return BREAKDOWNS
+    return tuple(name for name in BREAKDOWNS if name not in WITHIN_RECORDINGS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Partial:
-    """Numbers of expected samples that were and were not evaluated.
+    """How many expected samples were and were not evaluated.
 
     Attributes:
         missing: Number of samples without a prediction.
-        extra: Number of predictions that are left out: of other samples, or of no sample.
+        extra: Number of predictions that are left out, since they belong to other samples or to
+            unknown ones.
         expected: Number of samples that should be evaluated.
         evaluated: Number of samples that were evaluated.
     """
@@ -101,23 +104,24 @@ class Partial:
     evaluated: int
 
     def text(self) -> str:
-        """Return the mark that every number bears: `PARTIAL: 120 of 180 samples`."""
+        """Return the mark that is shown with every number: `PARTIAL: 120 of 180 samples`."""
         left_out = ""
         if self.extra:
             left_out = f", {counted(self.extra, 'prediction')} left out"
-        return f"PARTIAL: {self.evaluated} of {counted(self.expected, 'sample')}{left_out}"
+        samples = counted(self.expected, "sample")
+        return f"PARTIAL: {self.evaluated} of {samples}{left_out}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the values by name, with the text as `mark`."""
+        """Return the fields by name, and the text under the key `mark`."""
         return asdict(self) | {"mark": self.text()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseInfo(ShortRepr):
-    """The release that the ground truth comes from.
+    """Description of the release that the ground truth comes from.
 
     Attributes:
-        dataroot: Its folder.
+        dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
         scenarios: Hashes of the label, meta and calib files of each evaluated scenario.
     """
@@ -128,20 +132,20 @@ class ReleaseInfo(ShortRepr):
 
     @property
     def fingerprint(self) -> str:
-        """A single hash over all these hashes."""
+        """One hash over the hashes of all scenarios."""
         return fingerprint(self.scenarios)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultsInfo(ShortRepr):
-    """The results that were evaluated.
+    """Description of the results that were evaluated.
 
     Attributes:
-        path: Path of their file or folder.
-        task: Kind of predictions: `motion`, `accident` or `detection`.
+        path: Path of the file or folder.
+        task: Kind of the predictions, such as `motion`, `accident` or `detection`.
         fingerprint: Hash over all predictions.
-        meta: Notes of their author.
-        form: How predictions of motion are stored, in JSON form; None for other results.
+        meta: The author's notes.
+        form: How motion predictions are stored, as JSON values; None for other results.
     """
 
     path: str
@@ -157,20 +161,20 @@ class EvaluationRun:
 
     Attributes:
         setup: Task and rules.
-        selection: The samples that were selected.
+        selection: Selection of the samples.
         evaluator: Evaluator with the counts of each sample.
-        result: Result of all samples, as computed by the task's evaluator.
-        partial: What is missing; None if nothing is.
-        left_out: Number of predictions of other samples that the results have.
+        result: Result over all samples, as computed by the task's evaluator.
+        partial: Numbers of missing samples; None if no sample is missing.
+        left_out: Number of predictions that were left out, since their samples are not selected.
         attributes: Token → attributes of the sample, for each evaluated sample.
-        times_to_impact: Token → seconds to the recorded impact; None where there is none, or none
-            is known.
-        breakdowns: Results by attribute; `all` has the intervals of the result itself.
-        release: The release that the ground truth comes from.
-        results: The results that were evaluated.
-        sanity: Report of the sanity check in JSON form; None without a check.
-        further: Name → a further result (`further.with_further`), as a single group `all` with
-            intervals.
+        times_to_impact: Token → seconds to the recorded impact; None if there is no impact or its
+            time is unknown.
+        breakdowns: Results by attribute; `all` contains the intervals of the result itself.
+        release: Description of the release that the ground truth comes from.
+        results: Description of the results that were evaluated.
+        sanity: Report of the sanity check as JSON values; None if there was no check.
+        further: Name → further result with intervals (`further.with_further`), as a breakdown with
+            the single group `all`.
     """
 
     setup: EvaluationSetup
@@ -188,7 +192,7 @@ class EvaluationRun:
     further: Mapping[str, Breakdown[Any]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Return task, protocol, whether it is partial, and the first headlines."""
+        """Return the task, the protocol, the mark of a partial run, and the first headlines."""
         mark = ""
         if self.partial is not None:
             mark = f", {self.partial.text()}"
@@ -197,17 +201,20 @@ class EvaluationRun:
 
     @property
     def prevented(self) -> Breakdown[Any] | None:
-        """Accidents that warnings would have prevented; None without (`with_prevented`)."""
+        """Accidents that warnings would have prevented, if `with_prevented` added them."""
         return self.further.get("prevented")
 
     @property
     def stamp(self) -> dict[str, Any]:
-        """Stamp of every file: version of the devkit, task, protocol, and the mark if partial."""
+        """Stamp in every file of the run: devkit version, task, protocol, and missing samples."""
+        partial_values = None
+        if self.partial is not None:
+            partial_values = self.partial.as_dict()
         return {
             "devkit_version": __version__,
             "task": self.setup.task,
             "protocol": self.setup.protocol,
-            "partial": None if self.partial is None else self.partial.as_dict(),
+            "partial": partial_values,
         }
 
     def broken_down(
@@ -216,16 +223,16 @@ class EvaluationRun:
         resampling: Resampling | None = None,
         **engine: Unpack[Engine],
     ) -> EvaluationRun:
-        """Return the same run with results by these attributes, which replace its breakdowns.
+        """Return a copy of the run whose breakdowns are replaced.
 
         Args:
-            by: Names of `breakdowns.ATTRIBUTES`; repeated names count once. None for
-                `breakdowns_of` the task.
-            resampling: How intervals are made; None for the defaults.
-            **engine: `workers` (1 by default), `executor` and `progress`, see `parallel.Engine`.
+            by: Attributes to break the result down by (`breakdowns.ATTRIBUTES`); repeated names
+                count once. None for the defaults of the task (`breakdowns_of`).
+            resampling: Settings of the intervals; None for the defaults.
+            **engine: `workers` (1 by default), `executor` and `progress`; see `parallel.Engine`.
 
         Raises:
-            ChoiceError: no such attribute.
+            ChoiceError: If an attribute does not exist.
         """
         names = breakdowns_of(self.setup.task) if by is None else map(attribute_name, by)
         work = partial(breakdown, self.evaluator, dict(self.attributes), resampling=resampling)
@@ -234,13 +241,17 @@ class EvaluationRun:
         return replace(self, breakdowns=tuple(breakdowns))
 
     def summary(self) -> dict[str, Any]:
-        """Return all numbers except for single samples, and what they depend on, as JSON."""
+        """Return all numbers except single samples', and what they depend on, as JSON."""
+        setup = self.setup.as_dict()
+        del setup["task"], setup["protocol"]  # they are in the stamp
+        selection = self.selection.as_dict()
+        del selection["horizon"]  # it is in the setup
         values = {
             "format": SUMMARY_FORMAT,
             "version": SUMMARY_VERSION,
             **self.stamp,
-            **_without(self.setup.as_dict(), "task", "protocol"),
-            **_without(self.selection.as_dict(), "horizon"),
+            **setup,
+            **selection,
             "counts": {
                 "samples": len(self.evaluator),
                 "scenarios": len(set(map(scenario_of, self.evaluator.tokens))),
@@ -252,7 +263,9 @@ class EvaluationRun:
                 "fingerprint": self.release.fingerprint,
             },
             "results": self.results,
-            "headlines": [{**asdict(line), "text": line.text()} for line in headlines(self.result)],
+            "headlines": [
+                asdict(headline) | {"text": headline.text()} for headline in headlines(self.result)
+            ],
             "metrics": self.result.as_dict(),
             "breakdowns": {table.by: _breakdown_values(table) for table in self.breakdowns},
             "environment": _environment(),
@@ -263,12 +276,8 @@ class EvaluationRun:
         return plain_form
 
 
-def _without(values: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if name not in names}
-
-
 def _environment() -> dict[str, str]:
-    """Return the versions of Python and of the libraries."""
+    """Return the versions of Python and of the libraries by name."""
     from importlib.metadata import version as installed_version
 
     versions = {name: installed_version(name) for name in _LIBRARIES}
@@ -276,45 +285,49 @@ def _environment() -> dict[str, str]:
 
 
 def _breakdown_values(table: Breakdown[Any]) -> dict[str, Any]:
+    """Convert a breakdown to the values that a summary contains."""
     return {
-        "resampling": plain(table.resampling),
-        "groups": list(map(_group_values, table.groups)),
-        "without_infrastructure": list(map(_group_values, table.without_infrastructure)),
+        "resampling": table.resampling,
+        "groups": [_group_values(group) for group in table.groups],
+        "without_infrastructure": [_group_values(group) for group in table.without_infrastructure],
     }
 
 
 def _group_values(group: Group[Any]) -> dict[str, Any]:
+    """Convert a group of a breakdown to the values that a summary contains."""
     return {
         "value": group.value,
         "samples": group.samples,
         "scenarios": group.scenarios,
         "clusters": group.clusters,
-        "headlines": {line.path: line.value for line in headlines(group.result)},
+        "headlines": {headline.path: headline.value for headline in headlines(group.result)},
         "metrics": group.result.as_dict(),
-        "intervals": plain(group.intervals),
-        "notes": list(group.notes),
+        "intervals": group.intervals,
+        "notes": group.notes,
     }
 
 
 def _further_values(table: Breakdown[Any]) -> dict[str, Any]:
+    """Convert a further result to the values that a summary contains."""
     (group,) = table.groups
     return {
         **group.result.as_dict(),
-        "resampling": plain(table.resampling),
-        "intervals": plain(group.intervals),
-        "interval_notes": list(group.notes),
+        "resampling": table.resampling,
+        "intervals": group.intervals,
+        "interval_notes": group.notes,
     }
 
 
 @dataclass(frozen=True, eq=False)
 class _LazyAttributes(Mapping[str, SampleAttributes]):
-    """`sample_attributes`, computed on first use: only evaluations with breakdowns need them."""
+    """Attributes of samples by token, computed on first use, since only breakdowns need them."""
 
     dataset: Dataset
     tokens: Sequence[str]
 
     @cached_property
     def _attributes(self) -> dict[str, SampleAttributes]:
+        """Attributes of all samples by token."""
         return sample_attributes(self.dataset, self.tokens)
 
     def __getitem__(self, token: str) -> SampleAttributes:
@@ -327,7 +340,7 @@ class _LazyAttributes(Mapping[str, SampleAttributes]):
         return len(self.tokens)
 
 
-@workers_kept()
+@keep_workers()
 def evaluate_results(
     dataset: Dataset,
     results: Results | str | os.PathLike[str],
@@ -335,37 +348,39 @@ def evaluate_results(
     selection: SampleSelection | str | os.PathLike[str] = "val",
     *,
     allow_partial: bool = False,
-    out: str | os.PathLike[str] | None = None,
+    out: PathType | None = None,
     **engine: Unpack[Engine],
 ) -> EvaluationRun:
-    """Evaluate a results file, which is fully checked before any long work.
+    """Evaluate results; they are fully checked before any long computation.
 
-    Any number of workers gives the same bits.
+    The numbers are identical for any number of workers.
 
     Args:
-        dataset: The release.
-        results: The opened results, or their path.
+        dataset: Release with the ground truth.
+        results: Opened results, or their path.
         setup: Task and rules.
-        selection: The samples; the name of a split stands for its `default_selection`.
-        allow_partial: Whether to evaluate the samples common to both where the results lack some,
-            or have others; if some are missing, all output is marked as partial.
-        out: The folder that the run will be saved to (`save_run`). Counts are stored beside it: an
-            interrupted run continues with them if nothing that they depend on has changed, and
-            several processes with the same folder share the samples. None for no such counts.
-        **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
+        selection: Selection of the samples; the name of a split selects its `default_selection`.
+        allow_partial: Whether to accept results whose samples differ from the selected ones. Then
+            predictions for other samples are ignored, and if samples are missing, all output is
+            marked as partial.
+        out: Folder that the run will be saved to (`save_run`); counts are stored next to it. An
+            interrupted run continues with these counts if nothing that they depend on has changed,
+            and several processes with the same folder share the samples. None stores no counts.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Returns:
-        The run, without breakdowns: `EvaluationRun.broken_down` adds them.
+        The run, without breakdowns; `EvaluationRun.broken_down` adds them.
 
     Raises:
-        ResultsError: the results cannot be read, an entry is wrong, they are of other recordings
-            (`check_recordings`), or they do not have the samples of the selection.
-        EvaluationError: they are of another kind than the task is evaluated from or look less far
-            ahead, scenarios lack the meta that the task needs, or samples cannot be evaluated.
-        ChoiceError: no such split.
-        NotAvailableError: the release has no such samples.
-        IndexStoreError: files of these scenarios have changed since the index was made.
-        WorkerError: a worker was killed, or cannot do the work.
+        ResultsError: If the results cannot be read, have an invalid entry, were predicted on other
+            recordings (`check_recordings`), or do not cover the selected samples.
+        EvaluationError: If the task cannot be evaluated from such results, the predictions do not
+            look far enough ahead, scenarios lack the meta file that the task needs, or samples
+            cannot be evaluated.
+        ChoiceError: If the split does not exist.
+        NotAvailableError: If the release does not have the selected samples.
+        IndexStoreError: If files of the scenarios have changed since the index was made.
+        WorkerError: If a worker was killed, or cannot do its work.
     """
     if not isinstance(selection, SampleSelection):
         selection = default_selection(setup, selection)
@@ -382,12 +397,16 @@ def evaluate_results(
     hashes = scenario_hashes(
         dataset, scenarios, workers=engine["workers"], executor=engine.get("executor")
     )
-    prints = {"results": opened.fingerprint, "release": fingerprint(hashes)}
-    checkpoint = None if out is None else checkpoint_path(out, setup, tokens, prints)
+    fingerprints = {"results": opened.fingerprint, "release": fingerprint(hashes)}
+    checkpoint = None
+    if out is not None:
+        checkpoint = checkpoint_path(out, setup, tokens, fingerprints)
     samples = {token: token for token in tokens}
     evaluator = evaluate_samples(
         setup.evaluator(), samples, loader, checkpoint=checkpoint, places=loader.places, **engine
     )
+    times_to_impact = {token: dataset.get("sample", token)["time_to_impact"] for token in tokens}
+    release = ReleaseInfo(dataroot=str(dataset.dataroot), version=dataset.version, scenarios=hashes)
     return EvaluationRun(
         setup=setup,
         selection=selection,
@@ -396,17 +415,15 @@ def evaluate_results(
         partial=partial_of(covered),
         left_out=len(covered.extra) + len(covered.unknown),
         attributes=_LazyAttributes(dataset, tokens),
-        times_to_impact={token: dataset.get("sample", token)["time_to_impact"] for token in tokens},
+        times_to_impact=times_to_impact,
         breakdowns=(),
-        release=ReleaseInfo(
-            dataroot=str(dataset.dataroot), version=dataset.version, scenarios=hashes
-        ),
+        release=release,
         results=results_info(opened),
     )
 
 
 def results_info(results: Results) -> ResultsInfo:
-    """Return the metadata of the results that a run stores."""
+    """Describe results as a run stores them."""
     return ResultsInfo(
         path=os.fspath(Path(results.path).absolute()),
         task=results.task,
@@ -424,57 +441,60 @@ def _covered_tokens(
     *,
     allow_partial: bool,
 ) -> list[str]:
-    """Return the samples to evaluate; raises ResultsError if samples differ or there are none."""
+    """Return the samples to evaluate.
+
+    Raise ResultsError if there are none, or if the samples of the results differ from the selected
+    ones and `allow_partial` is False.
+    """
     if not covered.is_complete and not allow_partial:
         remedy = (
-            "; give results of these samples, choose the list that they are of (--split, "
+            "; give results of the evaluated samples, select the samples of the results (--split, "
             "--agents, --samples, --scope, --horizon; in Python a SampleSelection), or evaluate "
-            "the samples that have a prediction with allow_partial=True (--allow-partial), which "
-            "marks every number as partial"
+            "only samples with a prediction by allow_partial=True (--allow-partial), which marks "
+            "every number as partial"
         )
         if covered.options or not (covered.missing or covered.unknown):
-            remedy = ""  # the text of the coverage has a better one
+            remedy = ""  # the text of the coverage suggests a better one
         raise ResultsError(f"{results.path}: {covered.to_text()}{remedy}")
     tokens = [token for token in selection.tokens(dataset) if token in results]
     if not tokens:
-        raise ResultsError(f"{results.path}: {covered.to_text()}; nothing is left to evaluate")
+        raise ResultsError(f"{results.path}: {covered.to_text()}; no sample is left to evaluate")
     return tokens
 
 
 def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:
-    """Raise EvaluationError if scenarios of samples have no meta file, which names the pair.
-
-    The message has the number of such scenarios.
-    """
-    scenarios = list(dict.fromkeys(map(scenario_of, tokens)))
-    without_meta = [
-        token for token in scenarios if dataset.get("scenario", token)["weather"] is None
-    ]
-    if without_meta:
-        of_split = ""
-        if split in SPLITS:
-            of_split = f" --where split={split}"
-        more = ""
-        if len(without_meta) > 3:
-            more = ", …"
-        raise EvaluationError(
-            f"{len(without_meta)} of {len(scenarios)} scenarios have no meta file, which names the "
-            "colliding pair, so that accidents cannot be evaluated there: "
-            f"{', '.join(without_meta[:3])}{more}; unpack their meta folders, or leave them out "
-            "with a split file of your own: deepaccident split "
-            f"{shlex.quote(str(dataset.dataroot))}{of_split} --where 'weather!=unknown' --out "
-            "mine.txt, then --split mine.txt"
-        )
+    """Raise EvaluationError if a sample's scenario has no meta file, which names the pair."""
+    scenarios = dict.fromkeys(map(scenario_of, tokens))
+    without_meta = []
+    for scenario in scenarios:
+        if dataset.get("scenario", scenario)["weather"] is None:
+            without_meta.append(scenario)
+    if not without_meta:
+        return
+    split_option = ""
+    if split in SPLITS:
+        split_option = f" --where split={split}"
+    more = ""
+    if len(without_meta) > _MAX_NAMED_SCENARIOS:
+        more = ", …"
+    raise EvaluationError(
+        f"no meta file, which names the colliding pair, for {len(without_meta)} of "
+        f"{counted(len(scenarios), 'scenario')}, so their accidents cannot be evaluated: "
+        f"{', '.join(without_meta[:_MAX_NAMED_SCENARIOS])}{more}; unpack the meta folders, or "
+        "exclude these scenarios with your own split file: deepaccident split "
+        f"{shlex.quote(str(dataset.dataroot))}{split_option} --where 'weather!=unknown' --out "
+        "mine.txt, then --split mine.txt"
+    )
 
 
 def partial_of(covered: Coverage) -> Partial | None:
-    """Return the mark of a run; None if only predictions of other samples are left out."""
-    missing = len(covered.missing)
-    if not missing:
+    """Return how many samples are missing in a run; None if all are there."""
+    num_missing = len(covered.missing)
+    if not num_missing:
         return None
     return Partial(
-        missing=missing,
+        missing=num_missing,
         extra=len(covered.extra) + len(covered.unknown),
         expected=covered.expected,
-        evaluated=covered.expected - missing,
+        evaluated=covered.expected - num_missing,
     )

@@ -1,4 +1,4 @@
-"""Extra results of a run: numbers that a plug-in computes from the same counts as its task."""
+"""Further results of a run: numbers that a plug-in computes from the task's counts."""
 
 from __future__ import annotations
 
@@ -25,13 +25,15 @@ Json = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExtraResult:
-    """Extra result of a plug-in, under its name in `Plugin.extra_results` and in summaries.
+    """Further result that a plug-in offers; its name is in `Plugin.extra_results` and in summaries.
 
     Attributes:
         title: Heading of its numbers.
-        evaluator: Returns the evaluator for a dataset, a run's evaluator, and `parallel.Engine`.
-        tables: Returns the tables of the numbers in a summary.
-        figures: Draws the computed result; imports the drawing library when it is called.
+        evaluator: Function that takes the dataset, the evaluator of a run, and the arguments of
+            `parallel.Engine`, and returns the evaluator of the further result.
+        tables: Function that converts the numbers in a summary to tables.
+        figures: Function that draws the computed result; it imports the drawing library when it is
+            called.
     """
 
     title: str
@@ -40,7 +42,7 @@ class ExtraResult:
     figures: Callable[[Any], Iterable[Any]]
 
     def text(self, numbers: Json) -> str:
-        """Return all tables and notes of the numbers in a summary as aligned lines."""
+        """Format the numbers in a summary as tables and notes, in aligned lines."""
         blocks = [table.to_text() for table in self.tables(numbers)]
         notes = numbers["notes"]
         if notes:
@@ -49,7 +51,7 @@ class ExtraResult:
 
 
 def extra_result(name: str) -> ExtraResult:
-    """Return the extra result of a name; raises MissingPluginError."""
+    """Return the further result with a name; raise MissingPluginError if no plug-in has it."""
     loaders = offers(lambda plugin: plugin.extra_results, own=True).by_name
     if name not in loaders:
         loaders = offers(lambda plugin: plugin.extra_results).by_name
@@ -67,12 +69,12 @@ def with_further(
     resampling: Resampling | None = None,
     **engine: Unpack[Engine],
 ) -> EvaluationRun:
-    """Return the same run with a further result, and intervals of its numbers.
+    """Return a copy of the run with a further result, including intervals of its numbers.
 
     Raises:
-        MissingPluginError: its plug-in is not installed.
-        EvaluationError: the run is of another task or protocol than it needs.
-        WorkerError: a worker was killed, or cannot do the work.
+        MissingPluginError: If the plug-in that computes the result is not installed.
+        EvaluationError: If the result needs a task or protocol other than the run's.
+        WorkerError: If a worker was killed, or cannot do its work.
     """
     evaluator = extra_result(name).evaluator(dataset, run.evaluator, **{"workers": 1, **engine})
     table = breakdown(evaluator, run.attributes, EVERYTHING, resampling)
@@ -82,13 +84,16 @@ def with_further(
 
 
 def further_results(summary: Json) -> Iterator[tuple[ExtraResult, Json]]:
-    """Yield the further results of a summary with their numbers; raises MissingPluginError."""
+    """Yield each further result of a summary with its numbers.
+
+    Raise MissingPluginError if the plug-in of one is not installed.
+    """
     for name in further_names(summary):
         yield extra_result(name), summary[name]
 
 
 def further_names(summary: Json) -> list[str]:
-    """Return the names of the further results of a summary."""
+    """Return the names of the further results in a summary."""
     installed = offers(lambda plugin: plugin.extra_results, own=True).by_name
     names = []
     for name, value in summary.items():

@@ -1,14 +1,11 @@
-"""`over_bytes`: headline numbers of evaluations over the bytes that partners send."""
-
-from __future__ import annotations
+"""`over_bytes`: headline numbers of evaluations, plotted over the bytes that partners send."""
 
 import math
-import os
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from operator import itemgetter
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import msgspec
 
@@ -16,23 +13,30 @@ from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.comparison import comparable
+from deepaccident_devkit.evaluation.runs.comparison import comparable, interval_text
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.task import Unit, headlines, value_text
+from deepaccident_devkit.support.human_names import metric_name, rules_name
 from deepaccident_devkit.support.reports import Report, Row, record_rows
-from deepaccident_devkit.support.text import columns_text, counted, path_of
+from deepaccident_devkit.support.text import (
+    PathType,
+    columns_text,
+    counted,
+    distinct_names,
+    path_of,
+)
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-# Number of headlines that are compared.
-_MAX_HEADLINES: Final = 4
+# Largest number of headlines that are compared.
+_MAX_HEADLINES = 4
 
 
 class SentBytes(msgspec.Struct, kw_only=True, frozen=True):
-    """The bytes that partners send, as noted in results (`v2x.messages.traffic_note`).
+    """How many bytes partners send, as stated in results (`v2x.messages.traffic_note`).
 
     Attributes:
-        payload: Kind of data, or the bytes of every message.
-        mean: Mean bytes a sample, from all partners together.
+        payload: Kind of data, or the size of every message in bytes.
+        mean: Mean number of bytes per sample, summed over all partners.
         partners: Mean number of partners.
     """
 
@@ -41,19 +45,18 @@ class SentBytes(msgspec.Struct, kw_only=True, frozen=True):
     partners: Annotated[float, msgspec.Meta(ge=0)]
 
     def text(self) -> str:
-        """Return one line, with the bytes also as a power of 2 and as the load of a radio."""
-        power = ""
-        if self.mean:
-            power = f" (2^{math.log2(self.mean):.1f})"
+        """Format the bytes in one line, also as a power of 2 and as the load of a radio link."""
+        if not self.mean:
+            return "none"
         megabits = self.mean * 8e-6 / FRAME_PERIOD
         return (
-            f"{self.mean:,.0f} a sample{power}, {megabits:,.2f} Mbit/s at 10 Hz, "
-            f"{self.partners:.1f} partners, payload {self.payload}"
+            f"{self.mean:,.0f} bytes per sample (2^{math.log2(self.mean):.1f}), {megabits:,.2f} "
+            f"Mbit/s at 10 Hz, {self.partners:.1f} partners, payload {self.payload}"
         )
 
 
 def sent_bytes(summary: Mapping[str, Any]) -> SentBytes | None:
-    """Return the bytes that the results of a summary note; None without a valid note."""
+    """Return the bytes that the notes of a summary's results state; None if they state none."""
     try:
         return msgspec.convert(summary["results"]["meta"]["bytes"], SentBytes)
     except (LookupError, TypeError, msgspec.ValidationError):
@@ -65,14 +68,14 @@ class BytesPoint:
     """A headline number of one evaluation.
 
     Attributes:
-        evaluation: Name of its folder, or its path if names repeat; with `(partial)` if it is
-            partial.
-        bytes: Mean bytes a sample, from all partners together.
+        evaluation: Part of the folder's path in which the evaluations differ, followed by
+            `(partial)` if the evaluation is partial.
+        bytes: Mean number of bytes per sample, summed over all partners.
         headline: Short name of the number.
         unit: Unit of the number.
         value: The number.
-        low: Lower end of its interval; None for no interval.
-        high: Upper end.
+        low: Lower end of the interval; None if there is no interval.
+        high: Upper end of the interval; None if there is no interval.
     """
 
     evaluation: str
@@ -86,14 +89,14 @@ class BytesPoint:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverBytes(Report):
-    """Evaluations of the same samples by the same rules.
+    """Headline numbers of evaluations that use the same samples and rules.
 
     Attributes:
-        task: Task of all.
-        protocol: Protocol of all.
-        samples: Number of samples evaluated.
-        resampling: How intervals were made.
-        points: Points by headline, four at most, and by evaluation in the order of the arguments.
+        task: Task of all evaluations.
+        protocol: Protocol of all evaluations.
+        samples: Number of evaluated samples.
+        resampling: Settings of the intervals.
+        points: Points ordered by headline (four at most), then by evaluation, as they were passed.
     """
 
     task: str
@@ -103,65 +106,58 @@ class OverBytes(Report):
     points: tuple[BytesPoint, ...]
 
     def to_text(self) -> str:
-        """Return a line for each headline of each evaluation."""
+        """Format one line for each headline of each evaluation."""
         interval_title = f"{self.resampling.confidence:.0%} interval"
-        rows = [("number", "evaluation", "bytes a sample", "value", interval_title)]
+        rows = [("number", "evaluation", "bytes per sample", "value", interval_title)]
         for point in self.points:
-            interval = "–"
-            if point.low is not None and point.high is not None:
-                interval = f"[{point.low:.3f}, {point.high:.3f}]"
+            interval = interval_text(point.low, point.high)
             value = value_text(point.value, point.unit)
-            rows.append((point.headline, point.evaluation, f"{point.bytes:,.0f}", value, interval))
-        head = f"{self.task}, protocol {self.protocol}: {counted(self.samples, 'sample')}"
+            name = metric_name(point.headline)
+            rows.append((name, point.evaluation, f"{point.bytes:,.0f}", value, interval))
+        head = f"{rules_name(self.task, self.protocol)}; {counted(self.samples, 'sample')}"
         return f"{head}\n\n{columns_text(rows, left=2)}"
 
     def named_tables(self) -> dict[str, list[Row]]:
-        """Return a table with a row for each point."""
+        """Return a single table with one row per point."""
         return {"numbers": record_rows(BytesPoint, self.points)}
 
 
 def over_bytes(
-    folders: Sequence[str | os.PathLike[str]],
+    folders: Sequence[PathType],
     resampling: Resampling | None = None,
     *,
     common: bool = False,
 ) -> OverBytes:
-    """Return the headlines that all bundles have, over the bytes that partners sent for them.
+    """Collect the headlines that all bundles have, with the bytes that partners sent for them.
 
     Args:
         folders: Folders of the bundles, as written by `save_run`.
-        resampling: How intervals are made; None for the defaults.
-        common: Whether to use only the samples common to all, if they differ; the bytes stay the
-            mean over all samples of a bundle.
+        resampling: Settings of the intervals; None for the defaults.
+        common: Whether to use only the common samples if the samples of the bundles differ; bytes
+            are still averaged over all samples of a bundle.
 
     Raises:
-        ResultsError: one of them is no bundle.
-        EvaluationError: results do not note the bytes; or as in `compare_bundles`.
+        ResultsError: If one of the folders does not contain a bundle.
+        EvaluationError: If results do not state the bytes, or the bundles cannot be compared (see
+            `compare_bundles`).
     """
     bundles = [read_bundle(path_of(folder)) for folder in folders]
     resampling = resampling or Resampling()
     traffic = list(map(_noted_bytes, bundles))
     evaluators, tokens = comparable(bundles, common=common)
-    pairs = [(token, cluster_of(scenario_of(token))) for token in tokens]
-    clusters = dict(sorted(pairs, key=itemgetter(1)))
-    folder_names = [bundle.folder.name for bundle in bundles]
-    points = list[BytesPoint]()
-    for bundle, sent, evaluator in zip(bundles, traffic, evaluators, strict=True):
-        name = bundle.folder.name
-        label = name if folder_names.count(name) == 1 else str(bundle.folder)
-        if bundle.summary["partial"]:
-            label += " (partial)"
+    token_clusters = [(token, cluster_of(scenario_of(token))) for token in tokens]
+    cluster_by_token = dict(sorted(token_clusters, key=itemgetter(1)))
+    names = distinct_names([bundle.folder for bundle in bundles])
+    points_by_headline: dict[str, list[BytesPoint]] = {}
+    for name, bundle, sent, evaluator in zip(names, bundles, traffic, evaluators, strict=True):
+        label = f"{name} (partial)" if bundle.summary["partial"] else name
         result = evaluator.compute(tokens)
-        intervals = intervals_of(evaluator, evaluator.clustered(clusters), result, resampling)
-        points += _points(label, sent, result, intervals.ends)
-    shared = [
-        name
-        for name, count in Counter(point.headline for point in points).items()
-        if count == len(bundles)
-    ]
-    shared_points = []
-    for headline in shared[:_MAX_HEADLINES]:
-        shared_points += [point for point in points if point.headline == headline]
+        clusters = evaluator.clustered(cluster_by_token)
+        intervals = intervals_of(evaluator, clusters, result, resampling)
+        for point in _make_points(label, sent, result, intervals.ends):
+            points_by_headline.setdefault(point.headline, []).append(point)
+    shared = [points for points in points_by_headline.values() if len(points) == len(bundles)]
+    shared_points = chain.from_iterable(shared[:_MAX_HEADLINES])
     return OverBytes(
         task=bundles[0].setup.task,
         protocol=bundles[0].setup.protocol,
@@ -172,7 +168,7 @@ def over_bytes(
 
 
 def _noted_bytes(bundle: Bundle) -> SentBytes:
-    """Return the bytes that the results of a bundle note; raises EvaluationError."""
+    """Return the bytes that a bundle's results state; raise EvaluationError if they do not."""
     sent = sent_bytes(bundle.summary)
     if sent is None:
         raise EvaluationError(
@@ -182,7 +178,7 @@ def _noted_bytes(bundle: Bundle) -> SentBytes:
     return sent
 
 
-def _points(
+def _make_points(
     evaluation: str,
     sent: SentBytes,
     result: Any,

@@ -1,50 +1,53 @@
-"""`sample_rows`: the counts of a run's samples as flat rows, and such rows as a Parquet file."""
-
-from __future__ import annotations
+"""`sample_rows`: the counts of a run's samples as flat rows, and Parquet files of such rows."""
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
-from deepaccident_devkit.errors import MOST_TOLD, ResultsError, shortened
+from deepaccident_devkit.errors import MAX_REASON_LENGTH, ResultsError, shortened
 from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.evaluation.task import plain
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.support.reading import check_size, fault_text, read_bytes
+from deepaccident_devkit.support.reading import check_size, read_bytes, reason_text
 
 Row = dict[str, Any]
-# Key of the file's metadata; its value is one JSON object.
+# Key in the file's metadata; its value is a JSON object.
 STAMP_KEY: Final = b"deepaccident"
-# Memory that Python needs for a number.
-_VALUE_BYTES: Final = 32
+# Memory that Python needs for a number, in bytes.
+_VALUE_BYTES = 32
 
 
 def sample_rows(run: EvaluationRun) -> list[Row]:
-    """Return one row a sample, ordered by token, all with the same columns.
+    """Build one row per sample, ordered by token; all rows have the same columns.
 
-    Values are texts, numbers, or None where there is none. The first columns identify the sample:
-    token, scenario, agent, frame (from 1), time_to_impact (seconds to the recorded impact),
-    accident_visibility. The others are the evaluator's `sample_row`:
+    Values are texts, numbers or None. The first columns identify the sample: token, scenario,
+    agent, frame (from 1), time_to_impact (seconds to the recorded impact), accident_visibility. The
+    other columns come from the evaluator's `sample_row`:
 
-    - motion: by range IoU and PQ (percent) and instances over all frames, cells of IoU, paths and
-      their errors (m);
-    - accident: `positive` (an accident comes), the actors that the truth names, tp, fp and fn by
-      tolerance in metres, and the errors (m, s) of what is foreseen within the largest distance;
-    - detection: true boxes and detections that count, and true positives by threshold, over all
-      classes and ranges;
-    - warning: the plain values of the sample's counts, and the lengths of its lists;
+    - motion: for each range IoU and PQ (percent), instances summed over frames, and cells; paths
+      and their errors (m);
+    - accident: `positive` (whether an accident comes); the kind of pair that the truth names; tp,
+      fp and fn for each allowed distance in metres; and the errors (m, s) of accidents that are
+      foreseen within the largest distance;
+    - detection: the numbers of true boxes and detections that count, and of true positives at each
+      threshold, summed over classes and ranges;
+    - warning: the sample's counts, with lists replaced by their lengths;
     - planning, forecasting: the headlines of the sample.
     """
     rows = []
     for token in sorted(run.evaluator.tokens):
-        rows.append(_identity(run, token) | run.evaluator.sample_row(token))
-    # rows of tables of means have only the means that the sample counts in
-    columns = dict.fromkeys(name for row in rows for name in row)
-    return [{name: plain(row.get(name)) for name in columns} for row in rows]
+        rows.append(_identify_sample(run, token) | run.evaluator.sample_row(token))
+    # for tasks with tables of means, a row only contains means that the sample contributes to
+    columns = dict.fromkeys(chain.from_iterable(rows))
+    plain_rows = []
+    for row in rows:
+        plain_rows.append({name: plain(row.get(name)) for name in columns})
+    return plain_rows
 
 
-def _identity(run: EvaluationRun, token: str) -> Row:
+def _identify_sample(run: EvaluationRun, token: str) -> Row:
     """Return the columns that identify a sample."""
     attributes = run.attributes[token]
     return {
@@ -58,27 +61,29 @@ def _identity(run: EvaluationRun, token: str) -> Row:
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
-    """Write rows as a Parquet file, with a stamp in its metadata."""
+    """Write rows to a Parquet file, with a stamp in the file's metadata."""
     from pyarrow import parquet
 
-    parquet.write_table(
-        rows_table(rows).replace_schema_metadata({STAMP_KEY: json.dumps(dict(stamp))}), path
-    )
+    metadata = {STAMP_KEY: json.dumps(dict(stamp))}
+    table = rows_table(rows).replace_schema_metadata(metadata)
+    parquet.write_table(table, path)
 
 
 def rows_table(rows: Sequence[Mapping[str, Any]]) -> Any:
-    """Return the Arrow table of rows with the same columns.
+    """Convert rows with the same columns to an Arrow table.
 
-    Values are texts, numbers, booleans or None, of one kind in a column.
+    The values of a column must all be texts, all numbers, or all booleans; None is always allowed.
     """
     import pyarrow as pa
 
-    names = rows[0] if rows else ()
-    return pa.table({name: _column([row[name] for row in rows]) for name in names})
+    columns = {}
+    for name in rows[0] if rows else ():
+        columns[name] = _make_column([row[name] for row in rows])
+    return pa.table(columns)
 
 
 def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the rows and the stamp that `write_rows` wrote; raises ResultsError."""
+    """Read the rows and the stamp that `write_rows` wrote; raise ResultsError on a fault."""
     import pyarrow as pa
 
     try:
@@ -86,17 +91,20 @@ def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         stamp: dict[str, Any] = parsed_json((table.schema.metadata or {})[STAMP_KEY])
         rows: list[dict[str, Any]] = table.to_pylist()
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, MemoryError) as error:
-        fault = shortened(fault_text(error), MOST_TOLD)
-        raise ResultsError(f"{path}: is no table of samples ({fault}); evaluate again") from error
+        fault = shortened(reason_text(error), MAX_REASON_LENGTH)
+        raise ResultsError(
+            f"{path}: is not a table of samples ({fault}); evaluate again"
+        ) from error
     return rows, stamp
 
 
 def _read_table(content: bytes) -> Any:
-    """Return the Arrow table in a Parquet file, within the memory that such a file may take.
+    """Read the Arrow table from a Parquet file, unless it would take too much memory.
 
-    Texts stay in dictionaries until their lengths in all rows are known: a few bytes can stand for
-    a long text in millions of rows. Raises OSError (it would take more memory), ValueError (a
-    column has a type that `write_rows` does not write) or ArrowException (it is damaged).
+    Texts are kept dictionary-encoded until their total length is known, since a few bytes can
+    encode a long text in millions of rows. Raise OSError if the table would take more memory than
+    such a file may take, ValueError if a column has a type that `write_rows` does not write, and
+    ArrowException if the file is damaged.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -121,10 +129,10 @@ def _read_table(content: bytes) -> Any:
     return table
 
 
-def _column(values: Sequence[Any]) -> Any:
-    """Return an Arrow array of the values' type.
+def _make_column(values: Sequence[Any]) -> Any:
+    """Convert values to an Arrow array of their type.
 
-    It is an array of floats for mixed whole numbers and fractions, and if all values are None.
+    The type is float if integers and floats are mixed, or if all values are None.
     """
     import pyarrow as pa
 

@@ -1,10 +1,10 @@
 """`check_sanity`: do the predictions fit the labels much better once a classic mistake is undone?
 
-A mistake is a transform that undoes it. Each sample shows which part of the truth the predictions
-hit once the mistake is undone, and which part they hit unchanged. These parts are summed over the
-samples. A mistake is suspected if the first share is large enough, and clearly larger than the
-second. If no mistake is suspected, but most sizes, heights or headings of boxes at the right
-position are wrong, a warning reports that instead.
+Each mistake is represented by a transform that undoes it. For each sample, the check counts how
+much of the truth the predictions hit once the mistake is undone, and how much they hit unchanged.
+These counts are summed over samples. A mistake is suspected if the first share is large enough, and
+clearly larger than the second. If no mistake is suspected, but most boxes at the correct position
+have a wrong size, height or heading, a warning reports it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident import AccidentContext, BoxAccidents
-from deepaccident_devkit.evaluation.alarms import LABEL_STEP, by_sureness, position_difference
+from deepaccident_devkit.evaluation.alarms import LABEL_STEP, alarm_sort_key, position_difference
 from deepaccident_devkit.evaluation.detection.boxes import columns_of
 from deepaccident_devkit.evaluation.forecasting import Forecast, ForecastingTruth
 from deepaccident_devkit.evaluation.forecasting.metrics import SAME_TIME
@@ -31,8 +31,8 @@ from deepaccident_devkit.evaluation.planning import Plan, PlanningScene
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,
-    frames_there,
     labels_at_present,
+    num_recorded_frames,
 )
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
@@ -51,10 +51,10 @@ if TYPE_CHECKING:
 
 __all__ = ["SanityReport", "check_sanity"]
 
-# Mistake → the signs of x and y that undo it, and −1 if x and y are swapped before. x right,
-# y forward is `turned left`. If two mistakes explain the same, as on a straight path, the earlier
-# one is reported.
-_AXES: Final = {
+# Mistake → factors for x and y that undo it, and −1 if x and y must be swapped first, otherwise 1.
+# Coordinates with x to the right and y forward are `turned left`. If two mistakes explain the
+# predictions equally well, as on a straight path, the earlier one is reported.
+_AXES = {
     "x mirrored": (-1, 1, 1),
     "y mirrored": (1, -1, 1),
     "turned left": (1, -1, -1),
@@ -65,139 +65,140 @@ _AXES: Final = {
 }
 # Number of samples that are examined.
 SAMPLE_COUNT: Final = 20
-# The same for accident lists and plans, which are short.
+# Number of samples that are examined for accident lists and plans, which are short.
 LIST_COUNT: Final = 60
-# Factor by which undoing a mistake has to raise the share.
-_MIN_GAIN: Final = 2.0
-# Share that has to be reached, by default one half. For times, slow predictions reach a part, too.
-_MIN_SHARES: Final[Mapping[str, float]] = {"place": 0.2, "time": 0.4}
-_DEFAULT_MIN_SHARE: Final = 0.5
-# Number of cells, accidents, boxes, or positions of paths that have to be hit.
-_MIN_HITS: Final = {
+# A mistake is only suspected if undoing it raises the share of hits by at least this factor.
+_MIN_GAIN = 2.0
+# Group of mistakes → share of hits that must be reached once a mistake is undone, unless it is the
+# default. It is higher for times than for places, since predictions for slow actors hit some, too.
+_MIN_SHARES: Mapping[str, float] = {"place": 0.2, "time": 0.4}
+_DEFAULT_MIN_SHARE = 0.5
+# Number of cells, accidents, boxes or path positions that must be hit.
+_MIN_HITS = {
     "motion": 100,
     "accident": 4,
     "detection": 10,
     "planning": 10,
     "forecasting": 10,
 }
-_UNITS: Final = dict(
-    zip(_MIN_HITS, ("cells", "accidents", "true boxes", "places", "places"), strict=True)
-)
-# Within this distance on the ground a box matches; of an accident, the mean over both positions.
-_POSITION_TOLERANCE_M: Final = 2.0
-# In height the tolerance is smaller, 0.7 m, since LiDAR and ego frame differ only by the height of
-# the LiDAR, about 2 m.
-_AXIS_WEIGHTS: Final = np.array([1, 1, _POSITION_TOLERANCE_M / 0.7])
-# Tolerance of the time of an accident.
+_UNITS = dict(zip(_MIN_HITS, ("cells", "accidents", "true boxes", "places", "places"), strict=True))
+# Largest distance on the ground of a matched box; for accidents, averaged over both positions.
+_POSITION_TOLERANCE_M = 2.0
+# Weights of x, y and z. For z the tolerance is only 0.7 m, since LiDAR and ego frame differ only by
+# the height of the LiDAR, about 2 m.
+_AXIS_WEIGHTS = np.array([1, 1, _POSITION_TOLERANCE_M / 0.7])
+# Largest time error of a matched accident.
 TIME_TOLERANCE_S: Final = 0.15
-# Tolerance of positions on a path, or a tenth of the distance travelled if that is more.
-_PATH_TOLERANCE_M: Final = 1.0
-# Tolerated error of a box's size, of its height above the ground or of its velocity, as a share.
-_RELATIVE_TOLERANCE: Final = 0.2
-# Number of true boxes that a class needs before its name is judged.
-_MIN_CLASS_BOXES: Final = 5
-# Slower actors do not move enough within a step.
+# Largest error of a position on a path; a tenth of the distance travelled is allowed if larger.
+_PATH_TOLERANCE_M = 1.0
+# Largest relative error of a box's size, of its height above the ground, or of its velocity.
+_RELATIVE_TOLERANCE = 0.2
+# A class needs at least this many true boxes before its name is judged.
+_MIN_CLASS_BOXES = 5
+# Slower actors do not move far enough in one step.
 MIN_SPEED_MPS: Final = 4.0
-# Within this angle (radians) to one of the true box's four directions a heading is right; of random
-# headings, one third is.
+# Largest angle between a heading and the nearest of the true box's four directions; one third of
+# all random headings are within it.
 HEADING_TOLERANCE_RAD: Final = np.deg2rad(15)
-_SIZE_AXES: Final = ("length", "width", "height")
-# Mistake → the order of the predicted sizes, and the factor that undoes it.
-_SIZES: Final = {
+_SIZE_AXES = ("length", "width", "height")
+# Mistake → axes in the order of the predicted sizes, and the factor that undoes the mistake.
+_SIZES = {
     f"sizes in the order {', '.join(_SIZE_AXES[axis] for axis in order)}": (order, 1.0)
     for order in permutations(range(3))
     if order != (0, 1, 2)
 } | {"half sizes": ((0, 1, 2), 2.0), "double sizes": ((0, 1, 2), 0.5)}
-# Mistake → share of the box's height that is added to undo it.
-_HEIGHTS: Final = {"z of the lower face": 0.5, "z of the upper face": -0.5}
-_VELOCITIES: Final = {
+# Mistake → share of the box's height that is added to z to undo it.
+_HEIGHTS = {"z of the lower face": 0.5, "z of the upper face": -0.5}
+_VELOCITIES = {
     "velocities per frame": 1 / FRAME_PERIOD,
     "velocities per step": 1 / LABEL_STEP,
 }
-_DEGREES: Final = "yaw in degrees"
-# Mistake → the factor of headings and the angle added to them that undo it.
-_YAWS: Final = {
+_DEGREES = "yaw in degrees"
+# Mistake → factor of headings, and angle in radians added to them, that undo it.
+_YAWS = {
     "yaw clockwise": (-1.0, 0.0),
     "yaw from y": (1.0, np.pi / 2),
     "yaw from −y": (1.0, -np.pi / 2),
     "yaw clockwise from y": (-1.0, np.pi / 2),
     "yaw backwards": (1.0, np.pi),
 }
-# A larger heading may be in degrees. A small one would be near 0 after the change, as most headings
-# are, whatever was wrong with it.
-_MAX_YAW_RAD: Final = 4.0
-_CLASSES: Final = "classes swapped"
+# Larger headings may be in degrees. Smaller ones are not converted, since they would end up near 0,
+# as most headings are, whatever was wrong with them.
+_MAX_YAW_RAD = 4.0
+_CLASSES = "classes swapped"
 # Times, in seconds, at which paths are compared.
-_STEP_TIMES: Final = np.arange(1, 7) * LABEL_STEP
-# The same times in frames after the present one.
-_STEP_FRAMES: Final = slice(5, 31, 5)
-# Slow predictions look late in this number of frames or fewer.
+_STEP_TIMES = np.arange(1, 7) * LABEL_STEP
+# Frames after the current one at these times.
+_STEP_FRAMES = slice(5, 31, 5)
+# If there are at most this many frames, predictions for slow actors look as if they were late.
 FEW_FRAMES: Final = 3
-_SECONDS: Final = "times are in seconds after the present"
-# Group → mistakes that are undone on trial → the remedy.
-_REMEDIES: Final[Mapping[str, Mapping[str, str]]] = {
+_SECONDS = "times are in seconds after the present"
+# Group of mistakes → mistake → its remedy.
+_REMEDIES: Mapping[str, Mapping[str, str]] = {
     "place": {
         **dict.fromkeys(
-            _AXES, "x is forward and y to the left; of maps, state the orientation that they have"
+            _AXES, "x is forward and y is to the left; for maps, state their orientation"
         ),
-        "world frame for ego frame": "places are given in the world frame; give them in the "
+        "world frame for ego frame": "positions are in the world frame; give them in the "
         "present ego frame",
-        "ego frame for world frame": "boxes are given in the ego frame; move them by "
+        "ego frame for world frame": "boxes are in the ego frame; transform them with "
         'da.world_from(token, "ego")',
-        "LiDAR frame for world frame": "boxes are given in the LiDAR frame; move them by "
+        "LiDAR frame for world frame": "boxes are in the LiDAR frame; transform them with "
         'da.world_from(token, "lidar")',
-        "LiDAR frame for ego frame": "boxes of the LiDAR frame were moved by the ego pose; take "
-        "the LiDAR's pose",
-        "ego frame for LiDAR frame": "boxes of the ego frame were moved by the LiDAR's pose; take "
-        "the ego pose",
+        "LiDAR frame for ego frame": "boxes in the LiDAR frame were transformed with the ego "
+        "pose; use the LiDAR's pose",
+        "ego frame for LiDAR frame": "boxes in the ego frame were transformed with the LiDAR's "
+        "pose; use the ego pose",
     },
     "time": {
         "frames reversed": "the first frame of a prediction is the present, and times are counted "
         "from there",
-        "one step late": "earlier moments are shown; the first frame, or time 0, is the sample's "
-        "own: no past",
-        "one step early": "later moments are shown; the first frame, or time 0, is the sample's "
-        "own",
-        "steps for places": "a path holds places; add up the steps",
+        "one step late": "the predictions show earlier moments; the first frame, or time 0, is "
+        "the sample's own moment, so leave out past frames",
+        "one step early": "the predictions show later moments; the first frame, or time 0, is "
+        "the sample's own moment",
+        "steps for places": "a path contains positions, not steps; add up the steps",
         "places from the actor": "a path begins where the actor is in the present ego frame, not "
         "at 0, 0",
         "times in frames": _SECONDS,
         "times in milliseconds": _SECONDS,
     },
-    "height": dict.fromkeys(_HEIGHTS, "z is that of the middle of the box"),
+    "height": dict.fromkeys(_HEIGHTS, "z is the height of the box's centre"),
     "size": dict.fromkeys(
         _SIZES,
-        "Boxes and DetectedBoxes hold whole lengths, widths, heights; results files hold width, "
-        "length, height",
+        "Boxes and DetectedBoxes contain full length, width and height; results files contain "
+        "width, length and height",
     ),
     "heading": dict.fromkeys(
         (_DEGREES, *_YAWS), "yaw is in radians, counter-clockwise from x of the present ego frame"
     ),
     "velocity": dict.fromkeys(_VELOCITIES, "velocities are in m/s"),
-    "class": {_CLASSES: f"the classes are, counted from 0, {', '.join(CATEGORIES)}"},
+    "class": {_CLASSES: f"class numbers count from 0: {', '.join(CATEGORIES)}"},
 }
-# Group → warning if most values of matched boxes are wrong, and no mistake explains it.
-_UNEXPLAINED: Final[Mapping[str, str]] = {
-    "height": "heights do not fit: {} of {} are right; z is that of the middle of the box, in the "
-    "world frame",
-    "size": "sizes do not fit: {} of {} are right; sizes are whole lengths, widths and heights in "
-    "metres",
-    "heading": "headings look random: {} of {} are right, of boxes apart from quarters of a turn; "
-    "are they degrees instead of radians, or not predicted? They are counted "
-    "counter-clockwise from x, of boxes from that of the world",
+# Group of mistakes → warning if most values of matched boxes are wrong, but no mistake explains it.
+_UNEXPLAINED: Mapping[str, str] = {
+    "height": "heights do not fit: only {} of {} are right; z is the height of the box's "
+    "centre, in the world frame",
+    "size": "sizes do not fit: only {} of {} are right; a size is the full length, width and "
+    "height in metres",
+    "heading": "headings look random: {} of {} are right (for boxes, up to quarter turns). Are "
+    "they in degrees instead of radians, or not predicted? A heading is counted "
+    "counter-clockwise from the x axis; a box's heading is counted from the x axis "
+    "of the world",
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SanityReport(FrozenMappings):
-    """Findings of a few samples on the predictions in general.
+    """Findings about predictions, based on a few samples.
 
     Attributes:
         samples: Number of samples that were examined.
-        warnings: Sentences; empty if nothing looks wrong.
-        compared: Sentence on how much of the truth was compared, and how much the predictions hit.
-        sought: Names of the mistakes that there was enough evidence to notice; empty if nothing can
-            be concluded.
+        warnings: One sentence per warning; empty if nothing looks wrong.
+        compared: Sentence on how much of the truth was compared, and how much of it the
+            predictions hit.
+        sought: Names of the mistakes for which there was enough evidence to notice them; empty if
+            nothing can be concluded.
     """
 
     samples: int
@@ -206,23 +207,23 @@ class SanityReport(FrozenMappings):
     sought: tuple[str, ...] = ()
 
     def to_text(self) -> str:
-        """State how much was compared, which mistakes were looked for, and what was found."""
+        """Format as lines how much was compared, the warnings, and the verdict."""
         head = f"Sanity check of {counted(self.samples, 'sample')}: {self.compared}"
         lines = (head, self.warnings_text(), self.verdict)
         return "\n".join(filter(None, lines))
 
     @property
     def verdict(self) -> str:
-        """The mistakes that were ruled out, or that nothing can be said; empty beside warnings."""
+        """Sentence that names the mistakes that are ruled out; empty if there are warnings."""
         if not self.sought:
-            return "Cannot say whether a mistake was made: there is too little to compare."
+            return "No verdict: there is too little to compare."
         if self.warnings:
             return ""
-        return f"None of these mistakes was found: {', '.join(self.sought)}."
+        return f"No mistake found. Checked: {', '.join(self.sought)}."
 
     def warnings_text(self) -> str:
-        """Return only the warnings, one a line; empty without any."""
-        return "\n".join(f"WARNING: {warning}" for warning in self.warnings)
+        """Return the warnings, one per line; empty if there are none."""
+        return "\n".join(f"warning: {warning}" for warning in self.warnings)
 
 
 def check_sanity(
@@ -232,64 +233,71 @@ def check_sanity(
     tokens: Collection[str],
     **engine: Unpack[Engine],
 ) -> SanityReport:
-    """Check whether predictions look as if all had a classic mistake, or are empty or constant.
+    """Check whether predictions seem to have a classic mistake, or are empty or constant.
 
-    Correct predictions raise no suspicion, nor do bad ones without any of these mistakes. The check
-    examines 20 samples, or 60 of accident lists and plans, always the same.
+    Neither correct predictions nor bad ones without these mistakes raise suspicion. The check
+    always examines the same 20 samples, or 60 for accident lists and plans.
+
+    Maps are compared cell by cell. Other values fit if they are within 2 m for positions (0.7 m in
+    height; on paths 1 m, or a tenth of the distance travelled if that is more), 0.15 s for times,
+    20 % for sizes, heights above the ground and velocities, and 15° for headings. Plans that are
+    much too slow can look late.
 
     Args:
-        dataset: The release.
-        results: The predictions.
-        setup: Rules that they are evaluated by.
-        tokens: Samples that are evaluated, each with a prediction.
+        dataset: Release with the ground truth.
+        results: Predictions to check.
+        setup: Task and rules of the evaluation.
+        tokens: Tokens of the evaluated samples, each with a prediction.
         **engine: `workers` (1 by default), `executor` and `progress`, see `parallel.Engine`.
 
     Raises:
-        EvaluationError: the results are not of a kind that the task takes, or there is no sample.
+        EvaluationError: If the task cannot be evaluated from such results, or there is no sample.
     """
     if not tokens:
-        raise EvaluationError(
-            f"{results.path}: there is no sample to look at, so that nothing can be compared"
-        )
+        raise EvaluationError(f"{results.path}: there is no sample to compare")
     has_lists = results.task == "accident"
-    alarmed = [token for token in tokens if has_lists and results.prediction(token)]  # may be few
+    alarmed = []
+    if has_lists:  # few samples may have an alarm
+        alarmed = [token for token in tokens if results.prediction(token)]
     sample_count = LIST_COUNT if results.task in ("accident", "planning") else SAMPLE_COUNT
     candidates = np.random.default_rng(0).permutation(sorted(alarmed or tokens))
-    drawn = candidates[:sample_count].tolist()
+    drawn_tokens = candidates[:sample_count].tolist()
     loader = SampleLoader(dataset, results, setup)
+    examine = partial(_examine_sample, loader)
     engine = {"workers": 1, **engine}
-    evidence = run_batch(partial(_sample_evidence, loader), drawn, places=loader.places, **engine)
+    evidence = run_batch(examine, drawn_tokens, places=loader.places, **engine)
     is_ranked = not has_lists or setup.task == "warning" or isinstance(setup.rules, BoxAccidents)
     sums = sum_tallies(sample.tallies for sample in evidence)
     hits, total = sums.get("place", np.zeros((4, 1)))[2:].sum(axis=1)
-    sought = [
-        name
-        for name in filter(sums.__contains__, chain(*_REMEDIES.values()))
-        if sums[name][:2].max() >= _MIN_HITS[results.task]
+    sought = []
+    for name in chain(*_REMEDIES.values()):
+        if name in sums and sums[name][:2].max() >= _MIN_HITS[results.task]:
+            sought.append(name)
+    warnings = [
+        *suspect_mistakes(sums, results.task),
+        *label_free_facts(evidence, ranked=is_ranked),
     ]
     return SanityReport(
         samples=len(evidence),
-        warnings=(
-            *suspect_mistakes(sums, results.task),
-            *label_free_facts(evidence, ranked=is_ranked),
-        ),
-        compared=f"{hits:,.0f} of {total:,.0f} {_UNITS[results.task]} are hit as they are given",
+        warnings=tuple(warnings),
+        compared=f"{hits:,.0f} of {total:,.0f} {_UNITS[results.task]} match the predictions",
         sought=tuple(sought),
     )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SampleEvidence:
-    """Evidence of one sample.
+    """Evidence from one sample.
 
     Attributes:
-        tallies: Mistake → tally, shape (4, N): hits and total once it is undone, then hits and
-            total as given. Of the N measurements, the worst one counts. For classes, shape (C, C):
-            number of true boxes of each class (rows) that are detected under each class name
-            (columns). A group's name → the same of all its values as given.
+        tallies: Mistake → tally of N measurements; the worst one counts. Its four rows,
+            shape (4, N), are hits and total once the mistake is undone, then hits and total as
+            predicted. The tally of swapped classes, shape (C, C), is the number of true boxes of
+            each class (rows) that are detected as each class (columns). The tally under the name of
+            a group counts all its values as predicted.
         empty: Whether nothing is predicted.
-        scores: Scores of all boxes or accidents.
-        probabilities: Whether all logits are in [0, 1].
+        scores: Scores of all predicted boxes or accidents.
+        probabilities: Whether all logits are in [0, 1], as if they were probabilities.
     """
 
     tallies: Mapping[str, FloatArray]
@@ -298,13 +306,14 @@ class SampleEvidence:
     probabilities: bool = False
 
 
-def _sample_evidence(loader: SampleLoader, token: str) -> SampleEvidence:
-    """Return the evidence of a sample."""
-    return _EXAMINERS[loader.results.task](loader, token, *loader(token))
+def _examine_sample(loader: SampleLoader, token: str) -> SampleEvidence:
+    """Load a sample and collect its evidence."""
+    examine = _EXAMINERS[loader.results.task]
+    return examine(loader, token, *loader(token))
 
 
 def sum_tallies(tallies: Iterable[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
-    """Add up the tallies of each name."""
+    """Sum tallies by name."""
     sums: dict[str, FloatArray] = {}
     for sample_tallies in tallies:
         for name, tally in sample_tallies.items():
@@ -315,15 +324,16 @@ def sum_tallies(tallies: Iterable[Mapping[str, FloatArray]]) -> dict[str, FloatA
 def suspect_mistakes(sums: Mapping[str, FloatArray], task: str) -> Iterator[str]:
     """Yield a sentence for each suspected mistake.
 
-    Of a group, only the best mistake is reported. After a wrong place or time nothing else is.
+    Only the most likely mistake of each group is reported. After a wrong place or time, no further
+    groups are reported.
     """
     for group, remedies in _REMEDIES.items():
-        suspected = list(_suspected(sums, task, group))
+        suspected = list(_suspect_group(sums, task, group))
         if suspected:
             share, given_share, name = max(suspected, key=itemgetter(0))
             yield (
-                f"{name}: {remedies[name]} ({share:.0%} of the truth is hit once that is undone, "
-                f"{given_share:.0%} as it is)"
+                f"{name}: {remedies[name]} ({share:.0%} of the truth matches when corrected, "
+                f"{given_share:.0%} as given)"
             )
             if group in ("place", "time"):
                 return
@@ -334,65 +344,80 @@ def suspect_mistakes(sums: Mapping[str, FloatArray], task: str) -> Iterator[str]
                 yield _UNEXPLAINED[group].format(right, total)
 
 
-def _suspected(
+def _suspect_group(
     sums: Mapping[str, FloatArray], task: str, group: str
 ) -> Iterator[tuple[float, float, str]]:
-    """Yield the suspected mistakes of a group: share once undone, share as given, name."""
-    for name in filter(sums.__contains__, _REMEDIES[group]):
+    """Yield the suspected mistakes of a group.
+
+    Yields:
+        Share of hits once the mistake is undone, share of hits as predicted, and the mistake.
+    """
+    for name in _REMEDIES[group]:
+        if name not in sums:
+            continue
         tally = class_tally(sums[name]) if name == _CLASSES else sums[name]
-        share = _min_share(tally[0], tally[1])
-        given_share = _min_share(tally[2], tally[3])
+        hits, totals, given_hits, given_totals = tally
+        share = _worst_share(hits, totals)
+        given_share = _worst_share(given_hits, given_totals)
         min_share = max(_MIN_SHARES.get(group, _DEFAULT_MIN_SHARE), _MIN_GAIN * given_share)
-        if share >= min_share and tally[0].sum() >= _MIN_HITS[task]:
+        if share >= min_share and hits.sum() >= _MIN_HITS[task]:
             yield share, given_share, name
 
 
-def _min_share(hits: FloatArray, totals: FloatArray) -> float:
+def _worst_share(hits: FloatArray, totals: FloatArray) -> float:
+    """Return the smallest share of hits of any measurement; 1 if there are no measurements."""
     is_measured = totals > 0
-    return float((hits[is_measured] / totals[is_measured]).min(initial=1.0))
+    shares = hits[is_measured] / totals[is_measured]
+    return float(shares.min(initial=1.0))
 
 
 def label_free_facts(evidence: Sequence[SampleEvidence], *, ranked: bool) -> Iterator[str]:
-    """Yield sentences on what shows without the labels."""
+    """Yield sentences about what looks wrong even without labels, such as empty predictions."""
     if all(sample.empty for sample in evidence):
-        yield f"all {len(evidence)} predictions looked at are empty: nothing is predicted in them"
-    scores = [score for sample in evidence for score in sample.scores]
+        yield f"all {len(evidence)} examined predictions are empty"
+    scores = list(chain.from_iterable(sample.scores for sample in evidence))
     if ranked and len(scores) > 1 and len(set(scores)) == 1:
         yield (
-            f"all {len(scores)} scores are {scores[0]:g}: numbers that depend on their order, such "
-            "as an average precision, then say little; give surer predictions higher scores"
+            f"all {len(scores)} scores are {scores[0]:g}, so numbers that depend on their order, "
+            "such as an average precision, mean little; give more certain predictions higher scores"
         )
     has_probabilities = any(sample.probabilities for sample in evidence)
     if has_probabilities and all(sample.probabilities or sample.empty for sample in evidence):
         yield (
-            "all values of the heads' segmentation are between 0 and 1: write logits and not "
-            "probabilities, which the released accident rule takes for actors everywhere"
+            "all values of the heads' segmentation are between 0 and 1; write logits instead of "
+            "probabilities, because the released accident rule finds actors everywhere in "
+            "probabilities"
         )
 
 
 def _distance(points: FloatArray, true_points: FloatArray) -> Any:
+    """Return the distances between points."""
     return np.linalg.norm(points - true_points, axis=-1)
 
 
 def _difference(values: Any, true_values: Any) -> Any:
+    """Return the absolute differences between values."""
     return np.abs(values - true_values)
 
 
 def _turn(angles: FloatArray, true_angles: FloatArray, period: float = 2 * np.pi) -> Any:
-    half = period / 2
-    turns = (angles - true_angles + half) % period - half
+    """Return the smallest angles between angles, which are equal if they differ by a period."""
+    half_period = period / 2
+    turns = (angles - true_angles + half_period) % period - half_period
     return np.abs(turns)
 
 
 def tally_of(undone: ArrayLike, predicted: ArrayLike, total: ArrayLike) -> FloatArray:
-    """Return a tally, shape (4, 1): hits and total once a mistake is undone, then as given.
+    """Build a tally, shape (4, 1): hits and total once a mistake is undone, then as predicted.
 
     Args:
-        undone: Hits once the mistake is undone, as flags or a number.
-        predicted: Hits of the values as predicted, likewise.
+        undone: Hits once the mistake is undone, as flags or as a number.
+        predicted: Hits as predicted, as flags or as a number.
         total: Number of values.
     """
-    rows = [[np.sum(undone)], [total], [np.sum(predicted)], [total]]
+    undone_hits = np.sum(undone)
+    predicted_hits = np.sum(predicted)
+    rows = [[undone_hits], [total], [predicted_hits], [total]]
     return np.array(rows, dtype=np.float64)
 
 
@@ -404,50 +429,62 @@ def tallies_of(
     tolerance: ArrayLike,
     error_of: Callable[[Any, Any], Any] = _difference,
 ) -> dict[str, FloatArray]:
-    """Tally which of N values are right, as given and once each mistake is undone.
+    """Count how many of N values are correct, as predicted and once each mistake is undone.
 
-    Only values count that cannot be right in both ways.
+    A value only counts for a mistake if it cannot be correct both with and without the mistake.
 
     Args:
         group: Group of the mistakes.
-        undone: Name of a mistake → the values without it.
-        predicted: The values as predicted.
-        true: Their true values; NaN where unknown.
-        tolerance: Largest error of a right value.
-        error_of: Function that returns the distances between values.
+        undone: Name of a mistake → values after it is undone.
+        predicted: Values as predicted.
+        true: True values; NaN if unknown.
+        tolerance: Largest error of a correct value.
+        error_of: Function that computes the errors of predicted values from the true ones.
     """
     error = error_of(predicted, true)
     is_known = np.isfinite(error)
-    tallies = {group: tally_of(0, error <= tolerance, is_known.sum())}
+    is_right = error <= tolerance
+    tallies = {group: tally_of(0, is_right, is_known.sum())}
     for name, values in undone.items():
-        counts = is_known & (error_of(values, predicted) > 2 * np.asarray(tolerance))
-        is_right = counts & (error_of(values, true) <= tolerance)
-        tallies[name] = tally_of(is_right, counts & (error <= tolerance), counts.sum())
+        is_changed = error_of(values, predicted) > 2 * np.asarray(tolerance)
+        counts = is_known & is_changed
+        is_right_undone = error_of(values, true) <= tolerance
+        tallies[name] = tally_of(counts & is_right_undone, counts & is_right, counts.sum())
     return tallies
 
 
 def _motion_evidence(
-    _: SampleLoader, __: str, prediction: MotionOutput, label: MotionLabels, *___: object
+    _loader: SampleLoader,
+    _token: str,
+    prediction: MotionOutput,
+    label: MotionLabels,
+    *_context: object,
 ) -> SampleEvidence:
-    """Compare cells of actors: for places in the present frame, for times where frames differ."""
-    frame_count, grid = frames_there(label), label.config.grid
-    true = grid.reorient(labels_at_present(label).segmentation[:frame_count] == 1, "devkit")
+    """Compare cells of actors: for places in the current frame, for times the ones that change."""
+    frame_count = num_recorded_frames(label)
+    grid = label.config.grid
+    segmentation = labels_at_present(label).segmentation[:frame_count]
+    true = grid.reorient(segmentation == 1, "devkit")
     all_frames = prediction.grid.reorient(actor_cells(prediction), "devkit")
     predicted = all_frames[:frame_count]
-    tallies = {}
-    for name, axes in (_AXES | {"place": (1, 1, 1)}).items():
-        keeps_shape = grid.x == grid.y or axes[2] == 1
+    true_present = true[:1]
+    present = predicted[:1]
+    tallies = {"place": _overlap(present, true_present, present)}
+    for name, (x, y, order) in _AXES.items():
+        keeps_shape = grid.x == grid.y or order == 1
         if keeps_shape:
-            present = predicted[:1]
-            tallies[name] = _overlap(_turn_maps(present, *axes), true[:1], present)
+            turned = _turn_maps(present, x, y, order)
+            tallies[name] = _overlap(turned, true_present, present)
     is_changing = true.any(axis=0) & ~true.all(axis=0)
-    true, predicted = true & is_changing, predicted & is_changing
+    true = true & is_changing
+    predicted = predicted & is_changing
     backwards = all_frames[::-1][:frame_count] & is_changing
     overlaps = {"frames reversed": _overlap(backwards, true, predicted)}
     if frame_count > FEW_FRAMES:
         overlaps["one step late"] = _overlap(predicted[1:], true[:-1], predicted[:-1])
     for name, overlap in overlaps.items():
-        tallies[name] = np.pad(overlap, ((0, 0), (0, len(all_frames) - overlap.shape[1])))
+        missing_frames = len(all_frames) - overlap.shape[1]
+        tallies[name] = np.pad(overlap, ((0, 0), (0, missing_frames)))
     is_empty = not all_frames.any()
     return SampleEvidence(
         tallies=tallies,
@@ -465,79 +502,90 @@ def _holds_probabilities(prediction: MotionOutput) -> bool:
 
 
 def _turn_maps(maps: AnyArray, x: int, y: int, order: int) -> AnyArray:
-    """Return maps (T, rows, columns) in the devkit's orientation with other axes."""
-    ordered = maps if order == 1 else maps.swapaxes(1, 2)
-    return ordered[:, ::y, ::x]
+    """Transform maps (T, rows, columns) in the devkit's orientation, with axes as in `_AXES`."""
+    if order == -1:
+        maps = maps.swapaxes(1, 2)
+    return maps[:, ::y, ::x]
 
 
 def _turn_points(points: FloatArray, x: int, y: int, order: int) -> FloatArray:
-    """Return points (N, 2) or (N, 3) with other axes."""
-    ordered = points[:, :2][:, ::order]
-    return np.column_stack([ordered * (x, y), points[:, 2:]])
+    """Transform points (N, 2) or (N, 3), with axes as in `_AXES`."""
+    on_ground = points[:, :2]
+    turned = on_ground[:, ::order] * (x, y)
+    return np.column_stack([turned, points[:, 2:]])
 
 
 def _overlap(undone: AnyArray, true: AnyArray, predicted: AnyArray) -> FloatArray:
-    """Count cells of intersections and unions frame by frame, shape (4, T)."""
-    cell_sets = (undone & true, undone | true, predicted & true, predicted | true)
-    counts = [cells.sum(axis=(1, 2)) for cells in cell_sets]
+    """Count cells in a tally (4, T): intersection and union after undoing a mistake, then before.
+
+    Args:
+        undone: Masks of T frames after the mistake is undone.
+        true: True masks.
+        predicted: Masks as predicted.
+    """
+    counts = []
+    for masks in (undone, predicted):
+        counts.append((masks & true).sum(axis=(1, 2)))
+        counts.append((masks | true).sum(axis=(1, 2)))
     return np.array(counts, dtype=np.float64)
 
 
 def _detection_evidence(
-    loader: SampleLoader, token: str, _: object, truth: Boxes
+    loader: SampleLoader, token: str, _prediction: object, truth: Boxes
 ) -> SampleEvidence:
-    """Compare detections with the boxes of other actors in the world frame: first the positions."""
+    """Compare detections with the boxes of other actors, in the world frame."""
     detections: Any = loader.results.prediction(token)  # in the world frame
     world_boxes = loader.dataset.boxes(token, "world")
-    true = world_boxes.select(
-        np.isin(world_boxes.actor_id, truth.actor_id) & (world_boxes.actor_id != OWN_ACTOR_ID)
-    )
+    is_true = np.isin(world_boxes.actor_id, truth.actor_id)
+    is_other = world_boxes.actor_id != OWN_ACTOR_ID
+    true = world_boxes.select(is_true & is_other)
     scores = detections.scores.tolist()
     if not len(detections) or not len(true):
         return SampleEvidence(tallies={}, empty=not len(detections), scores=scores)
     columns = columns_of(detections.boxes, detections.scores)
     boxes = detections.boxes.select(columns.surest_first[: 2 * len(true)])
-    center, true_center = boxes.center, true.center
+    center = boxes.center
+    true_center = true.center
     rows = _nearest_rows(center, true_center)
-    undone = {}
+    nearest_center = center[rows]
+    weighted_centers = {}
     for name, moved in _undo_frames(loader.dataset, token, center).items():
-        undone[name] = moved[_nearest_rows(moved, true_center)] * _AXIS_WEIGHTS
+        weighted_centers[name] = moved[_nearest_rows(moved, true_center)] * _AXIS_WEIGHTS
     step = LABEL_STEP * true.velocity
     step_length = _distance(step, np.zeros(3))
     is_moving = step_length[:, None] >= LABEL_STEP * MIN_SPEED_MPS
-    late = {"one step late": center[_nearest_rows(center, true_center - step)] + step}
-    is_matched = _distance(center[rows, :2], true_center[:, :2]) < _POSITION_TOLERANCE_M
-    tallies = {
-        **tallies_of(
-            "place",
-            undone,
-            center[rows] * _AXIS_WEIGHTS,
-            true_center * _AXIS_WEIGHTS,
-            _POSITION_TOLERANCE_M,
-            _distance,
-        ),
-        **tallies_of(
-            "time",
-            late,
-            center[rows],
-            np.where(is_moving, true_center, np.nan),
-            step_length / 4,
-            _distance,
-        ),
-        **_pair_tallies(boxes.select(rows[is_matched]), true.select(is_matched)),
-        "place": tally_of(0, is_matched, len(true)),
-    }
+    moving_center = np.where(is_moving, true_center, np.nan)
+    late_center = center[_nearest_rows(center, true_center - step)] + step
+    is_matched = _distance(nearest_center[:, :2], true_center[:, :2]) < _POSITION_TOLERANCE_M
+    tallies = tallies_of(
+        "place",
+        weighted_centers,
+        nearest_center * _AXIS_WEIGHTS,
+        true_center * _AXIS_WEIGHTS,
+        _POSITION_TOLERANCE_M,
+        _distance,
+    )
+    tallies |= tallies_of(
+        "time",
+        {"one step late": late_center},
+        nearest_center,
+        moving_center,
+        step_length / 4,
+        _distance,
+    )
+    tallies |= _pair_tallies(boxes.select(rows[is_matched]), true.select(is_matched))
+    tallies["place"] = tally_of(0, is_matched, len(true))
     return SampleEvidence(tallies=tallies, scores=scores)
 
 
 def _nearest_rows(predicted: FloatArray, true: FloatArray) -> IntArray:
-    """Return the rows (N,) of predicted points (K, 3) nearest on the ground to true ones (N, 3)."""
+    """Find the predicted point (K, 3) nearest to each true one (N, 3) on the ground: (N,)."""
     distances = _distance(true[:, None, :2], predicted[:, :2])
     return np.asarray(distances.argmin(axis=1))
 
 
 def _pair_tallies(detected: Boxes, true: Boxes) -> dict[str, FloatArray]:
-    """Compare N true boxes with the detections at their positions on the ground."""
+    """Compare N true boxes with the detections at their positions, in tallies by mistake."""
     z = detected.center[:, 2]
     height = true.size[:, 2]
     velocity = detected.velocity[:, :2]
@@ -568,7 +616,7 @@ def _pair_tallies(detected: Boxes, true: Boxes) -> dict[str, FloatArray]:
 
 
 def _undo_frames(dataset: Dataset, token: str, center: FloatArray) -> dict[str, FloatArray]:
-    """Return for each mistake the centres (N, 3) in the world frame without it."""
+    """Undo each mistake in centres: mistake → centres (N, 3) in the world frame."""
     ego = dataset.world_from(token, "ego")
     lidar = dataset.world_from(token, "lidar")
     in_ego = ego.inverse().apply(center)
@@ -582,39 +630,41 @@ def _undo_frames(dataset: Dataset, token: str, center: FloatArray) -> dict[str, 
 
 
 def class_tally(class_counts: FloatArray) -> FloatArray:
-    """Return a tally (4, N) of the N classes that are mostly detected under another class's name.
+    """Build a tally (4, N) of the N classes that are mostly detected as another class.
 
-    Each of them is detected under a different name.
+    N is 0 if two of these classes are detected as the same class.
 
     Args:
         class_counts: Number of true boxes of a class (rows) by detected class (columns), (C, C).
     """
     totals = class_counts.sum(axis=1)
     detected = class_counts.argmax(axis=1)
-    changed = np.flatnonzero(
-        (detected != np.arange(len(class_counts))) & (totals >= _MIN_CLASS_BOXES)
-    )
-    is_rare = len(changed) == 1 and 2 * totals[changed].sum() < totals.sum()
-    if is_rare or len(set(detected[changed])) < len(changed):
-        # one rare class, or several that are taken for the same one: no mistake of their order
-        changed = changed[:0]
-    total = totals[changed]
-    undone = class_counts[changed, detected[changed]]
-    return np.array([undone, total, class_counts[changed, changed], total])
+    is_swapped = detected != np.arange(len(class_counts))
+    swapped = np.flatnonzero(is_swapped & (totals >= _MIN_CLASS_BOXES))
+    is_rare = len(swapped) == 1 and 2 * totals[swapped].sum() < totals.sum()
+    if is_rare or len(set(detected[swapped])) < len(swapped):
+        # a single rare class, or several detected as the same class: classes are not permuted
+        swapped = swapped[:0]
+    total = totals[swapped]
+    undone_hits = class_counts[swapped, detected[swapped]]
+    given_hits = class_counts[swapped, swapped]
+    return np.array([undone_hits, total, given_hits, total])
 
 
 def _accident_evidence(
     loader: SampleLoader,
     token: str,
     alarms: Sequence[Accident],
-    _: object,
+    _label: object,
     context: AccidentContext,
 ) -> SampleEvidence:
-    """Compare the surest accident with the true one: its positions, and its time."""
+    """Compare the positions and time of the highest-scoring accident with the true one's."""
     tallies: dict[str, FloatArray] = {}
-    true = context.truth and context.truth.accident
-    if alarms and true:
-        surest = min(alarms, key=by_sureness)
+    true = None
+    if context.truth is not None:
+        true = context.truth.accident
+    if alarms and true is not None:
+        surest = min(alarms, key=alarm_sort_key)
         positions = _undo_positions(loader.dataset, token, surest.positions)
         times = {
             "one step late": surest.time - LABEL_STEP,
@@ -635,17 +685,20 @@ def _accident_evidence(
 
 
 def _undo_positions(dataset: Dataset, token: str, positions: FloatArray) -> dict[str, FloatArray]:
-    """Return for each mistake the positions (N, 2) in the present ego frame without it."""
-    in_world = np.column_stack([positions, np.zeros(len(positions))])
-    in_ego = dataset.world_from(token, "ego").inverse().apply(in_world)[:, :2]
+    """Undo each mistake in positions: mistake → positions (N, 2) in the current ego frame."""
+    heights = np.zeros(len(positions))
+    in_world = np.column_stack([positions, heights])
+    ego_from_world = dataset.world_from(token, "ego").inverse()
+    in_ego = ego_from_world.apply(in_world)
     undone = {name: _turn_points(positions, *axes) for name, axes in _AXES.items()}
-    return undone | {"world frame for ego frame": in_ego}
+    undone["world frame for ego frame"] = in_ego[:, :2]
+    return undone
 
 
 def _plan_evidence(
     loader: SampleLoader, token: str, plans: Sequence[Plan], scene: PlanningScene
 ) -> SampleEvidence:
-    """Compare the best plan with the recorded path, and its headings with the recorded ones."""
+    """Compare the path and the headings of the best plan with the recorded ones."""
     plan = max(plans, key=lambda plan: plan.score)
     tallies = _path_tallies(
         loader, token, plan.times, plan.path, np.zeros(2), scene.recorded[_STEP_FRAMES, :2]
@@ -688,15 +741,14 @@ def _path_tallies(
     Args:
         loader: Loader of the sample.
         token: Token of the sample.
-        times: Seconds of the path's positions after the present, (T,).
-        path: Predicted positions in the present ego frame, (T, 2).
-        present: Position at present, (2,).
-        true: True positions, (S, 2).
+        times: (T,) times of the path's positions, seconds after the current frame.
+        path: (T, 2) predicted positions in the current ego frame, metres.
+        present: (2,) position in the current frame, metres.
+        true: (S, 2) true positions, metres.
     """
-    timed_paths = {
-        name: (times, positions)
-        for name, positions in _undo_positions(loader.dataset, token, path).items()
-    }
+    timed_paths = {}
+    for name, positions in _undo_positions(loader.dataset, token, path).items():
+        timed_paths[name] = (times, positions)
     timed_paths |= {
         "steps for places": (times, present + path.cumsum(axis=0)),
         "places from the actor": (times, present + path),
@@ -715,18 +767,19 @@ def _path_tallies(
 
 
 def _positions_at_steps(times: FloatArray, path: FloatArray, present: FloatArray) -> FloatArray:
-    """Return the positions (S, 2) of a path (T, 2) at `_STEP_TIMES`.
+    """Interpolate a path (T, 2) at `_STEP_TIMES`, shape (S, 2).
 
-    The path begins at the present position and stays at its end.
+    The path begins at the current position, and stays at its last position.
     """
     if times[0] > 0:
-        times, path = np.append(0.0, times), np.vstack([present, path])
+        times = np.append(0.0, times)
+        path = np.vstack([present, path])
     coordinates = [np.interp(_STEP_TIMES, times, values) for values in path.T]
     return np.column_stack(coordinates)
 
 
-# Kind of results → function that examines a sample: its token, prediction and truth.
-_EXAMINERS: Final[Mapping[str, Callable[..., SampleEvidence]]] = {
+# Task of results → function that takes a sample's token, prediction and truth, and examines them.
+_EXAMINERS: Mapping[str, Callable[..., SampleEvidence]] = {
     "motion": _motion_evidence,
     "accident": _accident_evidence,
     "detection": _detection_evidence,

@@ -1,7 +1,5 @@
 """The rules of an evaluation (`EvaluationSetup`), and its samples (`SampleSelection`)."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -36,13 +34,14 @@ from deepaccident_devkit.support.files import remove_in
 from deepaccident_devkit.support.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.support.plugins import offers
 from deepaccident_devkit.support.text import (
+    PathType,
     choice,
     choices,
     counted,
+    match_spelling,
     meant_text,
     path_of,
     settle_choices,
-    spelled,
 )
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, SPLIT_CHOICES, SPLITS, VEHICLE_AGENTS
@@ -51,16 +50,16 @@ __all__ = ["TASKS", "EvaluationSetup", "SampleLoader", "evaluator_class", "is_ta
 
 SampleList = Literal["evaluate", "all"]
 ScopeName = Literal["accident", "all"]
-# Number of samples that a message names.
-_MAX_NAMED_SAMPLES: Final = 3
-# Seconds between samples of a list.
+# A message names at most this many samples.
+_MAX_NAMED_SAMPLES = 3
+# Seconds between successive samples of a list.
 LIST_STEP: Final = 0.5
-# Tolerance of a horizon in steps.
-_STEP_TOLERANCE: Final = 1e-6
-# In seconds; recordings are shorter.
-_MAX_HORIZON_S: Final = 100
-# Folder of an unfinished evaluation's counts.
-_COUNTS_FOLDER: Final = "counts"
+# A horizon may differ from a whole number of steps by this fraction of a step.
+_STEP_TOLERANCE = 1e-6
+# Largest horizon; all recordings are shorter.
+_MAX_HORIZON_S = 100
+# Name of the folder with the counts of an unfinished evaluation.
+_COUNTS_FOLDER = "counts"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,11 +68,11 @@ class SampleSelection:
 
     Attributes:
         split: `train`, `val`, … or the path of a split file.
-        samples: `evaluate` for samples within the horizon before the end, `all` for two a second
-            over the full scenarios.
+        samples: `evaluate` for samples within the horizon before the end, `all` for two samples a
+            second over the full scenarios.
         scope: `accident` for scenarios designed to end in an accident, `all` for normal ones, too.
-        agents: Agents of the samples, in the order of `taxonomy.AGENTS`; None for all.
-        horizon: Seconds before the end; used only by `evaluate`.
+        agents: Agents of the samples, in the order of `taxonomy.AGENTS`; None for all agents.
+        horizon: Seconds before the end, only used by `evaluate`.
     """
 
     split: str
@@ -83,26 +82,26 @@ class SampleSelection:
     horizon: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check the choices and put the agents in order; raises ChoiceError."""
-        object.__setattr__(self, "split", spelled(os.fspath(self.split), SPLIT_CHOICES))
+        """Check the choices and sort the agents; raise ChoiceError if a choice does not exist."""
+        object.__setattr__(self, "split", match_spelling(os.fspath(self.split), SPLIT_CHOICES))
         settle_choices(self, {"samples": get_args(SampleList), "scope": get_args(ScopeName)})
         if self.agents is not None:
-            object.__setattr__(self, "agents", _agents(self.agents))
+            object.__setattr__(self, "agents", _order_agents(self.agents))
 
     def tokens(self, dataset: Dataset) -> list[str]:
-        """Return the samples' tokens ordered by scenario, agent and time.
+        """Return the samples' tokens, ordered by scenario, agent and time.
 
         Raises:
-            ChoiceError: no such split.
-            ConfigError: `evaluate` with a horizon that is not a multiple of 0.5 s.
-            NotAvailableError: this release has no such samples with labels.
+            ChoiceError: If the split does not exist.
+            ConfigError: If `samples` is `evaluate` and the horizon is not a multiple of 0.5 s.
+            NotAvailableError: If the release has no labelled samples of this selection.
         """
         horizon = self.horizon if self.samples == "evaluate" else LIST_STEP
         steps = horizon / LIST_STEP
         if abs(steps - round(steps)) > _STEP_TOLERANCE:
             raise ConfigError(
-                f"horizon: samples to evaluate are {LIST_STEP} s apart, so that {horizon:g} s "
-                "does not say which; choose a multiple, or samples='all'"
+                f"horizon: expected a multiple of {LIST_STEP} s, the time between the evaluated "
+                f"samples, found {horizon:g} s; choose a multiple, or samples='all'"
             )
         tokens = samples(
             dataset, self.split, self.samples, "paper", horizon=horizon, scope=self.scope
@@ -112,68 +111,74 @@ class SampleSelection:
         if self.agents is not None:
             tokens = [token for token in tokens if agent_of(token) in self.agents]
         if not tokens:
-            of_agents = ""
+            agents = ""
             if self.agents is not None:
-                of_agents = f" of {', '.join(self.agents)}"
+                agents = f" of {', '.join(self.agents)}"
             raise NotAvailableError(
-                f"{self.split}: this release has no labelled samples{of_agents} there "
+                f"{self.split}: this split has no labelled samples{agents} in this release "
                 f"({self.text()}); {no_samples_text(dataset, self.split, self.scope)}"
             )
         return tokens
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all choices in JSON form."""
-        return asdict(self) | {"agents": None if self.agents is None else list(self.agents)}
+        """Convert all fields to JSON-compatible values."""
+        values = asdict(self)
+        if self.agents is not None:
+            values["agents"] = list(self.agents)
+        return values
 
     def text(self) -> str:
-        """Return the selection in words.
+        """Describe the selection in words.
 
         An example is `split val, samples evaluate (the last 2 s), scope accident, all agents`.
         """
-        within = ""
+        period = ""
         if self.samples == "evaluate":
-            within = f" (the last {self.horizon:g} s)"
-        agents = "all agents" if self.agents is None else f"agents {', '.join(self.agents)}"
-        return f"split {self.split}, samples {self.samples}{within}, scope {self.scope}, {agents}"
+            period = f" (the last {self.horizon:g} s)"
+        agents = "all agents"
+        if self.agents is not None:
+            agents = f"agents {', '.join(self.agents)}"
+        return f"split {self.split}, samples {self.samples}{period}, scope {self.scope}, {agents}"
 
 
 def label_rules(task: str) -> dict[str, str]:
-    """Return hints for protocols of labels that are given as a protocol of a task, by name."""
+    """Return hints, by name, for users who pass a label protocol as the protocol of a task."""
     hints = {}
     for name in LABEL_PROTOCOLS:
         remedy = ""
         if task == "motion":
-            remedy = f"; choose the labels by the switch labels={name!r} (--switch labels={name})"
-        hints[name] = f"; {name!r} is a protocol of labels{remedy}"
+            remedy = f"; choose the labels with the switch labels={name!r} (--switch labels={name})"
+        hints[name] = f"; {name!r} is a label protocol{remedy}"
     return hints
 
 
 def scenario_of(token: str) -> str:
-    """Return the token of the scenario of a sample token."""
+    """Extract the scenario's token from a sample's token."""
     return token.rsplit("/", 2)[0]
 
 
 def agent_of(token: str) -> str:
-    """Return the agent's name in a sample's token; empty if it is not a sample's token."""
+    """Extract the agent's name from a sample's token; empty if it is not a sample token."""
     if token.count("/") > 1:
         return token.rsplit("/", 2)[1]
     return ""
 
 
-def _agents(requested: Sequence[str]) -> tuple[str, ...]:
+def _order_agents(requested: Sequence[str]) -> tuple[str, ...]:
+    """Sort agents as in `taxonomy.AGENTS`; raise ChoiceError if one is unknown."""
     names = choices("agents", requested, AGENTS)
     return tuple(name for name in AGENTS if name in names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coverage(ShortRepr):
-    """Results compared with the list of samples that are evaluated; tokens are in order.
+    """How the predicted samples differ from the list of samples to evaluate.
 
     Attributes:
         expected: Number of samples in the list.
-        missing: Samples of the list without a prediction.
-        extra: Samples of this release with a prediction that are not in the list.
-        unknown: Tokens of predictions that are no samples of this release.
+        missing: Sorted tokens of samples in the list without a prediction.
+        extra: Sorted tokens of predicted samples of this release that are not in the list.
+        unknown: Sorted tokens of predictions that do not name a sample of this release.
         splits: Splits of the predictions.
         agents: Agents of the predictions, in the order of `taxonomy.AGENTS`.
         options: Options of `deepaccident evaluate` that select exactly the predicted samples; empty
@@ -190,37 +195,38 @@ class Coverage(ShortRepr):
 
     @property
     def is_complete(self) -> bool:
-        """Whether the results have each sample of the list, and no others."""
+        """Whether the results contain all samples of the list, and no others."""
         return not (self.missing or self.extra or self.unknown)
 
     def to_text(self) -> str:
-        """Return which options are missing, or how many samples, with three of each kind."""
+        """Say which options are missing, or how many samples differ, with some examples."""
         if self.is_complete:
-            return f"all {self.expected} samples have a prediction, and nothing else has"
-        parts = self._counts()
+            return f"all {counted(self.expected, 'sample')} have a prediction, and no others do"
+        sentences = self._list_differences()
         if self.options:
-            remedy = "evaluate with these options, too, or predict again without them"
-            parts = [f"the predictions are of the samples of {self.options}: {remedy}"]
+            remedy = "evaluate with the same options, or predict again without them"
+            sentences = [f"the predictions were made with {self.options}: {remedy}"]
         elif self.agents:
-            splits, agents = ", ".join(self.splits), ",".join(self.agents)
-            parts.append(f"the predictions are of --split {splits} --agents {agents}")
+            splits = ", ".join(self.splits)
+            agents = ",".join(self.agents)
+            sentences.append(f"the predictions cover --split {splits} --agents {agents}")
         if self.extra and not (self.missing or self.unknown):
-            parts.append(
-                "leave them out with --allow-partial (allow_partial=True), or evaluate whole "
-                "scenarios with --samples all; no sample lacks a prediction, so the numbers are "
-                "not partial then"
+            sentences.append(
+                "ignore them with --allow-partial (allow_partial=True), or evaluate full scenarios "
+                "with --samples all; every evaluated sample has a prediction, so the numbers are "
+                "not partial"
             )
-        return "; ".join(filter(None, parts))
+        return "; ".join(filter(None, sentences))
 
-    def _counts(self) -> list[str]:
-        """Return how many samples are missing, extra or unknown, and some names; empty for none."""
+    def _list_differences(self) -> list[str]:
+        """Return texts about missing, extra and unknown samples, which are empty for none."""
         expected = counted(self.expected, "sample")
         extra = counted(len(self.extra), "prediction")
         unknown = counted(len(self.unknown), "prediction")
         return [
-            _named(self.missing, f"without a prediction: {len(self.missing)} of {expected}"),
-            _named(self.extra, f"{extra} of samples that are not evaluated"),
-            _named(self.unknown, f"{unknown} of no sample of this release"),
+            _name_samples(self.missing, f"without a prediction: {len(self.missing)} of {expected}"),
+            _name_samples(self.extra, f"{extra} for samples that are not evaluated"),
+            _name_samples(self.unknown, f"{unknown} for samples that are not in this release"),
         ]
 
 
@@ -230,18 +236,19 @@ def coverage(
     """Compare the tokens of results with the samples of a selection.
 
     Args:
-        dataset: The release.
+        dataset: Release with the samples.
         results: Tokens of the predictions.
-        selection: The samples to evaluate.
-        explain: Whether to look for `Coverage.options`, which lists the release's samples many
-            times. This is always done if no sample has a prediction.
+        selection: Selection of the samples to evaluate.
+        explain: Whether to search for `Coverage.options`, which takes longer; this is always done
+            if no sample has a prediction.
 
     Raises:
-        ChoiceError: as in `SampleSelection.tokens`, for the selection itself.
-        ConfigError: likewise.
-        NotAvailableError: likewise.
+        ChoiceError: If the split does not exist.
+        ConfigError: If the selection's horizon is invalid; see `SampleSelection.tokens`.
+        NotAvailableError: If the release has no labelled samples of this selection.
     """
-    expected, predicted = selection.tokens(dataset), set(results)
+    expected = selection.tokens(dataset)
+    predicted = set(results)
     unexpected = predicted.difference(expected)
     unknown = {token for token in unexpected if not _is_sample(dataset, token)}
     samples_of_release = predicted - unknown
@@ -272,7 +279,7 @@ def _missing_options(
     splits: Iterable[str],
     agents: tuple[str, ...],
 ) -> str:
-    """Return the options that select exactly these samples, where they differ; empty for none."""
+    """Return the options that must be changed to select exactly these samples; empty if unknown."""
     horizon = max(dataset.get("sample", token)["time_to_end"] for token in tokens)
     values_by_option: dict[str, tuple[Any, ...]] = {
         "split": (requested.split, *splits),
@@ -281,8 +288,10 @@ def _missing_options(
         "agents": (requested.agents, agents),
         "horizon": (requested.horizon, horizon),
     }
-    for values in product(*map(dict.fromkeys, values_by_option.values())):
-        selection = replace(requested, **dict(zip(values_by_option, values, strict=True)))
+    distinct_values = map(dict.fromkeys, values_by_option.values())
+    for values in product(*distinct_values):
+        options = dict(zip(values_by_option, values, strict=True))
+        selection = replace(requested, **options)
         with suppress(ConfigError, NotAvailableError):
             if set(selection.tokens(dataset)) == tokens:
                 changed = asdict(selection).items() - asdict(requested).items()
@@ -291,19 +300,21 @@ def _missing_options(
 
 
 def _options_text(options: Iterable[tuple[str, Any]]) -> str:
-    """Return options as on a command line, in order of their names."""
+    """Format options as on a command line, sorted by name."""
     texts = []
     for name, value in sorted(options):
-        text = ",".join(value) if name == "agents" else value
+        text = value
+        if name == "agents":
+            text = ",".join(value)
         texts.append(f"--{name} {text}")
     return " ".join(texts)
 
 
 def release_note(dataset: Dataset, scenarios: Iterable[str]) -> dict[str, Any]:
-    """Return the note on the release that results have in `meta` under `release`.
+    """Build the note about the release that results store in their `meta` under `release`.
 
     Args:
-        dataset: The release that was predicted.
+        dataset: Release that was predicted.
         scenarios: Tokens of the scenarios that have a prediction.
     """
     return {
@@ -314,9 +325,10 @@ def release_note(dataset: Dataset, scenarios: Iterable[str]) -> dict[str, Any]:
 
 
 def check_recordings(results: Results, dataset: Dataset) -> None:
-    """Raise ResultsError if results are of other recordings than the release has under their names.
+    """Raise ResultsError if results were predicted on other recordings with the same names.
 
-    Results without such a note, and scenarios that are unknown to one of the two, are not compared.
+    Results without a note about their recordings are not checked, nor are scenarios that are
+    missing in the note or in the release.
     """
     note = results.meta.get("release")
     if not isinstance(note, dict):
@@ -328,15 +340,17 @@ def check_recordings(results: Results, dataset: Dataset) -> None:
     changed = [token for token, digest in hashes.items() if digest != noted_hashes[token]]
     if changed:
         raise ResultsError(
-            f"{results.path}: are of other recordings than {dataset.dataroot} has "
-            f"({dataset.version}; results of {note.get('version')}) for {len(changed)} of "
-            f"{len(hashes)} scenarios, such as {changed[0]}, although they have the same names; "
-            "evaluate with the release that was predicted, or predict this one. If files of the "
-            f"release were restored or edited, the index may be out of date: {INDEX_REMEDY}"
+            f"{results.path}: were predicted on recordings that differ from the recordings "
+            f"in {dataset.dataroot} ({dataset.version}; results of {note.get('version')}). "
+            f"{len(changed)} of {counted(len(hashes), 'scenario')} have the same name but "
+            f"different content, such as {changed[0]}. Evaluate with the release that was "
+            "predicted, or predict this one. If files of the release were restored or edited, "
+            f"the index may be outdated: {INDEX_REMEDY}"
         )
 
 
 def _is_sample(dataset: Dataset, token: str) -> bool:
+    """Return whether the release has a sample with this token."""
     try:
         dataset.getind("sample", token)
     except TokenError:
@@ -344,8 +358,8 @@ def _is_sample(dataset: Dataset, token: str) -> bool:
     return True
 
 
-def _named(tokens: Sequence[str], text: str) -> str:
-    """Return a text with some of the tokens it is about; empty without tokens."""
+def _name_samples(tokens: Sequence[str], text: str) -> str:
+    """Append the first tokens, in brackets, to a text about them; empty if there are no tokens."""
     if not tokens:
         return ""
     more = ""
@@ -365,47 +379,50 @@ TASKS: Final[dict[str, type[Evaluator[Any]]]] = {
         ForecastingEvaluator,
     )
 }
-"""The devkit's own tasks by name. Plug-ins have further tasks: call `evaluator_class`."""
+"""The devkit's own tasks by name. `evaluator_class` also finds the tasks of plug-ins."""
 
 
 def is_task(name: str) -> bool:
     """Return whether the devkit or a plug-in has a task."""
-    return name in TASKS or name in offers(lambda plugin: plugin.tasks, TASKS).by_name
+    if name in TASKS:
+        return True
+    offered = offers(lambda plugin: plugin.tasks, TASKS)
+    return name in offered.by_name
 
 
 def evaluator_class(task: str) -> type[Evaluator[Any]]:
-    """Return the evaluator of a task, of the devkit or of a plug-in.
+    """Return the evaluator class of a task of the devkit or of a plug-in.
 
     Raises:
-        ChoiceError: no such task; the message names a plug-in with this task that is not installed
-            or left out.
+        ChoiceError: If the task is unknown; if it belongs to a plug-in that is not installed or was
+            left out, the message names the plug-in.
     """
-    name = spelled(task, TASKS)
+    name = match_spelling(task, TASKS)
     if name in TASKS:
         return TASKS[name]
     offered = offers(lambda plugin: plugin.tasks, TASKS)
     names = (*TASKS, *offered.by_name)
-    remedy = f"; if a plug-in has this task, install it. {offered.refusals_text()}".rstrip()
+    remedy = f"; if a plug-in adds this task, install it. {offered.refusals_text()}".rstrip()
     hint = meant_text(str(task), names) or remedy
     plugin_task = choice("task", task, names, elsewhere={str(task).lower(): hint})
     evaluator = offered.by_name[plugin_task].load()
     if not evaluator.protocols:
         raise ConfigError(
-            f"{evaluator.__name__}: has no protocols; give it one, such as an empty frozen "
-            "dataclass"
+            f"{evaluator.__name__}: has no protocols; give the class a protocol, such as an "
+            "empty frozen dataclass"
         )
     return evaluator
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSetup:
-    """Task and rules of an evaluation; equal setups give comparable numbers.
+    """Task and rules of an evaluation; numbers with the same setup are comparable.
 
     Attributes:
-        task: Name of a task, of the devkit or of a plug-in.
+        task: Name of a task of the devkit or of a plug-in.
         protocol: Name of one of the task's `protocols`.
-        switches: Changed choices of the protocol, by name (`task.switch_names`).
-        horizon: Seconds that the predictions look ahead; not used by detection.
+        switches: Name of a changed field of the protocol (`task.switch_names`) → its new value.
+        horizon: Seconds that the predictions look ahead; detection does not use it.
     """
 
     task: str
@@ -414,7 +431,7 @@ class EvaluationSetup:
     horizon: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check all values; raises ChoiceError or ConfigError."""
+        """Check all fields; raise ChoiceError or ConfigError if one is invalid."""
         task = evaluator_class(self.task)
         object.__setattr__(self, "task", task.task)
         protocols = task.protocols
@@ -428,19 +445,21 @@ class EvaluationSetup:
                 f"{self.horizon!r}"
             )
         object.__setattr__(self, "switches", FrozenDict(self.switches))
-        switched(protocols[protocol], self.switches)  # raises for impossible choices
+        switched(protocols[protocol], self.switches)  # raises if a choice is invalid
 
     @property
     def rules(self) -> Any:
         """The protocol with the switches applied."""
-        return switched(evaluator_class(self.task).protocols[self.protocol], self.switches)
+        protocols = evaluator_class(self.task).protocols
+        return switched(protocols[self.protocol], self.switches)
 
     def evaluator(self) -> Evaluator[Any]:
-        """Return a new evaluator with these rules."""
-        return evaluator_class(self.task)(self.rules)
+        """Create an evaluator with these rules."""
+        evaluator_type = evaluator_class(self.task)
+        return evaluator_type(self.rules)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all values in JSON form, with the evaluator's own `settings`: every choice."""
+        """Convert all fields, and the evaluator's `settings`, to JSON-compatible values."""
         return asdict(self) | {
             "switches": dict(self.switches),
             "settings": self.evaluator().settings,
@@ -449,45 +468,50 @@ class EvaluationSetup:
 
 def default_selection(
     setup: EvaluationSetup,
-    split: str | os.PathLike[str] = "val",
+    split: PathType = "val",
     *,
     samples: SampleList | None = None,
     scope: ScopeName | None = None,
     agents: Sequence[str] | None = None,
 ) -> SampleSelection:
-    """Return the samples that a setup is evaluated at.
+    """Build the default selection of samples for a setup; arguments override the defaults.
 
     Args:
-        setup: Its task and horizon are used.
+        setup: Setup with the task and the horizon.
         split: `train`, `val`, … or the path of a split file.
-        samples: None for `all` if the task follows full recordings, otherwise `evaluate`.
-        scope: None for `all` where all samples are evaluated, otherwise `accident`.
-        agents: Agents of the samples; None for all agents of the task.
+        samples: List of samples; None takes `all` if the task follows whole recordings, and
+            `evaluate` otherwise.
+        scope: Scope of the scenarios; None takes `all` if all samples are evaluated, and `accident`
+            otherwise.
+        agents: Agents of the samples; None for all agents that the task evaluates.
 
     Raises:
-        ChoiceError: no such list, scope or agent.
+        ChoiceError: If the list, the scope or an agent does not exist.
     """
     task = evaluator_class(setup.task)
     if agents is None and task.vehicles_only:
         agents = VEHICLE_AGENTS
-    sample_list: SampleList = samples or ("all" if task.needs_whole_recordings else "evaluate")
+    if not samples:
+        samples = "all" if task.needs_whole_recordings else "evaluate"
+    if not scope:
+        scope = "all" if samples == "all" else "accident"
     return SampleSelection(
         split=os.fspath(split),
-        samples=sample_list,
-        scope=scope or ("all" if sample_list == "all" else "accident"),
-        agents=None if agents is None else _agents(agents),
+        samples=samples,
+        scope=scope,
+        agents=None if agents is None else _order_agents(agents),
         horizon=setup.horizon,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class SampleLoader:
-    """Makes the arguments of a setup's evaluator for a sample, except the token; cheap to pickle.
+    """Callable that loads a sample's prediction and truth for an evaluator; cheap to pickle.
 
     Attributes:
         dataset: Dataset with the ground truth.
-        results: Results with the predictions, of a kind that the task is evaluated from.
-        setup: The rules.
+        results: Results with the predictions, of a kind that the task can be evaluated from.
+        setup: Task and rules of the evaluation.
     """
 
     dataset: Dataset
@@ -495,17 +519,17 @@ class SampleLoader:
     setup: EvaluationSetup
 
     def __post_init__(self) -> None:
-        """Raise EvaluationError if the rules do not take the results, or if they end too early."""
+        """Raise EvaluationError if the task needs other results or longer predictions."""
         kinds = evaluator_class(self.setup.task).result_kinds
         if self.results.task not in kinds:
             raise EvaluationError(
-                f"{self.results.path}: holds {self.results.task} results; {self.setup.task} is "
+                f"{self.results.path}: contains {self.results.task} results; {self.setup.task} is "
                 f"evaluated from {' or '.join(kinds)} results"
             )
         if self.results.task == "accident" and getattr(self.setup.rules, "maps_alone", False):
             raise EvaluationError(
-                f"{self.results.path}: holds explicit accidents; the protocol "
-                f"{self.setup.protocol!r} compares motion: give motion results, or choose "
+                f"{self.results.path}: contains explicit accidents, but the protocol "
+                f"{self.setup.protocol!r} evaluates motion; give motion results, or choose "
                 "protocol 'paper' or 'boxes'"
             )
         form = self.results.form
@@ -514,63 +538,65 @@ class SampleLoader:
         seconds = (form.frames - 1) * form.step
         if seconds < self.setup.horizon - FRAME_PERIOD / 2:
             raise EvaluationError(
-                f"{self.results.path}: its predictions look {seconds:g} s ahead ({form.frames} "
-                f"frames, {form.step:g} s apart, from the present on), less than the horizon of "
-                f"{self.setup.horizon:g} s; add the present frame if it is missing, or evaluate "
-                "with a shorter horizon"
+                f"{self.results.path}: the predictions look {seconds:g} s ahead "
+                f"({counted(form.frames, 'frame')}, {form.step:g} s apart, from the present on), "
+                f"less than the horizon of {self.setup.horizon:g} s; add the present frame if it "
+                "is missing, or evaluate with a shorter horizon"
             )
 
     @property
     def places(self) -> Places:
-        """The paths that workers must be able to read."""
-        return Places(reads=(*self.dataset.places, self.results.path))
+        """Paths that workers must be able to read."""
+        paths = (*self.dataset.places, self.results.path)
+        return Places(reads=paths)
 
     def __call__(self, token: str) -> tuple[Any, ...]:
-        """Return a sample's prediction and truth: the arguments of the evaluator's `update`."""
+        """Load a sample's prediction and truth: the arguments of the evaluator's `update`."""
         evaluator = self.setup.evaluator()
         truth = evaluator.truth(self.dataset, token, self.results.form, self.setup.horizon)
         return self.prediction(token), *truth
 
     def prediction(self, token: str) -> Any:
-        """Return the prediction of a sample, boxes in the protocol's frame."""
-        return self.setup.evaluator().read(self.results, self.dataset, token)
+        """Load the prediction for a sample; boxes are in the protocol's frame."""
+        evaluator = self.setup.evaluator()
+        return evaluator.read(self.results, self.dataset, token)
 
     def label(self, token: str) -> MotionLabels | None:
-        """Return the motion labels that a sample's results are compared with; None without any."""
+        """Load the motion labels that a sample is compared with; None if none are needed."""
         return compared_labels(
             self.dataset, token, self.setup.rules, self.results.form, self.setup.horizon
         )
 
 
-def evaluation_store(out: str | os.PathLike[str], command: str = "") -> Store:
-    """Return the store beside `out`; only the process with its lock writes the evaluation.
+def evaluation_store(out: PathType, command: str = "") -> Store:
+    """Return the store, next to the folder of an evaluation, for the counts of an unfinished run.
 
-    It does so once all samples are counted.
+    Once all samples are counted, only the process that has the store's lock writes the evaluation.
 
     Args:
         out: Folder of the evaluation.
         command: Digest that identifies the evaluation.
     """
     target = path_of(out)
-    return Store(unfinished_folder(target), target, "evaluates for it", ResultsError, command)
+    return Store(unfinished_folder(target), target, "is evaluating", ResultsError, command)
 
 
 def checkpoint_path(
-    out: str | os.PathLike[str],
+    out: PathType,
     setup: EvaluationSetup,
     tokens: Collection[str],
     fingerprints: Mapping[str, str],
 ) -> Path:
-    """Return the folder beside `out` in which a run stores its counts.
+    """Return the folder, next to that of the evaluation, in which a run stores its counts.
 
-    Its name is a digest of everything that affects the counts: another setup, other samples, other
-    predictions, other labels or another devkit have another folder, and so never continue with
-    these counts.
+    The name of this folder is a digest of everything that affects the counts: the setup, the
+    samples, the predictions, the labels and the devkit. So runs that differ in any of these never
+    use each other's counts.
 
     Args:
         out: Folder of the finished evaluation.
         setup: Task and rules.
-        tokens: The samples.
+        tokens: Tokens of the samples.
         fingerprints: Fingerprints of the predictions and of the labels.
     """
     name = digest_of(
@@ -584,8 +610,8 @@ def checkpoint_path(
     return evaluation_store(out).folder / _COUNTS_FOLDER / name
 
 
-def remove_checkpoints(out: str | os.PathLike[str]) -> None:
-    """Remove all such folders beside `out`, once the evaluation is written."""
+def remove_checkpoints(out: PathType) -> None:
+    """Remove the stored counts next to the folder of an evaluation, once it is written."""
     store = evaluation_store(out)
     remove_in(store.folder, _COUNTS_FOLDER)
     store.remove()

@@ -1,37 +1,38 @@
-"""Evaluations of different sources, each by its own rules, side by side and without differences."""
-
-from __future__ import annotations
+"""Evaluations of different data, or under different rules, side by side without differences."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from deepaccident_devkit.evaluation.runs.bundles import Bundle
+from deepaccident_devkit.support.human_names import metric_name
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import columns_text
 
 
 @dataclass(frozen=True, slots=True)
 class SideBySide(Report):
-    """Headlines of evaluations, a column for each evaluation.
+    """Table of headlines with one column per evaluation.
 
     Attributes:
-        rows: Rows of texts: what was evaluated and how, then a row for each headline of any
-            evaluation.
+        rows: Rows of texts: what was evaluated and how, then one row for each headline that any
+            evaluation has.
     """
 
     rows: tuple[tuple[str, ...], ...]
 
     def named_tables(self) -> dict[str, list[Row]]:
-        """Return a single table with all rows."""
+        """Return a single table that contains all rows."""
         return {"numbers": list(self.rows)}
 
     def to_text(self) -> str:
-        """Return all rows, and why there is no difference."""
-        return f"{columns_text(self.rows)}\n\nno differences: they have no sample in common"
+        """Format all rows, with a note that explains why differences are not shown."""
+        rows = [(metric_name(name), *cells) for name, *cells in self.rows]
+        return f"{columns_text(rows)}\n\nno differences, since they have no sample in common"
 
 
 def side_by_side(bundles: Sequence[Bundle]) -> SideBySide:
-    """Return the headlines of evaluations that need not have anything in common."""
+    """Tabulate the headlines of evaluations, which need not have anything in common."""
     rows: dict[str, list[str]] = {"evaluation": [], "release": [], "rules": [], "samples": []}
     numbers = []
     for bundle in bundles:
@@ -43,7 +44,6 @@ def side_by_side(bundles: Sequence[Bundle]) -> SideBySide:
         rows["rules"].append(", ".join(map(str, rules)))
         rows["samples"].append(f"{summary['counts']['samples']:,}")
         numbers.append({headline["name"]: headline["text"] for headline in summary["headlines"]})
-    names = dict.fromkeys(name for texts in numbers for name in texts)
-    for name in names:
+    for name in dict.fromkeys(chain(*numbers)):
         rows[name] = [texts.get(name, "–") for texts in numbers]
     return SideBySide(rows=tuple((name, *cells) for name, cells in rows.items()))

@@ -1,4 +1,4 @@
-"""`verify_bundle` repeats an evaluation, and `find_differences` lists how its bundle differs."""
+"""`verify_bundle` repeats the evaluation of a bundle, and lists all differences."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from deepaccident_devkit.evaluation.runs.rows import rows_table, sample_rows
 from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.reports import Report, Row, record_rows
-from deepaccident_devkit.support.text import counted, path_of
+from deepaccident_devkit.support.text import PathType, counted, path_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -39,25 +39,27 @@ if TYPE_CHECKING:
     from deepaccident_devkit.support.parallel import Engine
 
 
-# Stands for a missing value.
+# Text that replaces a missing value.
 ABSENT_TEXT: Final = "absent"
-# Number of characters of a value, and of its path, that a line shows.
-_MAX_VALUE_LENGTH: Final = 60
-_MAX_PATH_LENGTH: Final = 300
-# Number of differences that the text lists.
-_MAX_DIFFERENCES: Final = 20
-# Paths in a summary that notes report, or that only name locations.
-_NOT_COMPARED: Final = ("environment", "sanity", "release/dataroot", "results/path")
+# A line shows at most this many characters of a value.
+_MAX_VALUE_LENGTH = 60
+# A line shows at most this many characters of a path.
+_MAX_PATH_LENGTH = 300
+# The text lists at most this many differences.
+_MAX_DIFFERENCES = 20
+# Paths in a summary that are not compared, since notes report their differences, or since their
+# values are only locations.
+_NOT_COMPARED = ("environment", "sanity", "release/dataroot", "results/path")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference(ShortRepr):
-    """A value in a bundle that differs from the value found.
+    """A value in a bundle that differs from that in the repeated evaluation.
 
     Attributes:
-        where: File and path in it, such as `metrics_summary.json: metrics/apa`.
+        where: File, and path in the file, such as `metrics_summary.json: metrics/apa`.
         stored: Value in the bundle.
-        found: Value of the repeated evaluation.
+        found: Value in the repeated evaluation.
     """
 
     where: str
@@ -65,34 +67,37 @@ class Difference(ShortRepr):
     found: Any
 
     def text(self) -> str:
-        """Return the difference in one line."""
-        where = self.where if self.where.isprintable() else ascii(self.where)
+        """Format the difference in one line."""
+        where = self.where
+        if not where.isprintable():
+            where = ascii(where)
         path = shortened(where, _MAX_PATH_LENGTH)
-        return f"{path}: stored {_short(self.stored)}, found {_short(self.found)}"
+        stored = _value_excerpt(self.stored)
+        found = _value_excerpt(self.found)
+        return f"{path}: stored {stored}, found {found}"
 
 
 def find_differences(
     stored: Any, actual: Any, *, without: Collection[str] = (), path: str = ""
 ) -> Iterator[tuple[str, Any, Any]]:
-    """Yield path, stored value and actual value wherever two values of JSON differ.
+    """Yield path, stored value and actual value wherever two JSON values differ.
 
     Numbers must be exactly equal.
 
     Args:
         stored: Value that was stored.
-        actual: Value to compare with it.
+        actual: Value that the stored one is compared with.
         without: Paths that are skipped, with everything below them.
-        path: Path of both values.
+        path: Path at which both values are found.
     """
     if path in without:
         return
-    stored, actual = _as_json(stored), _as_json(actual)
-    parts: Mapping[Any, tuple[Any, Any]] = {}
+    stored = _as_json(stored)
+    actual = _as_json(actual)
+    parts: dict[Any, tuple[Any, Any]] = {}
     if isinstance(stored, Mapping) and isinstance(actual, Mapping):
-        parts = {
-            name: (stored.get(name, ABSENT_TEXT), actual.get(name, ABSENT_TEXT))
-            for name in {**stored, **actual}
-        }
+        for name in {**stored, **actual}:
+            parts[name] = (stored.get(name, ABSENT_TEXT), actual.get(name, ABSENT_TEXT))
     elif isinstance(stored, list) and isinstance(actual, list) and len(stored) == len(actual):
         parts = dict(enumerate(zip(stored, actual, strict=True)))
     elif type(stored) is not type(actual) or stored != actual:
@@ -103,12 +108,14 @@ def find_differences(
 
 
 def _as_json(value: Any) -> Any:
+    """Convert the hashes of a scenario to JSON values, and leave other values as they are."""
     if isinstance(value, ScenarioHashes):
         return value.as_dict()
     return value
 
 
-def _short(value: Any) -> str:
+def _value_excerpt(value: Any) -> str:
+    """Format a value, and truncate its text if it is long."""
     text = value if value == ABSENT_TEXT else repr(value)
     if len(text) <= _MAX_VALUE_LENGTH:
         return text
@@ -117,13 +124,13 @@ def _short(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verification(Report):
-    """A bundle compared with its evaluation repeated.
+    """Comparison of a bundle with a repetition of the same evaluation.
 
     Attributes:
         folder: Folder of the bundle.
         samples: Number of samples that were evaluated again.
         differences: All differences, file by file.
-        notes: Sentences on what is not compared, or that explain differences.
+        notes: Sentences that explain differences, or say what is not compared.
     """
 
     folder: Path
@@ -137,22 +144,22 @@ class Verification(Report):
         return not self.differences
 
     def to_text(self) -> str:
-        """Return a line for each of the first differences, and how many more there are."""
-        again = f"{counted(self.samples, 'sample')} evaluated again"
+        """Format a line for each of the first differences, and say how many more there are."""
+        repeated = f"{counted(self.samples, 'sample')} evaluated again"
         if self.is_same:
-            head = f"the same; {again}, all numbers are equal"
+            head = f"identical: {repeated}, all numbers are equal"
         else:
-            head = f"{counted(len(self.differences), 'difference')}; {again}"
+            head = f"{counted(len(self.differences), 'difference')}; {repeated}"
         lines = [f"{self.folder}: {head}"]
         lines += [f"  {difference.text()}" for difference in self.differences[:_MAX_DIFFERENCES]]
-        hidden = len(self.differences) - _MAX_DIFFERENCES
-        if hidden > 0:
-            lines.append(f"  and {hidden} more")
+        hidden_count = len(self.differences) - _MAX_DIFFERENCES
+        if hidden_count > 0:
+            lines.append(f"  and {hidden_count} more")
         lines += [f"note: {note}" for note in self.notes]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all values in JSON form."""
+        """Convert all fields to JSON-compatible values."""
         return {
             "folder": os.fspath(self.folder),
             "same": self.is_same,
@@ -162,87 +169,94 @@ class Verification(Report):
         }
 
     def named_tables(self) -> dict[str, list[Row]]:
-        """Return a table with a row for each difference."""
+        """Return a single table with one row per difference."""
         return {"differences": record_rows(Difference, self.differences)}
 
 
 def verify_bundle(
-    folder: str | os.PathLike[str],
+    folder: PathType,
     dataset: Dataset,
     *,
     results: Results | str | os.PathLike[str] | None = None,
-    split: str | os.PathLike[str] | None = None,
+    split: PathType | None = None,
     **engine: Unpack[Engine],
 ) -> Verification:
     """Repeat the evaluation of a bundle and compare everything; numbers must be equal to the bit.
 
     A bundle may come from anyone. So paths that lead out of it (`Bundle.outside_paths`) are not
-    opened, and links in it are not followed. Files that do not belong to it are named, not opened.
+    opened, and links in it are not followed. Files that do not belong to it are reported, but not
+    opened.
 
     Args:
         folder: Folder of the bundle.
-        dataset: The release at `read_bundle(folder).dataroot`, or another copy of it.
-        results: The predictions; None for the bundle's own copy.
-        split: The split file, if the bundle was evaluated on one; otherwise None.
-        **engine: `workers`, `executor` and `progress`, see `parallel.Engine`.
+        dataset: Release at `read_bundle(folder).dataroot`, or another copy of it.
+        results: Predictions, or their path; None for the copy in the bundle.
+        split: Path of the split file, if the bundle was evaluated on one; otherwise None.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        ResultsError: there is no bundle of this devkit's format, no results to evaluate, or a path
-            must be given.
+        ResultsError: If the folder is not a bundle that this devkit can read, there are no results
+            to evaluate, or a path that leads out of the bundle was not passed.
     """
     bundle = read_bundle(path_of(folder))
     check_repeated(bundle, {"dataroot": dataset.dataroot, "results": results, "split": split})
-    source = bundle.results_path if results is None else results
-    opened = source if isinstance(source, Results) else read_results(source)
-    differences = list(
-        _compare_file(FILES_FILE, bundle.checksums, partial(checksums_of, bundle.folder))
-    )
-    notes, run = [], None
+    if results is None:
+        results = bundle.results_path
+    if not isinstance(results, Results):
+        results = read_results(results)
+    read_checksums = partial(checksums_of, bundle.folder)
+    differences = list(_compare_file(FILES_FILE, bundle.checksums, read_checksums))
+    notes = []
+    sample_count = 0
     try:
-        run = _repeat(bundle, dataset, opened, split, engine)
+        run = _repeat_evaluation(bundle, dataset, results, split, engine)
     except DeepAccidentError as error:
         differences.append(Difference(where="all numbers", stored="evaluated", found=ABSENT_TEXT))
         notes.append(f"cannot be evaluated again: {error}")
     else:
-        differences += _differences(bundle, run)
-        environments = bundle.summary["environment"], run.summary()["environment"]
-        for name, stored, actual in find_differences(*environments):
+        sample_count = len(run.evaluator)
+        differences += _compare_files(bundle, run)
+        environment = run.summary()["environment"]
+        for name, stored, actual in find_differences(bundle.summary["environment"], environment):
             notes.append(f"evaluated with {name} {stored}, verified with {actual}")
     if bundle.summary.get("sanity") is not None:
-        notes.append("the sanity check is not made again")
+        notes.append("the sanity check is not repeated")
     return Verification(
         folder=bundle.folder,
-        samples=0 if run is None else len(run.evaluator),
+        samples=sample_count,
         differences=tuple(differences),
         notes=tuple(notes),
     )
 
 
 def check_repeated(bundle: Bundle, arguments: Mapping[str, object]) -> None:
-    """Raise ResultsError unless all `Bundle.outside_paths` are given; the message has the command.
+    """Raise ResultsError unless all paths in `Bundle.outside_paths` were passed.
+
+    The message contains the complete command.
 
     Args:
-        bundle: The bundle.
-        arguments: Name of a path → the argument for it, or None.
+        bundle: Bundle to repeat.
+        arguments: Name of a path → the path that the caller passed, or None.
     """
     outside = bundle.outside_paths()
     if any(arguments[name] is None for name in outside):
         options = " ".join(f"--{name} {shlex.quote(path)}" for name, path in outside.items())
         raise ResultsError(
-            f"{bundle.folder}: names paths outside of it, which are opened only if you give them: "
-            f"deepaccident check bundle {shlex.quote(os.fspath(bundle.folder))} {options}"
+            f"{bundle.folder}: names paths outside its folder, which are opened only if you give "
+            f"them: deepaccident check bundle {shlex.quote(os.fspath(bundle.folder))} {options}"
         )
 
 
-def _repeat(
+def _repeat_evaluation(
     bundle: Bundle,
     dataset: Dataset,
     results: Results,
-    split: str | os.PathLike[str] | None,
+    split: PathType | None,
     engine: Engine,
 ) -> EvaluationRun:
-    """Return the bundle's evaluation, made again with its breakdowns and further results."""
-    summary, selection = bundle.summary, bundle.selection
+    """Repeat the evaluation of a bundle, with its breakdowns and further results."""
+    summary = bundle.summary
+    selection = bundle.selection
     if split is not None:
         selection = replace(selection, split=os.fspath(split))
     is_partial = summary["partial"] is not None or bool(summary["counts"]["left_out"])
@@ -252,15 +266,17 @@ def _repeat(
     breakdowns = summary["breakdowns"]
     engine = {"workers": None, **engine, "progress": False}
     if breakdowns:
-        resampling = _resampling(next(iter(breakdowns.values())))
+        first_breakdown = next(iter(breakdowns.values()))
+        resampling = _read_resampling(first_breakdown)
         run = run.broken_down(list(breakdowns), resampling, **engine)
     for name in further_names(summary):
-        run = with_further(run, name, dataset, _resampling(summary[name]), **engine)
+        resampling = _read_resampling(summary[name])
+        run = with_further(run, name, dataset, resampling, **engine)
     return run
 
 
-def _resampling(part: Any) -> Resampling:
-    """Return how the intervals of a part of a summary were made; raises ResultsError."""
+def _read_resampling(part: Any) -> Resampling:
+    """Read how the intervals in a part of a summary were made; raise ResultsError if unknown."""
     try:
         return Resampling(**part["resampling"])
     except (LookupError, TypeError) as error:
@@ -269,21 +285,23 @@ def _resampling(part: Any) -> Resampling:
         ) from error
 
 
-def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
-    """Yield the differences of all files except their list."""
-    skipped = ("split",) if "split" in bundle.outside_paths() else ()
-    truth, summary = dict(run.release.scenarios), run.summary()
-    with suppress(ResultsError):  # is reported as a difference of the file, below
+def _compare_files(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
+    """Yield the differences in all files except for the list of files."""
+    skipped = list(_NOT_COMPARED)
+    if "split" in bundle.outside_paths():
+        skipped.append("split")
+    hashes_by_scenario = dict(run.release.scenarios)
+    summary = run.summary()
+    with suppress(ResultsError):  # reported below as a difference of the file
         for token, hashes in bundle.scenarios().items():
-            if hashes.is_like(truth.get(token)):
-                truth[token] = hashes
-        summary["release"]["fingerprint"] = fingerprint(truth)
-    compared = find_differences(bundle.summary, summary, without=(*_NOT_COMPARED, *skipped))
-    for path, stored, actual in compared:
+            if hashes.is_like(hashes_by_scenario.get(token)):
+                hashes_by_scenario[token] = hashes
+        summary["release"]["fingerprint"] = fingerprint(hashes_by_scenario)
+    for path, stored, actual in find_differences(bundle.summary, summary, without=skipped):
         yield Difference(where=f"{SUMMARY_FILE}: {path}", stored=stored, found=actual)
-    row_list = rows_table(sample_rows(run)).to_pylist()  # with the types that a file would have
+    row_list = rows_table(sample_rows(run)).to_pylist()  # with the types of a written file
     rows = {row["token"]: row for row in row_list}
-    yield from _compare_file(SCENARIOS_FILE, bundle.scenarios, lambda _: truth)
+    yield from _compare_file(SCENARIOS_FILE, bundle.scenarios, lambda _: hashes_by_scenario)
     yield from _compare_file(COUNTS_FILE, bundle.counts, lambda _: dict(run.evaluator.counts))
     yield from _compare_file(ROWS_FILE, bundle.rows, lambda _: rows)
 
@@ -291,12 +309,12 @@ def _differences(bundle: Bundle, run: EvaluationRun) -> Iterator[Difference]:
 def _compare_file(
     name: str, read: Callable[[], Any], recompute: Callable[[Any], Any]
 ) -> Iterator[Difference]:
-    """Yield the differences of a bundle's file; a single one if it cannot be read.
+    """Yield the differences in a file of a bundle, or a single one if the file cannot be read.
 
     Args:
         name: Name of the file.
-        read: Reads the stored content.
-        recompute: Returns the actual content for the stored one.
+        read: Function that reads the stored content.
+        recompute: Function that takes the stored content and returns the actual content.
     """
     try:
         stored = read()

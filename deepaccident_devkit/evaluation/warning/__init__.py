@@ -1,4 +1,4 @@
-"""Warnings: how early they come before an accident, and how often an alarm is false."""
+"""Warnings: how early they precede an accident, and how often an alarm is false."""
 
 from deepaccident_devkit.evaluation.warning.anticipation import (
     AnticipationFigures,

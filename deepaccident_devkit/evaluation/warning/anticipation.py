@@ -1,6 +1,4 @@
-"""`CleanWarnings`: metrics in which a siren, silence or chance cannot win (protocol `clean`)."""
-
-from __future__ import annotations
+"""`CleanWarnings`: metrics on which constant alarm, silence or chance cannot win (`clean`)."""
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -14,29 +12,31 @@ from deepaccident_devkit.evaluation.evaluator import Counts, ratio
 from deepaccident_devkit.evaluation.task import FrozenMappings
 from deepaccident_devkit.evaluation.warning.clean import CleanScores, OperatingPoint
 from deepaccident_devkit.evaluation.warning.recordings import (
-    GIVEN,
+    GIVEN_SCORES,
     GROUPS,
     KINDS,
     PREDICTORS,
     Recording,
     ScoresOf,
-    by_group,
+    group_recordings,
     left_out_notes,
-    parts_of,
     recordings_of,
     series_of,
+    split_counts,
     twin_pairs,
 )
 from deepaccident_devkit.evaluation.warning.result import WarningResult
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.text import settle_choices
 
+# The figures of a random predictor are averaged over this number of draws.
 RANDOM_DRAWS: Final = 20
-# Seconds that a warning may need from an agent that sees the danger to the two that collide.
+# Possible delays of a warning, in seconds, from the agent that sees the danger to the two actors
+# that collide.
 LATENCIES: Final = (0.0, 0.1, 0.3)
 # Threshold at which every alarm with a score counts.
-_LOWEST_THRESHOLD: Final = float(np.nextafter(0.0, 1.0))
-_TRIVIAL_THRESHOLDS: Final[Mapping[str, float]] = {
+_LOWEST_THRESHOLD = float(np.nextafter(0.0, 1.0))
+_TRIVIAL_THRESHOLDS: Mapping[str, float] = {
     "always": 1.0,
     "never": 1.0,
     "random per frame": 0.5,
@@ -45,43 +45,47 @@ _TRIVIAL_THRESHOLDS: Final[Mapping[str, float]] = {
 
 
 def reference_threshold(predictor: str) -> float:
-    """Return the operating point of a reference predictor.
+    """Return the threshold at which a reference predictor is evaluated.
 
-    For the predictors that know the present any alarm counts.
+    For the predictors that know the current frame, any alarm counts.
 
     Args:
-        predictor: One of `PREDICTORS` except the given one.
+        predictor: One of `PREDICTORS` except `GIVEN_SCORES`.
     """
     return _TRIVIAL_THRESHOLDS.get(predictor, _LOWEST_THRESHOLD)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnticipationFigures(FrozenMappings):
-    """How well one predictor foresees a group's accidents. NaN: nothing to count.
+    """How well one predictor foresees the accidents of a group of recordings.
+
+    A figure is NaN if there is nothing to count.
 
     Attributes:
-        auc_ahead: Headline: the probability that an accident recording's score exceeds another
-            recording's at the same time before the end, ties half, mean over the moments of the
-            last 3 seconds. 0.5 for always and never, and on average for chance.
-        twin_wins: Probability that an accident recording's highest score exceeds its twin's, ties
-            half; a twin is cut to the accident's length.
-        average_precision: AP over recordings, by their highest scores; depends on the numbers of
-            accident and other recordings.
-        area_under_curve: AUC, the same up to the impact.
-        mean_time: mTTA over the curve of recall, seconds; a missed recording adds no time, so read
-            it beside the AP.
-        operating: Figures at the operating point: at the threshold of the protocol; without one at
-            the threshold of `at_r80`, or of the highest recall where 0.8 is not reached.
-        at_r80: Figures at the highest threshold with a recall of 0.8; NaN where no threshold has
-            it.
-        at_p80: Figures at the threshold of the highest recall with a precision of 0.8.
-        best_f1: Threshold of the best F1 over these recordings, for evaluations of another split.
-        quiet: Lowest threshold with at most one second per minute in alarm without a coming
-            accident, for evaluations of another split.
-        tta0_after: For agents that see an accident of others: latency → seconds of `operating.tta0`
-            that are left when the colliding pair receives the warning, at least 0; empty for
-            `ego_involved`.
-        recordings: Number of recordings by kind: `accident`, `twins`, `others`.
+        auc_ahead: The main metric: the probability that an accident recording's score exceeds that
+            of another recording at the same time before the end, averaged over the time steps of
+            the last 3 seconds. Ties count half. It is 0.5 for `always` and `never`, and 0.5 on
+            average for random scores.
+        twin_wins: Probability that an accident recording's highest score exceeds its twin's. Ties
+            count half; the twin is cut to the accident's length.
+        average_precision: AP when recordings are ranked by their highest scores; it depends on how
+            many recordings end in an accident and how many do not.
+        area_under_curve: AUC when recordings are ranked by their highest scores up to the impact.
+        mean_time: mTTA averaged over the recall curve, seconds. A missed recording adds no time, so
+            read it together with the AP.
+        operating: Figures at the operating point: the protocol's threshold if it has one; otherwise
+            the threshold of `at_r80`, or the threshold of the highest recall if none reaches 0.8.
+        at_r80: Figures at the highest threshold with a recall of at least 0.8; NaN if no threshold
+            reaches it.
+        at_p80: Figures at the threshold that has the highest recall among those with a precision of
+            at least 0.8; NaN if no threshold has that precision.
+        best_f1: Threshold with the best F1 over these recordings; use it to evaluate another split.
+        quiet: Lowest threshold that causes at most one second of alarm per minute when no accident
+            is coming; use it to evaluate another split.
+        tta0_after: For agents that see an accident of others: latency in seconds → what is left of
+            `operating.tta0` (seconds, at least 0) when the warning reaches the colliding pair;
+            empty for `ego_involved`.
+        recordings: Number of recordings of each kind: `accident`, `twins`, `others`.
         twins: Number of pairs of an accident recording and its twin.
     """
 
@@ -106,12 +110,13 @@ class AnticipationResult(WarningResult):
 
     Attributes:
         samples: Number of samples.
-        operating_by: Where the operating point comes from: a `given` threshold, or `recall`.
+        operating_by: How the operating point was chosen: `given` if the protocol has a threshold,
+            `recall` otherwise.
         groups: Involvement of the agent → figures; agents of one scenario are never pooled.
-        references: Predictor (of `PREDICTORS` except the given one) → the same figures; empty for
-            resamples.
-        beyond: Alarms for later than the horizon, which do not count.
-        notes: Sentences that a reader of the numbers should know.
+        references: Figures of each reference predictor (`PREDICTORS` except `GIVEN_SCORES`) by
+            group; empty for resamples.
+        beyond: Number of alarms that predict an accident beyond the horizon; these are ignored.
+        notes: Caveats that belong next to the numbers, one sentence each.
     """
 
     samples: int
@@ -124,72 +129,76 @@ class AnticipationResult(WarningResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CleanWarnings:
-    """Foreseen accidents by recording, without the quirks of published anticipation metrics.
+    """Rules that count foreseen accidents by recording, without the quirks of published metrics.
 
-    A recording's score at a sample is that of its surest alarm, lower than all thresholds without
-    one; from the impact on nothing counts.
+    A recording's score at a sample is the highest score of its alarms; if there is no alarm, the
+    score is below all thresholds. Samples at or after the impact do not count.
 
     Attributes:
-        scores_of: Alarms that count where somebody collides: the ones of the colliding `pair`
-            (right ones), or all of the `recording`, for predictors that name nobody. Where nobody
-            collides, all alarms count.
-        threshold: Lowest score that is an alarm, chosen on another split (`best_f1` or `quiet` of
-            that split); None if none was chosen.
+        scores_of: Which alarms count in a recording with a collision: with `pair` only the correct
+            ones, which name the colliding pair; with `recording` all alarms, for predictors that do
+            not name actors. In recordings without a collision, all alarms count.
+        threshold: Lowest score that raises an alarm, chosen on another split (its `best_f1` or
+            `quiet`); None if no threshold was chosen.
     """
 
     scores_of: ScoresOf = "pair"
     threshold: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the values; raises ChoiceError or ConfigError."""
+        """Check the fields; raise ChoiceError or ConfigError if one is invalid."""
         settle_choices(self, {"scores_of": get_args(ScoresOf)})
         if self.threshold is not None and not math.isfinite(self.threshold):
-            raise ConfigError(f"threshold: expected a number, or None, found {self.threshold!r}")
+            raise ConfigError(f"threshold: expected a number or None, found {self.threshold!r}")
 
     def result(self, counts: Collection[Counts], *, references: bool = False) -> AnticipationResult:
-        """Return the metrics of some samples' counts, with or without the reference predictors."""
-        parts = parts_of(counts)
+        """Compute the metrics from the counts of samples; reference predictors are optional."""
+        parts = split_counts(counts)
         recordings = recordings_of(parts)
         samples = [sample for part in parts for sample in part]
-        groups = dict(by_group(recordings))
         figures: dict[str, dict[str, AnticipationFigures]] = {}
-        for predictor in PREDICTORS:
-            if references or predictor == GIVEN:
-                figures[predictor] = {
-                    group: _figures(members, predictor, self) for group, members in groups.items()
-                }
+        for predictor in PREDICTORS if references else [GIVEN_SCORES]:
+            figures[predictor] = {}
+            for group, members in group_recordings(recordings):
+                figures[predictor][group] = _figures(members, predictor, self)
         return AnticipationResult(
             samples=len(samples),
-            operating_by="recall" if self.threshold is None else "given",
-            groups=figures.pop(GIVEN),
+            operating_by=self._operating_by,
+            groups=figures.pop(GIVEN_SCORES),
             references=figures,
             beyond=sum(sample["beyond"] for sample in samples),
             notes=tuple(_notes(samples, recordings, self)),
         )
 
+    @property
+    def _operating_by(self) -> str:
+        """How the operating point is chosen; see `AnticipationResult.operating_by`."""
+        return "recall" if self.threshold is None else "given"
+
     def resampled(
         self, parts: Sequence[Sequence[Counts]], times: IntArray
     ) -> Iterator[AnticipationResult]:
         """Yield the result of each draw, without references; see `Evaluator.resampled`."""
-        tables = {}
-        for group, recordings in by_group(recordings_of(parts)):
-            tables[group] = _Table(recordings, GIVEN, self)
-        samples = np.array([len(part) for part in parts], dtype=np.int64)
-        beyond = np.array(
-            [sum(sample["beyond"] for sample in part) for part in parts], dtype=np.int64
-        )
+        scores_by_group = {}
+        for group, recordings in group_recordings(recordings_of(parts)):
+            scores_by_group[group] = _GroupScores(recordings, GIVEN_SCORES, self)
+        sample_counts = np.zeros(len(parts), dtype=np.int64)
+        late_alarm_counts = np.zeros(len(parts), dtype=np.int64)
+        for index, part in enumerate(parts):
+            sample_counts[index] = len(part)
+            late_alarm_counts[index] = sum(sample["beyond"] for sample in part)
         for draw in times:
             yield AnticipationResult(
-                samples=int(samples @ draw),
-                operating_by="recall" if self.threshold is None else "given",
-                groups={group: table.figures(draw) for group, table in tables.items()},
+                samples=int(sample_counts @ draw),
+                operating_by=self._operating_by,
+                groups={name: scores.figures(draw) for name, scores in scores_by_group.items()},
                 references={},
-                beyond=int(beyond @ draw),
+                beyond=int(late_alarm_counts @ draw),
             )
 
 
-class _Table:
-    """Scores of one predictor in one group of recordings, for figures with any weights."""
+class _GroupScores:
+    """Scores of one predictor on one group of recordings, which can be weighted in any way."""
 
     def __init__(
         self, recordings: Sequence[Recording], predictor: str, rules: CleanWarnings, draw: int = 0
@@ -201,118 +210,147 @@ class _Table:
         if rules.scores_of != "recording":
             any_alarm = series_of(recordings, predictor, "recording", draw).highest()
         self._scores = CleanScores(series, any_alarm)
-        self._pairs = twin_pairs(recordings)
+        self._twin_pairs = twin_pairs(recordings)
         self._part = np.array([recording.part for recording in recordings], dtype=np.int64)
         self._kind = np.array([recording.kind for recording in recordings])
         self._sees_others = recordings[0].group not in (GROUPS[0], GROUPS[-1])
 
     def figures(self, draw: IntArray | None = None) -> AnticipationFigures:
-        """Return the figures of recordings that count as often as their part is drawn.
+        """Compute the figures; each recording is weighted by how often its part is drawn.
 
         Args:
-            draw: How often each part is drawn; None for once each.
+            draw: (P,) how often each part is drawn; None to draw each part once.
         """
-        weight = np.ones(len(self._part)) if draw is None else draw[self._part].astype(np.float64)
+        recording_weights = np.ones(len(self._part))
+        if draw is not None:
+            recording_weights = draw[self._part].astype(np.float64)
         scores = self._scores
-        r80 = scores.threshold_of_recall(weight)
-        threshold = self._operating_threshold(r80, weight)
+        threshold_at_recall_80 = scores.threshold_of_recall(recording_weights)
+        threshold = self._operating_threshold(threshold_at_recall_80, recording_weights)
         tta0_after = {}
         if self._sees_others:
             for latency in LATENCIES:
-                tta0_after[latency] = scores.tta0_after(threshold, weight, latency)
+                tta0_after[latency] = scores.tta0_after(threshold, recording_weights, latency)
         return AnticipationFigures(
-            auc_ahead=scores.area_at_moments(weight),
-            twin_wins=self._twin_wins(weight),
-            average_precision=scores.average_precision(weight),
-            area_under_curve=scores.area_under_curve(weight),
-            mean_time=scores.mean_time(weight),
-            operating=scores.at(threshold, weight),
-            at_r80=scores.at(r80, weight),
-            at_p80=scores.at(scores.threshold_of_precision(weight), weight),
-            best_f1=scores.threshold_of_best_f1(weight),
-            quiet=scores.threshold_of_alarm_time(weight),
+            auc_ahead=scores.area_at_moments(recording_weights),
+            twin_wins=self._twin_wins(recording_weights),
+            average_precision=scores.average_precision(recording_weights),
+            area_under_curve=scores.area_under_curve(recording_weights),
+            mean_time=scores.mean_time(recording_weights),
+            operating=scores.at(threshold, recording_weights),
+            at_r80=scores.at(threshold_at_recall_80, recording_weights),
+            at_p80=scores.at(scores.threshold_of_precision(recording_weights), recording_weights),
+            best_f1=scores.threshold_of_best_f1(recording_weights),
+            quiet=scores.threshold_of_alarm_time(recording_weights),
             tta0_after=tta0_after,
-            recordings={kind: int(weight[self._kind == kind].sum()) for kind in KINDS},
-            twins=int(weight[self._pairs[:, 0]].sum()),
+            recordings={kind: int(recording_weights[self._kind == kind].sum()) for kind in KINDS},
+            twins=int(recording_weights[self._twin_pairs[:, 0]].sum()),
         )
 
-    def _operating_threshold(self, r80: float, weight: FloatArray) -> float:
-        """Return the operating point; without a fixed one it is `r80`, or the highest recall's."""
+    def _operating_threshold(
+        self, threshold_at_recall_80: float, recording_weights: FloatArray
+    ) -> float:
+        """Return the protocol's or predictor's own threshold if it has one.
+
+        Otherwise, return the threshold of 80 % recall or, if that recall is not reached, of the
+        highest recall.
+
+        Args:
+            threshold_at_recall_80: Threshold of 80 % recall; NaN if it is not reached.
+            recording_weights: (N,) weights of the recordings.
+        """
         threshold = self._rules.threshold
-        if self._predictor != GIVEN:
+        if self._predictor != GIVEN_SCORES:
             threshold = reference_threshold(self._predictor)
         if threshold is not None:
             return threshold
-        return self._scores.threshold_of_highest_recall(weight) if math.isnan(r80) else r80
+        if math.isnan(threshold_at_recall_80):
+            return self._scores.threshold_of_highest_recall(recording_weights)
+        return threshold_at_recall_80
 
-    def _twin_wins(self, weight: FloatArray) -> float:
-        """Return the share of accidents with a higher score than their twin, ties half."""
-        highest = self._scores.highest
-        accident = highest[self._pairs[:, 0]]
-        twin = highest[self._pairs[:, 1]]
-        pairs = weight[self._pairs[:, 0]]
-        won = np.where(accident == twin, 0.5, accident > twin)
-        return ratio(float((won * pairs).sum()), float(pairs.sum()))
+    def _twin_wins(self, recording_weights: FloatArray) -> float:
+        """Return the share of accidents that score higher than their twins; ties count half.
+
+        Args:
+            recording_weights: (N,) weights of the recordings.
+        """
+        accident_row, twin_row = self._twin_pairs.T
+        accident_score = self._scores.highest[accident_row]
+        twin_score = self._scores.highest[twin_row]
+        wins = np.where(accident_score == twin_score, 0.5, accident_score > twin_score)
+        pair_weights = recording_weights[accident_row]
+        return ratio(float((wins * pair_weights).sum()), float(pair_weights.sum()))
 
 
 def _figures(
     recordings: Sequence[Recording], predictor: str, rules: CleanWarnings
 ) -> AnticipationFigures:
-    """Return one predictor's figures, for a random one their means over some draws."""
-    drawn = []
+    """Return one predictor's figures; a random predictor's are averaged over draws."""
+    drawn_figures = []
     for draw in range(draws_of(predictor)):
-        drawn.append(_Table(recordings, predictor, rules, draw).figures())
-    return drawn[0] if len(drawn) == 1 else mean_of(drawn)
+        scores = _GroupScores(recordings, predictor, rules, draw)
+        drawn_figures.append(scores.figures())
+    if len(drawn_figures) == 1:
+        return drawn_figures[0]
+    mean_figures: AnticipationFigures = mean_of_records(drawn_figures)
+    return mean_figures
 
 
 def draws_of(predictor: str) -> int:
-    """Return the number of draws that a predictor's figures are means of.
+    """Return over how many draws a predictor's figures are averaged.
 
-    Figures of a random predictor are means of several draws, so that no luck ranks it.
+    It is more than one for random predictors, so that their rank does not depend on luck.
     """
     return RANDOM_DRAWS if predictor.startswith("random") else 1
 
 
-def mean_of(parts: Sequence[Any]) -> Any:
-    """Return the means of floats, also of the floats in mappings and dataclasses of one form.
+def mean_of_records(parts: Sequence[Any]) -> Any:
+    """Average floats, or mappings or dataclasses with the same fields, value by value.
 
-    NaN is left out. Anything but floats is taken from the first of the parts.
+    NaN is ignored. Values that are not floats are taken from the first of the parts.
     """
-    head = parts[0]
-    if isinstance(head, float):
+    first_part = parts[0]
+    if isinstance(first_part, float):
         known_values = [value for value in parts if not math.isnan(value)]
-        return math.fsum(known_values) / len(known_values) if known_values else math.nan
-    if isinstance(head, Mapping):
-        return {name: mean_of([part[name] for part in parts]) for name in head}
-    if is_dataclass(head) and not isinstance(head, type):
-        means = {}
-        for field in fields(head):
-            means[field.name] = mean_of([getattr(part, field.name) for part in parts])
-        return replace(head, **means)
-    return head
+        if not known_values:
+            return math.nan
+        return math.fsum(known_values) / len(known_values)
+    means = {}
+    if isinstance(first_part, Mapping):
+        for name in first_part:
+            means[name] = mean_of_records([part[name] for part in parts])
+        return means
+    if is_dataclass(first_part) and not isinstance(first_part, type):
+        for field in fields(first_part):
+            means[field.name] = mean_of_records([getattr(part, field.name) for part in parts])
+        return replace(first_part, **means)
+    return first_part
 
 
 def _notes(
     counts: Collection[Counts], recordings: Sequence[Recording], rules: CleanWarnings
 ) -> Iterator[str]:
-    """Yield sentences on what was not evaluated, and on the operating point."""
+    """Yield sentences that say what was not evaluated and how the operating point was chosen."""
     kinds = {recording.kind for recording in recordings}
     if recordings and "accident" not in kinds:
-        yield "no recording of an accident was evaluated; give accident scenarios too for warnings"
+        yield (
+            "no recording of an accident was evaluated; to measure warnings, also evaluate "
+            "accident scenarios"
+        )
     if recordings and kinds == {"accident"}:
         yield (
-            "no recording without an accident was evaluated; give normal scenarios too for false "
-            "alarms"
+            "no recording without an accident was evaluated; to measure false alarms, also "
+            "evaluate normal scenarios"
         )
     if recordings and rules.threshold is None:
         yield (
-            "the operating point is that of a recall of 0.8, or the highest, on these very "
-            "recordings; choose it on another split with --threshold-from, or give it with "
-            "--switch threshold=…"
+            "the operating point has a recall of 0.8, or the highest recall, on these very "
+            "recordings; choose the operating point on another split with --threshold-from, or "
+            "set it with --switch threshold=…"
         )
     yield from left_out_notes(counts)
     if recordings and not any(sample["references"] for sample in counts):
         yield (
-            "the rows 'TTC < 3 s' need what constant velocities lead to: accident_context(…, "
-            "references=True)"
+            "the rows 'TTC < 3 s' need predictions at constant velocity; give "
+            "accident_context(…, references=True)"
         )

@@ -1,10 +1,9 @@
-"""Anticipation metrics without the quirks of published ones: by recording, with misses (`clean`).
+"""Anticipation metrics without the quirks of published ones (protocol `clean`).
 
-Every figure that grows with more alarms stands beside their cost: recall and lead beside precision
-and time in alarm. Recordings have weights, so that a resample does not read the scores again.
+They count by recording and include misses. Every figure that grows with the number of alarms is
+reported with the cost of the alarms: recall and lead time with precision and time in alarm.
+Recordings have weights, so that resamples do not read the scores again.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass
@@ -16,33 +15,37 @@ from deepaccident_devkit.evaluation.evaluator import ratio
 from deepaccident_devkit.evaluation.warning.recordings import MINUTE, ScoreSeries, shares
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, ShortRepr
 
-# Seconds before the impact in which the headline compares scores.
+# The main metric compares scores within this many seconds before the impact.
 WINDOW: Final = 3.0
-# R80 and P80: recall and precision at which operating points are compared.
+# Operating points are compared at this recall (R80) and at this precision (P80).
 SAME_RECALL: Final = 0.8
-# Seconds before the impact from which on an alarm counts as one of this accident; an earlier alarm
-# is neither right nor wrong.
+# An alarm more than this many seconds before the impact is neither correct nor false.
 EARLY: Final = 5.0
-_ROUNDING_TOLERANCE: Final = 1e-9
+_ROUNDING_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatingPoint(ShortRepr):
-    """Gain and cost if every score of at least a threshold is an alarm. NaN: nothing to count.
+    """Benefit and cost when every score at or above a threshold raises an alarm.
+
+    A figure is NaN if there is nothing to count.
 
     Attributes:
-        threshold: Lowest score that is an alarm; NaN where no threshold meets the condition.
+        threshold: Lowest score that raises an alarm; NaN if no threshold meets the condition.
         recall: Share of the accident recordings with an alarm before the impact.
-        precision: Share of the recordings with an alarm that end in an accident and have a right
-            alarm; depends on the numbers of accident and other recordings.
-        tta_hit: Seconds from the first alarm to the impact, mean over the warned recordings only.
-        tta0: The same over all accident recordings, where a missed one counts as 0 s.
+        precision: Share of the recordings with an alarm that end in an accident and have a correct
+            alarm; it depends on how many recordings end in an accident and how many do not.
+        tta_hit: Time from the first alarm to the impact, seconds, averaged over the accident
+            recordings with an alarm.
+        tta0: Time from the first alarm to the impact, seconds, averaged over all accident
+            recordings; a missed one counts as 0 s.
         time_in_alarm: Share of the frames without a coming accident that are in alarm.
-        alarm_seconds_per_minute: The same in seconds per minute.
-        episodes_per_minute: Runs of alarmed frames among them; a run that never ends counts once.
-        false_recordings: Recordings without an accident in which there is any alarm.
+        alarm_seconds_per_minute: `time_in_alarm` in seconds per minute.
+        episodes_per_minute: Runs of frames in alarm per minute of frames without a coming accident;
+            a run that never ends counts once.
+        false_recordings: Recordings without an accident that have any alarm.
         early_share: Share of the frames more than 5 s before an impact that are in alarm; such
-            alarms are neither right nor wrong.
+            alarms are neither correct nor false.
     """
 
     threshold: float
@@ -58,163 +61,200 @@ class OperatingPoint(ShortRepr):
 
 
 class CleanScores:
-    """Scores of N recordings, counted once, for figures with any weights.
+    """Scores of N recordings, prepared once so that the recordings can be weighted in any way.
 
     Attributes:
-        series: Scores of the recordings.
+        series: Scores of the recordings, frame by frame.
         highest: (N,) highest score of each recording.
     """
 
     def __init__(self, series: ScoreSeries, any_alarm: FloatArray | None = None) -> None:
-        """Count what figures at any threshold need.
+        """Compute in advance what the figures need at any threshold.
 
         Args:
-            series: Scores of the recordings.
-            any_alarm: (N,) highest scores of all alarms, where the series has only right ones; None
-                where it has all.
+            series: Scores of the recordings, frame by frame.
+            any_alarm: (N,) highest score of any alarm of each recording, if the series contains
+                correct alarms only; None if it contains all alarms.
         """
         self.series = series
         self.highest = series.highest()
-        self._any_alarm = self.highest if any_alarm is None else any_alarm
+        self._highest_of_all_alarms = self.highest if any_alarm is None else any_alarm
         self._ranks = _ranks(self.highest)
-        self._moments = [_ranks(scores) for scores in series.before(WINDOW).T]
+        self._ranks_by_moment = [_ranks(scores) for scores in series.before(WINDOW).T]
         valid = series.valid
-        self._frames = valid.sum(axis=1).astype(np.float64)
+        self._frame_counts = valid.sum(axis=1).astype(np.float64)
         self._scores = np.where(valid, series.scores, -np.inf)
-        lasting = np.minimum(self._scores[:, 1:], self._scores[:, :-1])
-        self._lasting = np.concatenate([np.full((len(lasting), 1), -np.inf), lasting], axis=1)
-        columns_to_impact = series.toa[:, None] - np.arange(series.scores.shape[1])
+        # a frame continues an alarm at the thresholds that both its score and the previous reach
+        recording_count, column_count = series.scores.shape
+        self._continued_scores = np.full((recording_count, column_count), -np.inf)
+        self._continued_scores[:, 1:] = np.minimum(self._scores[:, 1:], self._scores[:, :-1])
+        columns_to_impact = series.toa[:, None] - np.arange(column_count)
         is_early = columns_to_impact > EARLY * series.fps + _ROUNDING_TOLERANCE
-        self._early = valid & series.positive[:, None] & is_early
-        # the only thresholds of use are the recordings' highest scores
-        self._levels = np.unique(self.highest[np.isfinite(self.highest)])[::-1]
-        self._leads = series.leads(self._levels)
-        self._level_index = np.searchsorted(-self._levels, -self.highest, side="left")
-        sorted_scores = np.sort(self._scores, axis=1)
-        lower = [np.searchsorted(row, self._levels) for row in sorted_scores]
-        lower_counts = np.array(lower).reshape(len(lower), len(self._levels))
-        self._alarmed = self._scores.shape[1] - lower_counts
+        self._is_early = valid & series.positive[:, None] & is_early
+        # only the recordings' highest scores matter as thresholds
+        is_finite = np.isfinite(self.highest)
+        self._thresholds = np.unique(self.highest[is_finite])[::-1]
+        self._leads = series.leads(self._thresholds)
+        self._threshold_index = np.searchsorted(-self._thresholds, -self.highest, side="left")
+        self._alarmed_frames = np.empty((recording_count, len(self._thresholds)), dtype=np.int64)
+        for row, scores in enumerate(np.sort(self._scores, axis=1)):
+            lower_counts = np.searchsorted(scores, self._thresholds)
+            self._alarmed_frames[row] = column_count - lower_counts
 
     def __repr__(self) -> str:
         return f"CleanScores({self.series!r})"
 
-    def average_precision(self, weight: FloatArray) -> float:
-        """Return Σ (R_k − R_{k−1}) P_k over the recordings' highest scores, from the highest on.
+    def average_precision(self, weights: FloatArray) -> float:
+        """Return the AP: the sum of (R_k − R_{k−1}) P_k over the descending highest scores.
 
-        Recall that no threshold reaches adds nothing; NaN without an accident.
+        Recall that no threshold reaches adds nothing. The AP is NaN if there is no accident.
+
+        Args:
+            weights: (N,), one per recording.
         """
-        accidents = self._accidents(weight)
+        accidents = self._accidents(weights)
         if not accidents:
             return math.nan
-        true, false = self._raised(weight)
+        true, false = self._true_and_false(weights)
         recall_steps = np.diff(true, prepend=0.0) / accidents
-        return math.fsum((recall_steps * shares(true, true + false)).tolist())
+        precision = shares(true, true + false)
+        return math.fsum((recall_steps * precision).tolist())
 
-    def area_under_curve(self, weight: FloatArray) -> float:
+    def area_under_curve(self, weights: FloatArray) -> float:
         """Return the probability that an accident's highest score exceeds another recording's.
 
-        Ties count half; NaN without both kinds of recordings.
-        """
-        return roc_area(self._ranks, self.series.positive, weight)
+        Ties count half. The result is NaN unless there are recordings with and without an accident.
 
-    def area_at_moments(self, weight: FloatArray) -> float:
-        """Return the probability that an accident's score exceeds another's at one moment.
-
-        Both scores are taken at the same time before the end; ties count half. The mean is over the
-        moments of the last seconds at which there are both kinds; NaN without any.
+        Args:
+            weights: (N,), one per recording.
         """
-        areas = [roc_area(ranks, self.series.positive, weight) for ranks in self._moments]
+        return roc_area(self._ranks, self.series.positive, weights)
+
+    def area_at_moments(self, weights: FloatArray) -> float:
+        """Return the probability that an accident's score exceeds another recording's score.
+
+        Both scores are taken at the same time before the end; ties count half. The probability is
+        averaged over the time steps of the last 3 s that have recordings of both kinds. It is NaN
+        if there are none.
+
+        Args:
+            weights: (N,), one per recording.
+        """
+        positive = self.series.positive
+        areas = [roc_area(ranks, positive, weights) for ranks in self._ranks_by_moment]
         known_areas = [area for area in areas if not math.isnan(area)]
         if not known_areas:
             return math.nan
         return math.fsum(known_areas) / len(known_areas)
 
-    def mean_time(self, weight: FloatArray) -> float:
-        """Return the mTTA over the curve, seconds: Σ (R_k − R_{k−1}) · T_k.
+    def mean_time(self, weights: FloatArray) -> float:
+        """Return the mTTA over the recall curve, seconds: the sum of (R_k − R_{k−1}) · T_k.
 
-        T_k is the mean lead of the warned recordings at the highest threshold that reaches R_k.
+        T_k is the mean lead time of the recordings with an alarm at the highest threshold that
+        reaches R_k.
+
+        Args:
+            weights: (N,), one per recording.
         """
-        accidents = self._accidents(weight)
+        accidents = self._accidents(weights)
         if not accidents:
             return math.nan
-        true, _ = self._raised(weight)
+        true, _ = self._true_and_false(weights)
         recall_steps = np.diff(true, prepend=0.0) / accidents
         positive = self.series.positive
         leads = np.where(np.isfinite(self._leads), self._leads, 0.0)
-        seconds = leads[positive] * weight[positive, None]
-        return math.fsum((recall_steps * shares(seconds.sum(axis=0), true)).tolist())
+        seconds = leads[positive] * weights[positive, None]
+        mean_leads = shares(seconds.sum(axis=0), true)
+        return math.fsum((recall_steps * mean_leads).tolist())
 
-    def threshold_of_highest_recall(self, weight: FloatArray) -> float:
-        """Return the highest threshold with the highest recall; infinite without a right alarm."""
-        recalls = self._recalls(weight)
-        return float(self._levels[np.argmax(recalls)]) if recalls.any() else math.inf
+    def threshold_of_highest_recall(self, weights: FloatArray) -> float:
+        """Return the highest threshold with the highest recall; inf if no alarm is correct."""
+        recalls = self._recalls(weights)
+        if not recalls.any():
+            return math.inf
+        return float(self._thresholds[np.argmax(recalls)])
 
-    def threshold_of_recall(self, weight: FloatArray, recall: float = SAME_RECALL) -> float:
-        """Return the highest threshold with at least a recall; NaN if none has it."""
+    def threshold_of_recall(self, weights: FloatArray, recall: float = SAME_RECALL) -> float:
+        """Return the highest threshold that reaches `recall`; NaN if none does."""
         lowest_recall = recall - _ROUNDING_TOLERANCE
-        reached = np.flatnonzero(self._recalls(weight) >= lowest_recall)
-        return float(self._levels[reached[0]]) if len(reached) else math.nan
+        is_reached = self._recalls(weights) >= lowest_recall
+        reached = np.flatnonzero(is_reached)
+        if not len(reached):
+            return math.nan
+        return float(self._thresholds[reached[0]])
 
-    def threshold_of_precision(self, weight: FloatArray, precision: float = SAME_RECALL) -> float:
-        """Return the threshold of the highest recall with at least a precision.
+    def threshold_of_precision(self, weights: FloatArray, precision: float = SAME_RECALL) -> float:
+        """Return the threshold with the highest recall among the ones that reach a precision.
 
-        The highest of several; NaN if no threshold has the precision.
+        If several have the same recall, return the highest; if none reaches the precision, NaN.
         """
-        true, false = self._raised(weight)
+        true, false = self._true_and_false(weights)
         alarms = true + false
         is_precise = shares(true, alarms) >= precision - _ROUNDING_TOLERANCE
         precise = np.flatnonzero(is_precise & (alarms > 0))
         if not len(precise):
             return math.nan
-        return float(self._levels[precise[np.argmax(true[precise])]])
+        best_row = precise[np.argmax(true[precise])]
+        return float(self._thresholds[best_row])
 
-    def threshold_of_best_f1(self, weight: FloatArray) -> float:
-        """Return the highest threshold of the best F1 over recordings; NaN without an accident."""
-        true, false = self._raised(weight)
+    def threshold_of_best_f1(self, weights: FloatArray) -> float:
+        """Return the highest threshold with the best F1; NaN if no recording has an accident."""
+        true, false = self._true_and_false(weights)
         if not true.any():
             return math.nan
-        total = true + false + self._accidents(weight)
-        return float(self._levels[np.argmax(2 * true / total)])
+        f1 = 2 * true / (true + false + self._accidents(weights))
+        return float(self._thresholds[np.argmax(f1)])
 
-    def threshold_of_alarm_time(self, weight: FloatArray, seconds_per_minute: float = 1.0) -> float:
-        """Return the lowest threshold with at most a time in alarm without a coming accident.
+    def threshold_of_alarm_time(
+        self, weights: FloatArray, seconds_per_minute: float = 1.0
+    ) -> float:
+        """Return the lowest threshold at which frames without a coming accident are quiet.
 
-        NaN if no threshold is that quiet.
+        Return NaN if no threshold is quiet.
+
+        Args:
+            weights: (N,), one per recording.
+            seconds_per_minute: Longest time in alarm per minute that still counts as quiet.
         """
         is_other = ~self.series.positive
-        frames = float((self._frames[is_other] * weight[is_other]).sum())
+        other_weights = weights[is_other]
+        frames = float((self._frame_counts[is_other] * other_weights).sum())
         if not frames:
             return math.nan
-        alarmed = (self._alarmed[is_other] * weight[is_other, None]).sum(axis=0)
-        # levels of recordings that count
-        is_level = np.diff(sum(self._raised(weight)), prepend=0.0) > 0
-        is_quiet = alarmed * MINUTE <= seconds_per_minute * frames + _ROUNDING_TOLERANCE
-        quiet = np.flatnonzero(is_quiet & is_level)
-        return float(self._levels[quiet[-1]]) if len(quiet) else math.nan
+        alarmed_frames = (self._alarmed_frames[is_other] * other_weights[:, None]).sum(axis=0)
+        is_quiet = alarmed_frames * MINUTE <= seconds_per_minute * frames + _ROUNDING_TOLERANCE
+        true, false = self._true_and_false(weights)
+        has_weight = np.diff(true + false, prepend=0.0) > 0
+        quiet = np.flatnonzero(is_quiet & has_weight)
+        if not len(quiet):
+            return math.nan
+        return float(self._thresholds[quiet[-1]])
 
-    def at(self, threshold: float, weight: FloatArray) -> OperatingPoint:
-        """Return the figures at a threshold; all NaN at NaN."""
+    def at(self, threshold: float, weights: FloatArray) -> OperatingPoint:
+        """Compute the figures at a threshold; all are NaN if the threshold is NaN."""
         if math.isnan(threshold):
             return OperatingPoint(**dict.fromkeys(OperatingPoint.__slots__, math.nan))
         series = self.series
-        positive = self.series.positive
+        positive = series.positive
         leads = series.leads(np.array([threshold]))[:, 0]
         warned = np.isfinite(leads)
-        hits = float(weight[positive & warned].sum())
-        accidents = self._accidents(weight)
-        lead_times = np.where(warned, leads, 0.0) * weight
+        hits = float(weights[positive & warned].sum())
+        accidents = self._accidents(weights)
+        lead_times = np.where(warned, leads, 0.0) * weights
         seconds = math.fsum(lead_times[positive].tolist())
-        false = float(weight[~positive & warned].sum())
-        misled = float(weight[positive & ~warned & (self._any_alarm >= threshold)].sum())
-        in_alarm = (self._scores >= threshold)[~positive]
-        begun = in_alarm & ~(self._lasting >= threshold)[~positive]
-        other_weight = weight[~positive]
-        frames = float((self._frames[~positive] * other_weight).sum())
-        alarmed_frames = float((in_alarm.sum(axis=1) * other_weight).sum())
-        time_in_alarm = ratio(alarmed_frames, frames)
-        episodes = float((begun.sum(axis=1) * other_weight).sum())
-        early = self._early & (self._scores >= threshold)
-        early_frames = float((self._early.sum(axis=1) * weight).sum())
+        false = float(weights[~positive & warned].sum())
+        has_alarm = self._highest_of_all_alarms >= threshold
+        misled = float(weights[positive & ~warned & has_alarm].sum())
+        is_alarmed = self._scores >= threshold
+        other_alarms = is_alarmed[~positive]
+        begins_alarm = other_alarms & ~(self._continued_scores[~positive] >= threshold)
+        other_weights = weights[~positive]
+        other_frames = float((self._frame_counts[~positive] * other_weights).sum())
+        alarmed_frames = float((other_alarms.sum(axis=1) * other_weights).sum())
+        time_in_alarm = ratio(alarmed_frames, other_frames)
+        episodes = float((begins_alarm.sum(axis=1) * other_weights).sum())
+        early_alarms = (self._is_early & is_alarmed).sum(axis=1)
+        early_frames = self._is_early.sum(axis=1)
         return OperatingPoint(
             threshold=threshold,
             recall=ratio(hits, accidents),
@@ -223,86 +263,97 @@ class CleanScores:
             tta0=ratio(seconds, accidents),
             time_in_alarm=time_in_alarm,
             alarm_seconds_per_minute=time_in_alarm * MINUTE,
-            episodes_per_minute=ratio(episodes, frames / series.fps / MINUTE),
+            episodes_per_minute=ratio(episodes, other_frames / series.fps / MINUTE),
             false_recordings=false,
-            early_share=ratio(float((early.sum(axis=1) * weight).sum()), early_frames),
+            early_share=ratio(
+                float((early_alarms * weights).sum()), float((early_frames * weights).sum())
+            ),
         )
 
-    def tta0_after(self, threshold: float, weight: FloatArray, latency: float) -> float:
-        """Return `OperatingPoint.tta0` with a latency taken off each lead, seconds; NaN at NaN.
+    def tta0_after(self, threshold: float, weights: FloatArray, latency: float) -> float:
+        """Return `OperatingPoint.tta0` after a latency is subtracted from each lead time, seconds.
 
-        No lead falls below 0.
+        Lead times do not fall below 0. The result is NaN if the threshold is NaN.
+
+        Args:
+            threshold: Lowest score that raises an alarm.
+            weights: (N,), one per recording.
+            latency: Seconds between the alarm and its receipt.
         """
         if math.isnan(threshold):
             return math.nan
         leads = self.series.leads(np.array([threshold]))[:, 0] - latency
-        seconds = np.where(np.isfinite(leads), np.maximum(leads, 0.0), 0.0) * weight
-        accident_seconds = seconds[self.series.positive]
-        return ratio(math.fsum(accident_seconds.tolist()), self._accidents(weight))
+        remaining_leads = np.where(np.isfinite(leads), np.maximum(leads, 0.0), 0.0)
+        seconds = (remaining_leads * weights)[self.series.positive]
+        return ratio(math.fsum(seconds.tolist()), self._accidents(weights))
 
-    def _accidents(self, weight: FloatArray) -> float:
-        """Return the summed weight of the accident recordings."""
-        return float(weight[self.series.positive].sum())
+    def _accidents(self, weights: FloatArray) -> float:
+        """Sum the weights of the accident recordings."""
+        accident_weights = weights[self.series.positive]
+        return float(accident_weights.sum())
 
-    def _raised(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the weights of accidents and of others that reach each level, (K,) each."""
+    def _true_and_false(self, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sum the weights of accidents, and of others, that reach each threshold: (K,) each."""
         has_score = np.isfinite(self.highest)
         positive = self.series.positive
-        return (
-            self._reaching(has_score & positive, weight),
-            self._reaching(has_score & ~positive, weight),
-        )
+        true = self._reaching_weight(has_score & positive, weights)
+        false = self._reaching_weight(has_score & ~positive, weights)
+        return true, false
 
-    def _reaching(self, recordings: BoolArray, weight: FloatArray) -> FloatArray:
-        """Return the weight of recordings with a score that reaches each level, shape (K,).
+    def _reaching_weight(self, mask: BoolArray, weights: FloatArray) -> FloatArray:
+        """Sum the weights of the masked recordings that reach each threshold, shape (K,).
 
         Args:
-            recordings: (N,) mask of the recordings.
-            weight: (N,) weights.
+            mask: (N,), True for recordings to include.
+            weights: (N,), one per recording.
         """
-        index = self._level_index[recordings]
-        by_level = np.bincount(index, weight[recordings], len(self._levels))
-        return np.cumsum(by_level.astype(np.float64))
+        index = self._threshold_index[mask]
+        weight_by_threshold = np.bincount(index, weights[mask], len(self._thresholds))
+        return np.cumsum(weight_by_threshold.astype(np.float64))
 
-    def _recalls(self, weight: FloatArray) -> FloatArray:
-        """Return the recall at each level, shape (K,); 0 without accidents."""
-        true, _ = self._raised(weight)
-        accidents = self._accidents(weight)
-        return true / accidents if accidents else np.zeros(len(true))
+    def _recalls(self, weights: FloatArray) -> FloatArray:
+        """Return the recall at each threshold, shape (K,); 0 if there are no accidents."""
+        true, _ = self._true_and_false(weights)
+        accidents = self._accidents(weights)
+        if not accidents:
+            return np.zeros(len(true))
+        return true / accidents
 
 
 def _ranks(scores: FloatArray) -> IntArray:
-    """Return the ranks of scores, shape (N,), equal for equal scores; −1 for NaN."""
-    known = ~np.isnan(scores)
+    """Rank scores, shape (N,), in ascending order; equal scores share a rank, and NaN gets −1."""
+    is_known = ~np.isnan(scores)
     ranks = np.full(len(scores), -1, dtype=np.int64)
-    ranks[known] = np.unique(scores[known], return_inverse=True)[1].reshape(-1)
+    _, known_ranks = np.unique(scores[is_known], return_inverse=True)
+    ranks[is_known] = known_ranks.reshape(-1)
     return ranks
 
 
-def roc_area(ranks: IntArray, positive: BoolArray, weight: FloatArray) -> float:
-    """Return the area under the ROC curve of weighted scores (AUC), ties half.
+def roc_area(ranks: IntArray, positive: BoolArray, weights: FloatArray) -> float:
+    """Return the area under the ROC curve (AUC) of weighted scores; ties count half.
 
-    Equals the probability that a positive score exceeds a negative one.
+    It is the probability that a positive score exceeds a negative one.
 
     >>> import numpy as np
     >>> roc_area(np.array([0, 1, 1]), np.array([False, True, False]), np.ones(3))
     0.75
 
     Args:
-        ranks: (N,) ranks of the scores, −1 for no score.
-        positive: (N,) whether each is of the positive kind.
-        weight: (N,) weights.
+        ranks: (N,) ranks of the scores; −1 for a missing score.
+        positive: (N,) bool, True for scores of the positive class.
+        weights: (N,) weights of the scores.
 
     Returns:
-        A share in [0, 1]; NaN without both kinds.
+        The AUC in [0, 1]; NaN unless both classes have scores.
     """
     has_score = ranks >= 0
     rank_count = int(ranks.max(initial=0)) + 1
     positives = has_score & positive
     negatives = has_score & ~positive
-    true = np.bincount(ranks[positives], weight[positives], rank_count)
-    false = np.bincount(ranks[negatives], weight[negatives], rank_count)
+    true = np.bincount(ranks[positives], weights[positives], rank_count)
+    false = np.bincount(ranks[negatives], weights[negatives], rank_count)
     pairs = true.sum() * false.sum()
     if not pairs:
         return math.nan
-    return float((true * (np.cumsum(false) - false / 2)).sum() / pairs)
+    exceeded_negatives = np.cumsum(false) - false / 2
+    return float((true * exceeded_negatives).sum() / pairs)

@@ -1,6 +1,4 @@
-"""`WarningEvaluator`: how early an accident is warned of, and how often an alarm is false."""
-
-from __future__ import annotations
+"""`WarningEvaluator`: how early alarms precede an accident, and how often they are false."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -12,7 +10,7 @@ from deepaccident_devkit.evaluation.predictions import Prediction
 from deepaccident_devkit.evaluation.truth import AccidentContext, checked_facts, compared_facts
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.field import FieldResult, FieldWarnings
-from deepaccident_devkit.evaluation.warning.recordings import PART, parts_of, sample_counts
+from deepaccident_devkit.evaluation.warning.recordings import PART, sample_counts, split_counts
 from deepaccident_devkit.evaluation.warning.result import WarningResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import IntArray
@@ -22,17 +20,18 @@ _Result = AnticipationResult | FieldResult
 WARNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType(
     {"clean": CleanWarnings(), "field": FieldWarnings()}
 )
-"""`clean` ranks predictors, recording by recording; `field` is what published codes print. Both
-compare with labels as the accident protocol `boxes` does; the paper has no such metrics."""
+"""`clean` ranks predictors by recording; `field` reproduces what public implementations print. Both
+compare alarms with the labels, as the accident protocol `boxes` does; the paper does not define
+metrics of warnings."""
 
 
 class WarningEvaluator(Evaluator[Any]):
-    """Whether an alarm foresees accidents, how early it comes, and how long it is false.
+    """Evaluator of alarms: do they foresee accidents, how early, and how long are they false?
 
-    Give it whole recordings, normal scenarios among them: the metrics ignore moments without a
+    Pass whole recordings, including ones of normal scenarios: the metrics ignore times without a
     sample.
 
-    `compute` returns an `AnticipationResult` or a `FieldResult`, by the protocol.
+    `compute` returns an `AnticipationResult` or a `FieldResult`, depending on the protocol.
 
     >>> evaluator = WarningEvaluator()
     >>> evaluator.compute().samples
@@ -55,7 +54,7 @@ class WarningEvaluator(Evaluator[Any]):
     def truth(
         self, dataset: Dataset, token: str, form: Any, horizon: float, /
     ) -> tuple[MotionLabels | None, AccidentContext]:
-        """Return the labels that maps are compared with, None for alarms, and the context."""
+        """Return the labels that maps are compared with (None for alarms) and the context."""
         return compared_facts(dataset, token, self.protocol, form, horizon, references=True)
 
     def update(
@@ -71,33 +70,36 @@ class WarningEvaluator(Evaluator[Any]):
             token: Token of the sample, which names scenario, agent and frame.
             prediction: Prediction of a model: motion in maps, which is at most one alarm, or a list
                 of alarms.
-            label: Labels that define how far apart in time the maps of a prediction are, and where
-                instances lie within their cells; None for the released convention. Alarms need
-                none.
-            context: Truth from `accident_context(dataset, sample, horizon, references=True)`; up to
-                its horizon actors can be named, and later alarms do not count.
+            label: Labels that define the time between the maps of a prediction, and where
+                instances lie within their cells; None for the released convention. Lists of alarms
+                do not need it.
+            context: Truth from `accident_context(dataset, sample, horizon, references=True)`.
+                Actors can be named up to its horizon; alarms beyond it do not count.
 
         Raises:
-            EvaluationError: the token is no sample's, the context or something in it is missing,
-                the prediction is neither motion nor alarms, or the sample came before with other
-                counts.
+            EvaluationError: If the token is not a sample token, the context or something in it is
+                missing, the prediction is neither motion nor alarms, or the sample was counted
+                before with other counts.
         """
         checked_facts(label, context)
         self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
 
     def result_of(self, counts: Collection[Counts]) -> _Result:
-        """Return the metrics of some samples' counts, in any order, also of `pooled` counts."""
+        """Compute the metrics from the counts of samples, in any order; they can be `pooled`."""
         return self.protocol.result(counts)
 
     def compute(self, tokens: Iterable[str] | None = None) -> _Result:
-        """Return the metrics of all samples with reference predictors, or of some without."""
+        """Compute the metrics of some samples, or of all samples and the reference predictors.
+
+        If `tokens` is None, all samples and the reference predictors are evaluated.
+        """
         if tokens is None:
-            return self.protocol.result(list(self._counts.values()), references=True)
+            return self.protocol.result(self._counts.values(), references=True)
         result: _Result = super().compute(tokens)
         return result
 
     def sample_row(self, token: str) -> dict[str, Any]:
-        """Return the plain values of the sample's counts, and the lengths of its lists."""
+        """Return the sample's counts; lists are replaced by their lengths."""
         row: dict[str, Any] = {}
         for name, value in self._counts[token].items():
             if isinstance(value, list | tuple | Mapping):
@@ -107,11 +109,12 @@ class WarningEvaluator(Evaluator[Any]):
         return row
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
-        """Return counts with the same result; their recordings are never joined with others.
+        """Return the counts as a single group that leads to the same result.
 
-        So a scenario that is drawn twice counts twice.
+        Recordings of different groups are never joined, so a scenario that is drawn twice counts
+        twice.
         """
-        samples = [sample for part in parts_of(counts) for sample in part]
+        samples = [sample for part in split_counts(counts) for sample in part]
         return [{PART: samples}]
 
     def resampled(self, parts: Sequence[Sequence[Counts]], times: IntArray) -> Iterator[Any]:
@@ -122,5 +125,5 @@ class WarningEvaluator(Evaluator[Any]):
 
     @property
     def has_intervals(self) -> bool:
-        """Whether the protocol has intervals; `field` has none, since its numbers take long."""
+        """Whether the protocol has intervals; `field` has none, since its numbers are slow."""
         return not isinstance(self.protocol, FieldWarnings)

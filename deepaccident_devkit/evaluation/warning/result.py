@@ -1,6 +1,4 @@
-"""`WarningResult`: the numbers of both protocols of warnings."""
-
-from __future__ import annotations
+"""`WarningResult`: the base of the results of both warning protocols."""
 
 from typing import ClassVar
 
@@ -8,7 +6,7 @@ from deepaccident_devkit.evaluation.task import Row, TaskResult
 
 
 class WarningResult(TaskResult):
-    """Base of the results of warnings: the rows of both protocols."""
+    """Base of the results of the task `warning`; it defines the rows of both protocols."""
 
     __slots__ = ()
 

@@ -8,13 +8,41 @@ It needs the extra `mcap`.
     da = DeepAccident(dataroot="data/DeepAccident")
     export_mcap(da, da.scenario[0], "accident.mcap")
 
-docs/pictures.md lists the topics and describes how to view them. Only this package imports mcap,
-and only when `export_mcap` is called.
+docs/pictures.md describes how to view the file. Only this package imports mcap, and only when
+`export_mcap` is called.
+
+Messages have Foxglove's protobuf schemas, and chunks are compressed with zstd. The topics, each
+with its message:
+
+- `/tf` (FrameTransforms): world → agent → its sensors.
+- `/<agent>/pose` (PoseInFrame): the agent's ego frame in world.
+- `/<agent>/<camera>/image` (CompressedImage): the unchanged bytes of the JPEG file.
+- `/<agent>/<camera>/calibration` (CameraCalibration): K for the size of that image, without
+  distortion.
+- `/<agent>/lidar01/points` (PointCloud): x, y, z and intensity in the LiDAR frame.
+- `/actors` (SceneUpdate): each annotated actor once, in world.
+- `/actors/points` (PointCloud): the same actors as outlines, fronts and trails.
+- `/<agent>/annotations` (SceneUpdate): the agent's own boxes, in its colour.
+- `/<agent>/motion_labels/points` (PointCloud): one point per cell and frame, only with
+  `motion_labels`.
+- `/<agent>/prediction/…` (as the labels): `motion/points`, `accidents` and `boxes`, only with a
+  prediction.
+- `/road/points` (PointCloud): the ground in world, from the agents' BEV cameras; sent once.
+- `/<agent>/speed` (DoubleValue): the speed in m/s, for plots.
+- `/time_to_impact` (DoubleValue): seconds, only if meta names a collision.
+- `/log` (Log): facts about the scenario, the countdown and the impact.
+
+rerun (0.41) cannot show SceneUpdate messages, so actors and predictions also exist as point clouds,
+on topics that end in `/points`. In Foxglove, show only one of the two.
+
+The coordinate frames are `world`, `<agent>` (its ego frame), `<agent>/lidar01` and
+`<agent>/<camera>`. Recordings have no date, so frame 1 is set to 2024-01-01 00:00:00 UTC; frames
+follow at 10 Hz. Motion labels, true or predicted, are in the agent's ego frame at that moment, with
+each future frame 0.2 m above the one before, and paler.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -26,7 +54,7 @@ from deepaccident_devkit.evaluation.results import Prediction, Results
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.motion.config import resolved_label_config
 from deepaccident_devkit.support.arrays import checked_whole
-from deepaccident_devkit.support.text import choices, path_of, possible_text
+from deepaccident_devkit.support.text import PathType, choices, path_of, possible_text
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
 from deepaccident_devkit.v2x import Agents
 
@@ -36,7 +64,7 @@ EPOCH: Final = 1_704_067_200
 """Unix seconds of each scenario's first frame (2024-01-01 UTC), since viewers need a date."""
 EXPORTED_CHANNELS: Final = (*CAMERAS, LIDAR)
 # Modules of the extra `mcap`.
-_EXTRA_MODULES: Final = ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google")
+_EXTRA_MODULES = ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf", "google")
 Predictions = Results | Mapping[str, Prediction]
 """Predictions by sample token."""
 
@@ -44,7 +72,7 @@ Predictions = Results | Mapping[str, Prediction]
 def export_mcap(
     dataset: Dataset,
     scenario: RowArgument,
-    path: str | os.PathLike[str],
+    path: PathType,
     *,
     prediction: Predictions | None = None,
     progress: bool = False,
@@ -52,39 +80,39 @@ def export_mcap(
 ) -> Path:
     """Write a scenario into an MCAP file, with all agents on one timeline.
 
-    The file has poses, images, point clouds, boxes and labels. Messages are Foxglove's, as
-    protobuf. Images have the bytes of their files; LiDAR coordinates are rounded to 1/32 m and
-    intensities to 1/32, so that they compress. The same release and choices give the same bytes,
-    with the same versions of the libraries. The file is written completely or not at all, and after
-    it, beside it, a layout for Foxglove (`.foxglove.json`) and a script that opens it in rerun with
-    a blueprint (`.rerun.py`).
+    The file contains poses, images, point clouds, boxes and labels, as Foxglove's protobuf
+    messages. Image files are copied byte for byte. LiDAR coordinates are rounded to 1/32 m and
+    intensities to 1/32, so that they compress well. With the same library versions, the same
+    release and choices give the same bytes. The file is written completely or not at all. Two more
+    files are then written next to it: a layout for Foxglove (`.foxglove.json`), and a script that
+    opens the file in rerun with a blueprint (`.rerun.py`).
 
     Args:
         dataset: The release.
-        scenario: Token or record.
+        scenario: Token or record of the scenario.
         path: Path of the file; an existing file is replaced.
-        prediction: Results, or a mapping from sample token to prediction; rendered in addition to
-            the labels.
+        prediction: Results, or a mapping from sample token to prediction, which are rendered in
+            addition to the labels.
         progress: Whether to show a progress bar.
-        **choices: The fields of `McapConfig`: `agents`, `channels`, `frames`, `points`,
+        **choices: Fields of `McapConfig`: `agents`, `channels`, `frames`, `points`,
             `motion_labels`.
 
     Returns:
         The path.
 
     Raises:
-        MissingExtraError: the extra `mcap` is not installed.
-        TokenError: no such scenario.
-        ChoiceError: no such choice, agent, channel or frame, or the path is a folder.
-        NotAvailableError: an agent is not in this (partial) release, or no sample in the file has a
-            prediction.
-        SensorFileError: a sensor file cannot be read.
+        MissingExtraError: If the extra `mcap` is not installed.
+        TokenError: If there is no such scenario.
+        ChoiceError: If there is no such choice, agent, channel or frame, or the path is a folder.
+        NotAvailableError: If an agent is not in this (partial) release, or no sample in the file
+            has a prediction.
+        SensorFileError: If a sensor file cannot be read.
     """
     config = McapConfig.of(**choices)
     target = path_of(path)
     if target.is_dir():
         raise ChoiceError(
-            f"path: expected a file, such as {target / 'accident.mcap'}, found the folder {target}"
+            f"{target}: is a folder; name a file in it, such as {target / 'accident.mcap'}"
         )
     try:
         from deepaccident_devkit.export.mcap.scenario import write_scenario
@@ -93,7 +121,7 @@ def export_mcap(
         if package not in _EXTRA_MODULES:
             raise
         raise MissingExtraError(
-            f"the MCAP export needs {error.name}: in a checkout, pip install '.[mcap]'"
+            f"the MCAP export needs {error.name}; run pip install '.[mcap]' in a checkout"
         ) from error
     return write_scenario(
         dataset, scenario, target, config, prediction=prediction, progress=progress
@@ -102,7 +130,7 @@ def export_mcap(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class McapConfig:
-    """Parts of a scenario in the file; checked on creation.
+    """Selection of what an MCAP file contains; checked on creation.
 
     Attributes:
         agents: Agents to export: their names, a configuration as seen from the ego vehicle, or None
@@ -111,7 +139,7 @@ class McapConfig:
         frames: Numbers of frames, from 1; None for all.
         points: n for every n-th point of a cloud; 1 for all.
         motion_labels: Configuration of motion labels, or the name of a preset (`motion.PRESETS`);
-            None for none.
+            None to leave them out.
     """
 
     agents: Agents = None
@@ -121,19 +149,20 @@ class McapConfig:
     motion_labels: MotionLabelConfig | str | None = None
 
     def __post_init__(self) -> None:
-        """Check the fields; raises ChoiceError."""
-        object.__setattr__(self, "channels", _channel_names(self.channels))
-        object.__setattr__(self, "frames", _frame_numbers(self.frames))
+        """Check the fields; raise ChoiceError if one is impossible."""
+        object.__setattr__(self, "channels", _check_channels(self.channels))
+        object.__setattr__(self, "frames", _check_frames(self.frames))
         if checked_whole("points", self.points, "n for every n-th point", ChoiceError) < 1:
             raise ChoiceError(
-                f"points: expected a number from 1, for every n-th point, found {self.points!r}"
+                "points: expected a number n from 1, to keep every n-th point, found "
+                f"{self.points!r}"
             )
         if self.motion_labels is not None:
             object.__setattr__(self, "motion_labels", resolved_label_config(self.motion_labels))
 
     @classmethod
     def of(cls, **choices: Any) -> McapConfig:
-        """Return a configuration with these fields; raises ChoiceError."""
+        """Make a configuration with these fields; raise ChoiceError if one is impossible."""
         names = [field.name for field in fields(cls)]
         for name in choices:
             if name not in names:
@@ -143,9 +172,9 @@ class McapConfig:
         return cls(**choices)
 
     def frame_numbers(self, last: int) -> tuple[int, ...]:
-        """Return the selected frames of a scenario with `last` frames, ascending.
+        """Return the selected frames of a scenario with `last` frames, in ascending order.
 
-        Raises ChoiceError if a frame does not exist.
+        Raises ChoiceError if a selected frame does not exist.
         """
         if self.frames is None:
             return tuple(range(1, last + 1))
@@ -156,16 +185,22 @@ class McapConfig:
         return numbers
 
 
-def _channel_names(channels: object) -> tuple[str, ...]:
-    """Return names of channels in the order of `EXPORTED_CHANNELS`; raises ChoiceError."""
+def _check_channels(channels: object) -> tuple[str, ...]:
+    """Return the names of channels in the order of `EXPORTED_CHANNELS`.
+
+    Raises ChoiceError if one is unknown.
+    """
     if channels is None:
         return EXPORTED_CHANNELS
     names = choices("channels", channels, EXPORTED_CHANNELS, empty=True)
     return tuple(name for name in EXPORTED_CHANNELS if name in names)
 
 
-def _frame_numbers(frames: object) -> tuple[int, ...] | None:
-    """Return frame numbers, each once, ascending; None for all; raises ChoiceError."""
+def _check_frames(frames: object) -> tuple[int, ...] | None:
+    """Return frame numbers, each once, in ascending order; None for all.
+
+    Raises ChoiceError if they are not whole numbers from 1, or there are none.
+    """
     if frames is None:
         return None
     if isinstance(frames, str) or not isinstance(frames, Iterable):

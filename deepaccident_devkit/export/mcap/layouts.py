@@ -1,6 +1,4 @@
-"""Initial views of a file: a layout for Foxglove, and a script for rerun with a blueprint."""
-
-from __future__ import annotations
+"""Initial views of an MCAP file: a layout for Foxglove, and a script with a blueprint for rerun."""
 
 import json
 from collections.abc import Sequence
@@ -49,43 +47,34 @@ if __name__ == "__main__":
 
 
 def write_layouts(path: Path, topics: Sequence[str]) -> None:
-    """Write the layouts beside an MCAP file with these topics.
+    """Write the layouts next to an MCAP file that has these topics.
 
-    They have the suffixes `.foxglove.json` and `.rerun.py`, which replace its own. They show the
+    Their suffixes `.foxglove.json` and `.rerun.py` replace the suffix of the file. They show the
     road, clouds and actors, the front cameras, and the speeds and the time to the impact as curves.
     """
     clouds = [topic for topic in topics if topic.endswith(f"/{LIDAR}/points")]
     cameras = [topic for topic in topics if topic.endswith("/Camera_Front/image")][:2]
     values = [topic for topic in topics if topic.endswith("/speed") or topic == "/time_to_impact"]
+    scene_topics: dict[str, Any] = {
+        "/road/points": {"visible": True, "colorMode": "rgba-fields", "pointSize": 4},
+        "/actors": {"visible": True},
+    }
+    for topic in clouds:
+        scene_topics[topic] = {"visible": True, "colorMode": "colormap", "colorField": "z"}
+    paths = [{"value": f"{topic}.value", "enabled": True} for topic in values]
     panels: dict[str, Any] = {
-        "3D!scene": {
-            "followMode": "follow-none",
-            "followTf": "world",
-            "topics": {
-                "/road/points": {"visible": True, "colorMode": "rgba-fields", "pointSize": 4},
-                "/actors": {"visible": True},
-                **{
-                    topic: {"visible": True, "colorMode": "colormap", "colorField": "z"}
-                    for topic in clouds
-                },
-            },
-        },
-        "Plot!values": {
-            "paths": [{"value": f"{topic}.value", "enabled": True} for topic in values]
-        },
+        "3D!scene": {"followMode": "follow-none", "followTf": "world", "topics": scene_topics},
+        "Plot!values": {"paths": paths},
     }
     side: Any = "Plot!values"
     for number, topic in enumerate(cameras):
-        panels[f"Image!{number}"] = {
-            "imageMode": {
-                "imageTopic": topic,
-                "calibrationTopic": topic.replace("/image", "/calibration"),
-            }
-        }
-        side = {"direction": "column", "first": f"Image!{number}", "second": side}
+        panel = f"Image!{number}"
+        calibration = topic.replace("/image", "/calibration")
+        panels[panel] = {"imageMode": {"imageTopic": topic, "calibrationTopic": calibration}}
+        side = {"direction": "column", "first": panel, "second": side}
     layout = {"direction": "row", "first": "3D!scene", "second": side, "splitPercentage": 60}
     foxglove = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": layout}
     write_bytes(path.with_suffix(".foxglove.json"), json.dumps(foxglove, indent=1).encode())
     scene = ["/road/points", "/actors/points", "/tf", *clouds]
-    text = _RERUN_TEMPLATE.format(file=path.name, scene=scene, cameras=cameras, values=values)
-    write_bytes(path.with_suffix(".rerun.py"), text.encode())
+    script = _RERUN_TEMPLATE.format(file=path.name, scene=scene, cameras=cameras, values=values)
+    write_bytes(path.with_suffix(".rerun.py"), script.encode())

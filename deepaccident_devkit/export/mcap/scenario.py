@@ -1,6 +1,4 @@
-"""A scenario's messages, moment by moment: log texts, poses, sensor files and actors."""
-
-from __future__ import annotations
+"""The messages of a scenario, moment by moment: log texts, poses, sensor files and actors."""
 
 import json
 from collections.abc import Callable
@@ -25,24 +23,24 @@ from deepaccident_devkit.export.mcap.messages import (
     McapRecording,
     Moment,
     Roles,
-    box_segments,
-    cloud_message,
-    colored_points,
-    cube,
-    entity,
-    exported_agents,
-    frame_id,
+    color_points,
+    compute_box_segments,
+    compute_text_position,
     join_points,
-    label,
-    lines,
-    moment_of,
-    protobuf_timestamp,
-    scene_update,
-    segment_points,
-    strip,
-    strip_points,
-    text_position,
-    transform_message,
+    make_cloud,
+    make_cube,
+    make_entity,
+    make_label,
+    make_lines,
+    make_moment,
+    make_scene_update,
+    make_strip,
+    make_timestamp,
+    make_transform,
+    name_frame,
+    sample_segments,
+    sample_strip,
+    select_agents,
 )
 from deepaccident_devkit.export.mcap.predicted import MotionMapMessages, PredictedScenes
 from deepaccident_devkit.geometry import Boxes
@@ -72,49 +70,48 @@ from deepaccident_devkit.v2x.cooperation import visible_actors
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 METADATA: Final = "deepaccident_devkit"
-# Number of frames (0.1 s) between two lines of the countdown.
-_LOG_INTERVAL_FRAMES: Final = 5
+# Number of frames, of 0.1 s each, between two lines of the countdown.
+_LOG_INTERVAL_FRAMES = 5
 # Fields of a scenario in the log and the metadata.
-_SCENARIO_FIELDS: Final = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
+_SCENARIO_FIELDS = ("town", "weather", "time_of_day", "road_type", "split", "accident_type")
 LIDAR_POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
-# Number of steps a metre for rounded LiDAR coordinates, and of rounded intensities from 0 to 1.
-_LIDAR_STEPS, _INTENSITY_STEPS = 32, 32
+# Number of steps in a metre of rounded LiDAR coordinates, and from 0 to 1 of rounded intensities.
+_ROUNDING_STEPS = 32
 # Number of BEV camera cells between points of the road.
-_ROAD_STEP_CELLS: Final = 5
+_ROAD_STEP_CELLS = 5
 TRAIL_FRAMES: Final = 20
-"""Number of frames (2 s) that an actor's trail goes back, and its path goes ahead."""
-_PATH_ALPHA: Final = 0.5
+"""How many frames an actor's trail goes back and its path goes ahead (2 s)."""
+_PATH_ALPHA = 0.5
 
 
 def write_poses(dataset: Dataset, moment: Moment, recording: McapRecording) -> None:
-    """Write world → agent → sensors in one message, and the pose of each agent in its own."""
+    """Write the transforms world → agent → sensors, and each agent's pose in another message."""
+    frame_number = moment.frame_number
     transforms = []
     poses = {}
     for agent, sample in moment.samples.items():
-        ego_frame = frame_id(agent, "ego")
-        poses[agent] = transform_message(
-            "world", ego_frame, dataset.world_from(sample, "ego"), moment.index
-        )
+        ego_frame = name_frame(agent, "ego")
+        world_from_ego = dataset.world_from(sample, "ego")
+        poses[agent] = make_transform("world", ego_frame, world_from_ego, frame_number)
         transforms.append(poses[agent])
         for channel in EXPORTED_CHANNELS:
-            sensor_frame = frame_id(agent, channel)
+            sensor_frame = name_frame(agent, channel)
+            ego_from_sensor = dataset.ego_from(sample, channel)
             transforms.append(
-                transform_message(
-                    ego_frame, sensor_frame, dataset.ego_from(sample, channel), moment.index
-                )
+                make_transform(ego_frame, sensor_frame, ego_from_sensor, frame_number)
             )
-    recording.write("/tf", FrameTransforms(transforms=transforms), moment.index)
+    recording.write("/tf", FrameTransforms(transforms=transforms), frame_number)
     for agent, transform in poses.items():
-        message = PoseInFrame(timestamp=protobuf_timestamp(moment.index), frame_id="world")
+        message = PoseInFrame(timestamp=make_timestamp(frame_number), frame_id="world")
         message.pose.position.CopyFrom(transform.translation)
         message.pose.orientation.CopyFrom(transform.rotation)
-        recording.write(f"/{agent}/pose", message, moment.index)
+        recording.write(f"/{agent}/pose", message, frame_number)
 
 
 def write_road(dataset: Dataset, moment: Moment, recording: McapRecording) -> None:
     """Write the ground in the agents' BEV cameras at this moment as points in the world frame.
 
-    They are 0.5 m apart.
+    The points are 0.5 m apart.
     """
     parts = []
     for agent, sample in moment.samples.items():
@@ -129,10 +126,10 @@ def write_road(dataset: Dataset, moment: Moment, recording: McapRecording) -> No
             ahead, left = (middle - _ROAD_STEP_CELLS * cells) * image.resolution
             ground = np.column_stack([ahead, left, np.full(len(ahead), height)])
             in_world = dataset.world_from(sample, "ego").apply(ground)
-            parts.append(colored_points(in_world, color))
+            parts.append(color_points(in_world, color))
     if parts:
-        cloud = cloud_message(join_points(parts), "world", moment.index)
-        recording.write("/road/points", cloud, moment.index)
+        cloud = make_cloud(join_points(parts), "world", moment.frame_number)
+        recording.write("/road/points", cloud, moment.frame_number)
 
 
 def write_scenario(
@@ -144,12 +141,12 @@ def write_scenario(
     prediction: Predictions | None,
     progress: bool,
 ) -> Path:
-    """Do the work of `export_mcap`, with the same arguments and errors."""
+    """Write a scenario into an MCAP file, with the arguments and errors of `export_mcap`."""
     record = dataset.scenario[dataset.getind("scenario", scenario)]
     token = record["token"]
-    agents = exported_agents(dataset, token, config.agents)
+    agents = select_agents(dataset, token, config.agents)
     moments = [
-        moment_of(token, number, agents) for number in config.frame_numbers(record["num_frames"])
+        make_moment(token, number, agents) for number in config.frame_numbers(record["num_frames"])
     ]
     sensors = _SensorMessages(dataset, config)
     writers: list[Callable[[Moment, McapRecording], None]]
@@ -164,40 +161,45 @@ def write_scenario(
             MotionMapMessages(dataset, token, resolved_label_config(config.motion_labels)).write
         )
     if prediction is not None:
-        writers.append(_predicted_scenes(prediction, moments, token).write)
+        writers.append(_open_predictions(prediction, moments, token).write)
     with (
         replacing(path) as temporary,
         temporary.open("wb") as stream,
         McapRecording(stream) as recording,
     ):
-        recording.add_metadata(METADATA, scenario_metadata(dataset, token))
+        recording.add_metadata(METADATA, collect_metadata(dataset, token))
         write_road(dataset, moments[0], recording)
-        for moment in tqdm(moments, desc=path.name, disable=not progress, unit="frame"):
+        for moment in tqdm(
+            moments, desc=f"Writing {path.name}", disable=not progress, unit="frame"
+        ):
             for write in writers:
                 write(moment, recording)
-    sensors.tell_missing()
+    sensors.log_missing()
     write_layouts(path, recording.topics)
     return path
 
 
-def _predicted_scenes(
+def _open_predictions(
     prediction: Predictions, moments: list[Moment], scenario: str
 ) -> PredictedScenes:
-    """Return the renderer of predictions; raises NotAvailableError if no sample has one."""
+    """Return the renderings of predictions; raise NotAvailableError if no sample has one."""
     scenes = PredictedScenes(prediction)
-    samples = [sample for moment in moments for sample in moment.samples.values()]
+    samples: list[str] = []
+    for moment in moments:
+        samples += moment.samples.values()
     if not any(map(scenes.has, samples)):
         raise NotAvailableError(
-            f"prediction: has nothing of {scenario} at these agents and frames, such as "
+            f"prediction: has no prediction for {scenario} at these agents and frames, such as "
             f"{moments[0].first_sample!r}"
         )
     return scenes
 
 
-def scenario_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
-    """Return the file's metadata.
+def collect_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
+    """Return the metadata of the file.
 
-    It has the devkit's version, the scenario, and a hash of its label, meta and calib files.
+    They are the version of the devkit, the scenario and its facts, and a hash of its label, meta
+    and calib files.
     """
     record = dataset.get("scenario", scenario)
     hashes = scenario_hashes(dataset, [scenario], workers=1)
@@ -215,111 +217,120 @@ def scenario_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:
 
 
 class _StoryMessages:
-    """Writes events into a log, and, if there is an impact, a countdown to it."""
+    """Log texts about the events of a scenario and, if there is an impact, a countdown to it."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
-        """Prepare the facts of a scenario."""
+        """Read the record of a scenario."""
         self._dataset = dataset
         self._record: Any = dataset.get("scenario", scenario)
         self._has_begun = False
 
     def write(self, moment: Moment, recording: McapRecording) -> None:
-        """Write the countdown of a moment; at the first moment, the scenario's facts before it."""
+        """Write the countdown at a moment, after the scenario's facts at the first moment."""
         if not self._has_begun:
             self._has_begun = True
-            _log(self._facts(), moment.index, recording)
-        frame = self._dataset.get("frame", frame_token(moment.scenario, moment.index))
+            _write_log(self._describe_scenario(), moment.frame_number, recording)
+        frame = self._dataset.get("frame", frame_token(moment.scenario, moment.frame_number))
         seconds = frame["time_to_impact"]
         if seconds is None:
             return
-        recording.write("/time_to_impact", DoubleValue(value=seconds), moment.index)
+        recording.write("/time_to_impact", DoubleValue(value=seconds), moment.frame_number)
         if seconds == 0:
-            _log(f"impact: {self._pair()}", moment.index, recording, Log.ERROR)
+            _write_log(
+                f"impact: {self._describe_pair()}", moment.frame_number, recording, Log.ERROR
+            )
         elif round(seconds * 10) % _LOG_INTERVAL_FRAMES == 0:
-            _log(f"{seconds:.1f} s to the impact", moment.index, recording)
+            _write_log(f"{seconds:.1f} s to the impact", moment.frame_number, recording)
 
-    def _facts(self) -> str:
+    def _describe_scenario(self) -> str:
         facts = []
         for name in _SCENARIO_FIELDS:
             if self._record[name] is not None:
                 facts.append(f"{name} {self._record[name]}")
         ending = "no collision is known"
         if self._record["collision"]:
-            ending = f"ends in an accident: {self._pair()}"
+            ending = f"ends in an accident: {self._describe_pair()}"
         return f"{self._record['token']}: {', '.join(facts)}; {ending}"
 
-    def _pair(self) -> str:
+    def _describe_pair(self) -> str:
         collision = self._record["collision"]
         pair = zip(collision["classes"], collision["ids"], strict=True)
         return " and ".join(f"{category} {actor}" for category, actor in pair)
 
 
-def _log(text: str, index: int, recording: McapRecording, level: int = Log.INFO) -> None:
-    message = Log(timestamp=protobuf_timestamp(index), level=level, message=text, name=METADATA)
-    recording.write("/log", message, index)
+def _write_log(
+    text: str, frame_number: int, recording: McapRecording, level: int = Log.INFO
+) -> None:
+    message = Log(timestamp=make_timestamp(frame_number), level=level, message=text, name=METADATA)
+    recording.write("/log", message, frame_number)
 
 
 class _SensorMessages:
-    """Writes the sensor files of moments, and counts the missing ones."""
+    """Messages with the sensor files of moments; missing files are counted."""
 
     def __init__(self, dataset: Dataset, config: McapConfig) -> None:
-        """Prepare the sensor files of a release."""
+        """Store the selection of sensors and points; nothing is read yet."""
         self._dataset = dataset
         self._channels = tuple(config.channels or ())
         self._step = config.points
         self._files = MissingFiles(dataset.dataroot, "skip")
 
     def write(self, moment: Moment, recording: McapRecording) -> None:
-        """Write the files of a moment, agent by agent; raises SensorFileError."""
+        """Write a moment's files by agent; raise SensorFileError if one cannot be read."""
         for agent, sample in moment.samples.items():
             for channel in self._channels:
                 path = self._dataset.sensor_path(f"{sample}/{channel}")
                 if not self._files.has(path, channel):
                     continue
                 if channel == LIDAR:
-                    self._write_cloud(agent, sample, moment.index, recording)
+                    self._write_cloud(agent, sample, moment.frame_number, recording)
                 else:
-                    self._write_image(agent, f"{sample}/{channel}", path, moment.index, recording)
+                    self._write_image(
+                        agent, f"{sample}/{channel}", path, moment.frame_number, recording
+                    )
 
-    def tell_missing(self) -> None:
+    def log_missing(self) -> None:
         """Log how many files were left out, if any."""
         self._files.tell()
 
     def _write_image(
-        self, agent: str, token: str, path: ReleasePath, index: int, recording: McapRecording
+        self, agent: str, token: str, path: ReleasePath, frame_number: int, recording: McapRecording
     ) -> None:
         content, size = read_jpeg(path)
         channel = token.rsplit("/", 1)[1]
-        frame = frame_id(agent, channel)
-        calibration = _calibration(self._dataset, token, size, frame, index)
+        frame = name_frame(agent, channel)
+        calibration = _make_calibration(self._dataset, token, size, frame, frame_number)
         image = CompressedImage(
-            timestamp=protobuf_timestamp(index), frame_id=frame, data=content, format="jpeg"
+            timestamp=make_timestamp(frame_number), frame_id=frame, data=content, format="jpeg"
         )
-        recording.write(f"/{frame}/calibration", calibration, index)
-        recording.write(f"/{frame}/image", image, index)
+        recording.write(f"/{frame}/calibration", calibration, frame_number)
+        recording.write(f"/{frame}/image", image, frame_number)
 
-    def _write_cloud(self, agent: str, sample: str, index: int, recording: McapRecording) -> None:
+    def _write_cloud(
+        self, agent: str, sample: str, frame_number: int, recording: McapRecording
+    ) -> None:
         cloud = self._dataset.load_point_cloud(sample, "lidar")
-        xyz, intensity = cloud.xyz[:: self._step], cloud.intensity[:: self._step]
+        xyz = cloud.xyz[:: self._step]
+        intensity = cloud.intensity[:: self._step]
         points = np.zeros(len(xyz), dtype=LIDAR_POINT)
-        # values with few digits compress well: clouds are most of a file
-        rounded = (xyz * _LIDAR_STEPS).round().T / _LIDAR_STEPS
+        # Clouds are most of a file, and values with few digits compress well.
+        rounded = (xyz * _ROUNDING_STEPS).round().T / _ROUNDING_STEPS
         points["x"], points["y"], points["z"] = rounded
-        points["intensity"] = (intensity * _INTENSITY_STEPS).round() / _INTENSITY_STEPS
-        frame = frame_id(agent, "lidar")
-        recording.write(f"/{frame}/points", cloud_message(points, frame, index), index)
+        points["intensity"] = (intensity * _ROUNDING_STEPS).round() / _ROUNDING_STEPS
+        frame = name_frame(agent, "lidar")
+        recording.write(f"/{frame}/points", make_cloud(points, frame, frame_number), frame_number)
 
 
-def _calibration(
-    dataset: Dataset, token: str, size: tuple[int, int], frame: str, index: int
+def _make_calibration(
+    dataset: Dataset, token: str, size: tuple[int, int], frame: str, frame_number: int
 ) -> Any:
-    """Return a CameraCalibration for an image of `size` (width, height).
+    """Return the CameraCalibration of an image with a size of (width, height) pixels.
 
-    The image may be smaller than in the calib file.
+    The image may be smaller than the calib file states.
     """
     lens = dataset.camera(token).resized(*size)
     return CameraCalibration(
-        timestamp=protobuf_timestamp(index),
+        timestamp=make_timestamp(frame_number),
         frame_id=frame,
         width=lens.width,
         height=lens.height,
@@ -332,10 +343,10 @@ def _calibration(
 
 
 class _ActorMessages:
-    """Renders the boxes of moments."""
+    """Renderings of the boxes of moments."""
 
     def __init__(self, dataset: Dataset, scenario: str) -> None:
-        """Prepare the boxes of a scenario."""
+        """Read the tracks of all actors of a scenario."""
         self._dataset = dataset
         self._roles = Roles(dataset, scenario)
         tracks = scenario_tracks(dataset, scenario)
@@ -349,76 +360,93 @@ class _ActorMessages:
         self._write_actors(moment, recording)
         for agent, sample in moment.samples.items():
             if self._dataset.get("sample", sample)["labelled"]:
-                self._write_annotations(agent, sample, moment.index, recording)
+                self._write_annotations(agent, sample, moment.frame_number, recording)
 
     def _write_actors(self, moment: Moment, recording: McapRecording) -> None:
         view = cooperative_view(self._dataset, moment.first_sample, agents=tuple(moment.samples))
-        boxes, segments = view.boxes, box_segments(view.boxes)
+        boxes = view.boxes
+        segments = compute_box_segments(boxes)
         colors = role_colors(self._dataset, moment.first_sample, boxes)
         visible = {}
         for agent, sample in moment.samples.items():
             visible[agent] = set(visible_actors(self._dataset, sample, agents=(agent,)).tolist())
-        entities, points = [], []
+        entities = []
+        points = []
         for row, actor in enumerate(boxes.actor_id.tolist()):
             color = colors[row]
-            trail, path = self._trail(actor, moment.index)
+            trail, path = self._find_trail(actor, moment.frame_number)
             annotators = [name for bit, name in enumerate(AGENTS) if view.seen_by[row] >> bit & 1]
             observers = [agent for agent, actors in visible.items() if actor in actors]
             facts = {
-                **self._facts(boxes, row, actor),
+                **self._describe_actor(boxes, row, actor),
                 "annotated_by": ", ".join(annotators),
                 "seen_by": ", ".join(observers),
             }
             name = str(actor)
             if actor == UNTRACKED_ID:
                 name = f"untracked/{AGENTS[view.source[row]]}/{boxes.row[row]}"
-            strips = [strip(part, color) for part in (trail, path) if len(part) > 1]
+            strips = [make_strip(line, color) for line in (trail, path) if len(line) > 1]
             entities.append(
-                entity(
+                make_entity(
                     name,
                     "world",
-                    moment.index,
+                    moment.frame_number,
                     facts,
-                    cubes=[cube(boxes, row, color)],
-                    lines=[lines(segments[row, -1:], color), *strips],
-                    texts=[label(facts["text"], text_position(boxes, row), color)],
+                    cubes=[make_cube(boxes, row, color)],
+                    lines=[make_lines(segments[row, -1:], color), *strips],
+                    texts=[make_label(facts["text"], compute_text_position(boxes, row), color)],
                 )
             )
             points += [
-                segment_points(segments[row], color),
-                strip_points(trail, color),
-                strip_points(path, color, _PATH_ALPHA),
+                sample_segments(segments[row], color),
+                sample_strip(trail, color),
+                sample_strip(path, color, _PATH_ALPHA),
             ]
         self._write_speeds(boxes, moment, recording)
-        recording.write("/actors", scene_update(entities, moment.index), moment.index)
-        cloud = cloud_message(join_points(points), "world", moment.index)
-        recording.write("/actors/points", cloud, moment.index)
+        recording.write(
+            "/actors", make_scene_update(entities, moment.frame_number), moment.frame_number
+        )
+        cloud = make_cloud(join_points(points), "world", moment.frame_number)
+        recording.write("/actors/points", cloud, moment.frame_number)
 
     def _write_speeds(self, boxes: Boxes, moment: Moment, recording: McapRecording) -> None:
         """Write the known speeds of the exported agents."""
-        for row in np.flatnonzero(np.isfinite(boxes.velocity[:, 0])).tolist():
+        has_speed = np.isfinite(boxes.velocity[:, 0])
+        for row in np.flatnonzero(has_speed).tolist():
             agent = self._roles.agents.get(int(boxes.actor_id[row]))
             if agent in moment.samples:
-                speed = float(np.linalg.norm(boxes.velocity[row]))
-                recording.write(f"/{agent}/speed", DoubleValue(value=speed), moment.index)
+                speed = np.linalg.norm(boxes.velocity[row])
+                message = DoubleValue(value=float(speed))
+                recording.write(f"/{agent}/speed", message, moment.frame_number)
 
     def _write_annotations(
-        self, agent: str, sample: str, index: int, recording: McapRecording
+        self, agent: str, sample: str, frame_number: int, recording: McapRecording
     ) -> None:
         boxes = self._dataset.boxes(sample, "lidar")
         actors = self._dataset.actor_ids(sample).tolist()
-        segments, color = box_segments(boxes), AGENT_COLORS[agent]
-        frame = frame_id(agent, "lidar")
+        segments = compute_box_segments(boxes)
+        color = AGENT_COLORS[agent]
+        frame = name_frame(agent, "lidar")
         entities = []
         for row, actor in enumerate(actors):
-            facts = {**self._facts(boxes, row, actor), "label_id": str(boxes.actor_id[row])}
+            facts = {
+                **self._describe_actor(boxes, row, actor),
+                "label_id": str(boxes.actor_id[row]),
+            }
             name = f"{actor}/{boxes.row[row]}"
-            entities.append(entity(name, frame, index, facts, lines=[lines(segments[row], color)]))
-        recording.write(f"/{agent}/annotations", scene_update(entities, index), index)
+            entities.append(
+                make_entity(
+                    name, frame, frame_number, facts, lines=[make_lines(segments[row], color)]
+                )
+            )
+        recording.write(
+            f"/{agent}/annotations", make_scene_update(entities, frame_number), frame_number
+        )
 
-    def _facts(self, boxes: Boxes, row: int, actor: int) -> dict[str, str]:
-        category, velocity = CATEGORIES[boxes.category[row]], boxes.velocity[row]
-        role = self._roles.role(actor)
+    def _describe_actor(self, boxes: Boxes, row: int, actor: int) -> dict[str, str]:
+        category = CATEGORIES[boxes.category[row]]
+        velocity = boxes.velocity[row]
+        role = self._roles.describe(actor)
         identity = "untracked" if actor == UNTRACKED_ID else str(actor)
         suffix = ""
         if role:
@@ -435,12 +463,15 @@ class _ActorMessages:
             "camera_visible": str(bool(boxes.camera_visible[row])).lower(),
         }
 
-    def _trail(self, actor: int, index: int) -> tuple[FloatArray, FloatArray]:
+    def _find_trail(self, actor: int, frame_number: int) -> tuple[FloatArray, FloatArray]:
         """Return an actor's past and future positions, shape (n, 3) each, in the world frame.
 
-        Both include the present.
+        Both include the position in the current frame.
         """
-        frames, centers = self._paths.get(actor, (np.zeros(0, dtype=np.int64), np.zeros((0, 3))))
-        past = (frames <= index) & (frames >= index - TRAIL_FRAMES)
-        future = (frames >= index) & (frames <= index + TRAIL_FRAMES)
-        return centers[past], centers[future]
+        no_path = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+        frames, centers = self._paths.get(actor, no_path)
+        first = frame_number - TRAIL_FRAMES
+        last = frame_number + TRAIL_FRAMES
+        is_past = (first <= frames) & (frames <= frame_number)
+        is_future = (frame_number <= frames) & (frames <= last)
+        return centers[is_past], centers[is_future]

@@ -1,15 +1,14 @@
-"""Detections of a nuScenes export, by a nuScenes detector, converted to DeepAccident's tokens.
+"""Detections that a nuScenes detector made on a nuScenes export, converted back to DeepAccident.
 
-Classes are converted as well. Both formats have the boxes in the right-handed world, with width,
-length, height and quaternions w, x, y, z (schema/results/README.md); only tokens and classes
-differ.
+Tokens and classes are converted. Boxes need no conversion: both formats have them in the
+right-handed world, with width, length, height and quaternions w, x, y, z
+(schema/results/README.md).
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ from deepaccident_devkit.export.frames import KEY_STEP
 from deepaccident_devkit.export.nuscenes.scenes import token
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import PathType, path_of
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 if TYPE_CHECKING:
@@ -41,8 +40,8 @@ if TYPE_CHECKING:
 
 OTHER_CLASSES: Final = ("bus", "trailer", "construction_vehicle", "barrier", "traffic_cone")
 """Detection classes of nuScenes that this dataset does not have."""
-_IGNORED_FIELDS: Final = ("attribute_name", "ego_translation", "num_pts")
-_REMEDY: Final = (
+_IGNORED_FIELDS = ("attribute_name", "ego_translation", "num_pts")
+_REMEDY = (
     'give nuScenes detections, {"meta": …, "results": sample token → boxes}, of the nuScenes '
     "export of"
 )
@@ -50,11 +49,13 @@ _REMEDY: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NuScenesDetections:
-    """A detector's boxes in samples of a nuScenes export.
+    """Boxes that a detector found in samples of a nuScenes export.
 
     Attributes:
-        boxes: Token of the devkit's sample → its boxes, in the world frame, in the file's order.
-        left_out: Class that this dataset does not have → number of its boxes, which are left out.
+        boxes: Boxes of each sample, in the world frame and in the file's order, by the devkit's
+            sample token.
+        left_out: Number of boxes that are left out, by class; DeepAccident does not have these
+            classes.
         meta: Notes of the file's author.
     """
 
@@ -63,36 +64,37 @@ class NuScenesDetections:
     meta: Mapping[str, Any]
 
 
-def results_from_nuscenes(dataset: Dataset, path: str | os.PathLike[str]) -> NuScenesDetections:
-    """Read a nuScenes detection file of the devkit's nuScenes export.
+def results_from_nuscenes(dataset: Dataset, path: PathType) -> NuScenesDetections:
+    """Read a nuScenes detection file that was made on the devkit's nuScenes export.
 
-    Its form is `{"meta": …, "results": {sample token: [box, …]}}`. nuScenes has no class for vans:
-    none of its ten classes becomes `van`. A detector that learned DeepAccident's classes may write
-    them.
+    Its format is `{"meta": …, "results": {sample token: [box, …]}}`. nuScenes has no class for
+    vans, so none of its ten classes becomes `van`; but a detector that was trained on
+    DeepAccident's classes may write `van`.
 
     Args:
         dataset: The release that was exported, or one that contains it.
         path: Path of the file.
 
     Raises:
-        ResultsError: it cannot be read, is no such file, or has a sample that is not of this
-            release's export; the message names the first one.
+        ResultsError: If the file cannot be read, is not a nuScenes detection file, or has a sample
+            that is not in the export of this release; the message names the first such sample.
     """
     file = path_of(path).absolute()
-    samples = {token("sample", sample): sample for sample in _key_samples(dataset)}
+    samples = {token("sample", sample): sample for sample in _find_keyframes(dataset)}
     try:
-        return _read(parsed_json(read_bytes(file, "results"), constants=True), samples)
+        document = parsed_json(read_bytes(file, "results"), constants=True)
+        return _convert_document(document, samples)
     except (OSError, ValueError) as error:
         fault = fault_text(error)
         raise ResultsError(f"{file}: {fault}; {_REMEDY} {dataset.dataroot}") from error
 
 
-def _read(document: object, samples: Mapping[str, str]) -> NuScenesDetections:
-    """Return the detections of a document; raises ContentError.
+def _convert_document(document: object, samples: Mapping[str, str]) -> NuScenesDetections:
+    """Convert a parsed file to detections; raise ContentError if its content is invalid.
 
     Args:
         document: The parsed file.
-        samples: Token in nuScenes' format → token of the devkit's sample.
+        samples: The devkit's token of each sample, by the sample's token in the nuScenes export.
     """
     if not isinstance(document, dict):
         raise ContentError(f"expected a JSON object, found {json_excerpt(document)}")
@@ -100,7 +102,8 @@ def _read(document: object, samples: Mapping[str, str]) -> NuScenesDetections:
         raise ContentError(
             "is in DeepAccident's own format, which `deepaccident evaluate` takes as it is"
         )
-    meta, results = document.get("meta", {}), document.get("results")
+    meta = document.get("meta", {})
+    results = document.get("results")
     if not isinstance(meta, dict):
         raise ContentError(f"meta: expected an object, found {json_excerpt(meta)}")
     if not isinstance(results, dict) or not results:
@@ -117,55 +120,62 @@ def _read(document: object, samples: Mapping[str, str]) -> NuScenesDetections:
     boxes = {}
     for key in entries.number:
         if key not in samples:
-            raise ContentError(f"results: {shortened(key)}: is no sample of this release's export")
+            raise ContentError(
+                f"results: {shortened(key)}: is not a sample of the release's export"
+            )
         detected = boxes_at(entries, key)
-        left_out_numbers = left_out.get(key, {})
-        retained = [number not in left_out_numbers for number in range(len(detected))]
-        rows = np.array(retained, dtype=bool)
+        is_retained = np.ones(len(detected), dtype=bool)
+        is_retained[list(left_out.get(key, ()))] = False
         boxes[samples[key]] = DetectedBoxes(
-            boxes=detected.boxes[rows], scores=detected.scores[rows]
+            boxes=detected.boxes[is_retained], scores=detected.scores[is_retained]
         )
-    counts = Counter(name for numbers in left_out.values() for name in numbers.values())
+    counts: Counter[str] = Counter()
+    for names in left_out.values():
+        counts.update(names.values())
     return NuScenesDetections(boxes=boxes, left_out=dict(sorted(counts.items())), meta=meta)
 
 
 def _convert_classes(results: dict[str, Any]) -> dict[str, dict[int, str]]:
     """Convert boxes to DeepAccident's classes in place, and unknown velocities to null.
 
-    Boxes of other classes get any class. Invalid entries stay unchanged.
+    Boxes of classes that DeepAccident does not have get an arbitrary class. Invalid entries stay
+    unchanged.
 
     Returns:
-        Token → number of each box that is to be left out → its class.
+        Classes of the boxes to leave out, by token, then by the box's index.
     """
     left_out: dict[str, dict[int, str]] = {}
     for key, sample_entries in results.items():
-        for number, entry in enumerate(sample_entries if isinstance(sample_entries, list) else ()):
+        if not isinstance(sample_entries, list):
+            continue
+        for number, entry in enumerate(sample_entries):
             if not isinstance(entry, dict):
                 continue
-            for field in _IGNORED_FIELDS:  # they may be NaN
+            for field in _IGNORED_FIELDS:  # Their values may be NaN.
                 entry.pop(field, None)
             name = entry.get("detection_name")
             if name in OTHER_CLASSES:
                 left_out.setdefault(key, {})[number] = name
                 entry["detection_name"] = CATEGORIES[0]
-            elif name == "bicycle":  # the other classes have the same names
+            elif name == "bicycle":  # The other classes have the same names in both.
                 entry["detection_name"] = "cyclist"
             if _has_nan(entry.get("velocity")):
-                # the nuScenes devkit writes NaN where the velocity is unknown
+                # The nuScenes devkit writes NaN where the velocity is unknown.
                 entry["velocity"] = None
     return left_out
 
 
 def _has_nan(velocity: object) -> bool:
-    """Return whether a velocity is a list with a NaN."""
+    """Return whether a velocity is a list that contains NaN."""
     if not isinstance(velocity, list):
         return False
     return any(isinstance(value, float) and math.isnan(value) for value in velocity)
 
 
-def _key_samples(dataset: Dataset) -> Iterator[str]:
-    """Yield the samples of the export: the keyframes of each agent."""
-    samples, scenarios = dataset.columns("sample"), dataset.columns("scenario")
+def _find_keyframes(dataset: Dataset) -> Iterator[str]:
+    """Yield the tokens of the exported samples, which are the keyframes of each agent."""
+    samples = dataset.columns("sample")
+    scenarios = dataset.columns("scenario")
     rows = samples["scenario_row"]
     frame_numbers = samples["frame_row"] - scenarios["first_frame_row"][rows] + 1
     frames_to_end = scenarios["num_frames"][rows] - frame_numbers

@@ -1,7 +1,7 @@
-"""A scene, one agent's recording of a scenario, as nuScenes rows of it, its boxes and sensor files.
+"""A scene of nuScenes, which is one agent's recording of a scenario: its rows, boxes and files.
 
 mmdet3d's infos refer to the same files by the same names. All names depend only on the release, so
-that exports of parts agree with a complete export.
+that partial exports agree with a complete one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.export.frames import keyframe_after, keyframes, sensor_files, stored_camera
+from deepaccident_devkit.export.frames import (
+    FrameFiles,
+    SensorFile,
+    keyframes,
+    load_camera,
+    next_keyframe,
+    select_files,
+    sensor_files,
+)
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import read_lidar
 from deepaccident_devkit.release.store import ReleasePath
@@ -54,14 +62,14 @@ CAMERA_CHANNELS: Final = MappingProxyType(
         )
     )
 )
-"""Camera → nuScenes' channel."""
+"""nuScenes' channel for each camera."""
 CHANNEL_NAMES: Final = MappingProxyType({**CAMERA_CHANNELS, LIDAR: LIDAR_CHANNEL})
-_SUFFIXES: Final = MappingProxyType({**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "pcd.bin"})
-_EPOCH_US: Final = 1_600_000_000_000_000
-_HOUR_US: Final = 3_600_000_000
-_FRAME_PERIOD_US: Final = 100_000
+_SUFFIXES = MappingProxyType({**dict.fromkeys(CAMERAS, "jpg"), LIDAR: "pcd.bin"})
+_EPOCH_US = 1_600_000_000_000_000
+_HOUR_US = 3_600_000_000
+_FRAME_PERIOD_US = 100_000
 NuScenesRow = dict[str, Any]
-# Table → its rows in order.
+# Rows of each table in order, by table.
 _RowsByTable = Mapping[str, Sequence[NuScenesRow]]
 Van = Literal["car", "truck"]
 NUSCENES_CATEGORIES: Final = MappingProxyType(
@@ -73,37 +81,39 @@ NUSCENES_CATEGORIES: Final = MappingProxyType(
         "pedestrian": "human.pedestrian.adult",
     }
 )
-"""Class of DeepAccident → nuScenes' category; vans become one of the first two."""
-# Whether a camera of the agent sees a box → nuScenes' visibility; the intermediate levels are
-# unknown.
-_VISIBILITY_TOKENS: Final = MappingProxyType({True: "4", False: "1"})
+"""nuScenes' category for each DeepAccident class; vans become one of the first two."""
+# nuScenes' visibility token, by whether a camera of the agent sees the box; the levels in between
+# cannot be known.
+_VISIBILITY_TOKENS = MappingProxyType({True: "4", False: "1"})
 # Speed above which an actor moves.
-_MIN_MOVING_SPEED_MPS: Final = 0.2
+_MIN_MOVING_SPEED_MPS = 0.2
 LidarAxes = Literal["ego", "nuscenes"]
 AXES_ROTATIONS: Final = {
     "ego": np.eye(3),
     "nuscenes": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""Axes → rotation into them from x forward and y left; nuScenes' LiDAR has x right, y forward."""
+"""Rotation from x forward, y left to each kind of axes; nuScenes' are x right, y forward."""
 
 
 def token(kind: str, *parts: object) -> str:
-    """Return a token of 32 hexadecimal digits for a row of a table, from its identity.
+    """Return a token of 32 hexadecimal digits for a row of a table, made from its identity.
 
     Args:
         kind: Name of the table.
         *parts: Values that identify the row.
     """
-    return hashlib.md5(
-        "/".join(map(str, (kind, *parts))).encode(), usedforsecurity=False
-    ).hexdigest()
+    identity = "/".join(map(str, (kind, *parts)))
+    return hashlib.md5(identity.encode(), usedforsecurity=False).hexdigest()
 
 
-def sensor_path(scene: str, channel: str, stamp: int, *, key: bool) -> str:
-    """Return the path of a sensor file in the folder; `channel` is DeepAccident's."""
+def build_sensor_path(scene: str, channel: str, timestamp: int, *, is_key: bool) -> str:
+    """Return the path of a sensor file within the export; `channel` is DeepAccident's name."""
     name = CHANNEL_NAMES[channel]
-    folder = "samples" if key else "sweeps"
-    return f"{folder}/{name}/{scene}__{name}__{stamp}.{_SUFFIXES[channel]}"
+    if is_key:
+        folder = "samples"
+    else:
+        folder = "sweeps"
+    return f"{folder}/{name}/{scene}__{name}__{timestamp}.{_SUFFIXES[channel]}"
 
 
 @dataclass(frozen=True)
@@ -114,7 +124,7 @@ class AgentScene:
         dataset: The release.
         scenario: Token of the scenario.
         agent: Name of the agent.
-        sweeps: Whether the frames between keyframes are exported too.
+        sweeps: Whether to also export the frames between keyframes.
     """
 
     dataset: Dataset
@@ -125,11 +135,12 @@ class AgentScene:
     @property
     def name(self) -> str:
         """Name in the table `scene` and in `splits.json`: `<type>-<scenario>-<agent>`."""
-        return f"{self.scenario.replace('/', '-')}-{self.agent}"
+        prefix = self.scenario.replace("/", "-")
+        return f"{prefix}-{self.agent}"
 
     @cached_property
-    def last(self) -> int:
-        """Number of the last frame."""
+    def last_frame(self) -> int:
+        """Number of the last frame of the scenario."""
         count: int = self.dataset.scenario.get(self.scenario)["num_frames"]
         return count
 
@@ -137,51 +148,54 @@ class AgentScene:
     def frames(self) -> range:
         """Numbers of the exported frames."""
         if self.sweeps:
-            return range(1, self.last + 1)
-        return keyframes(self.last)
+            return range(1, self.last_frame + 1)
+        return keyframes(self.last_frame)
 
     @cached_property
-    def files(self) -> Mapping[str, Mapping[int, tuple[ReleasePath, int]]]:
-        """Channel → number of an exported frame → path and bytes of the file, where it exists."""
+    def files(self) -> Mapping[str, FrameFiles]:
+        """Path and bytes of each existing file, by channel, then by exported frame."""
         files = {}
         for channel in CHANNEL_NAMES:
             all_files = sensor_files(self.dataset, self.scenario, self.agent, channel)
-            files[channel] = {
-                number: all_files[number] for number in self.frames if number in all_files
-            }
+            files[channel] = select_files(all_files, self.frames)
         return files
 
     def is_key(self, number: int) -> bool:
         """Return whether a frame is a keyframe."""
-        return keyframe_after(number, self.last) == number
+        return next_keyframe(number, self.last_frame) == number
 
-    def key_of(self, number: int) -> str:
-        """Return the devkit's token of the sample of a frame: that of the keyframe it leads to.
+    def find_key_sample(self, number: int) -> str:
+        """Return the devkit's token of a frame's keyframe: the frame itself or the next keyframe.
 
-        The nuScenes devkit interpolates boxes of a sweep from the keyframe before its sample to its
-        sample.
+        The nuScenes devkit interpolates the boxes of a sweep between the keyframe before its sample
+        and its sample.
         """
-        return self.sample(keyframe_after(number, self.last))
+        return self.sample(next_keyframe(number, self.last_frame))
 
     def sample(self, number: int) -> str:
-        """Return the devkit's token of a frame's sample."""
+        """Return the devkit's token of the sample at a frame."""
         return sample_token(self.scenario, self.agent, number)
 
-    def stamp(self, number: int) -> int:
+    def timestamp(self, number: int) -> int:
         """Return the time of a frame in microseconds.
 
-        Each scenario has an hour of its own, and each agent starts a microsecond after the previous
-        one. The devkit of nuScenes sorts scenes by their first time, so all times differ.
+        Each scenario starts in a different hour, and each agent starts a microsecond after the
+        previous one. All times are therefore different, which matters because the nuScenes devkit
+        sorts scenes by their first timestamp.
         """
-        hours = self.dataset.getind("scenario", self.scenario) + 1
-        return _EPOCH_US + hours * _HOUR_US + number * _FRAME_PERIOD_US + AGENTS.index(self.agent)
+        scenario_number = self.dataset.getind("scenario", self.scenario) + 1
+        start = _EPOCH_US + scenario_number * _HOUR_US
+        return start + number * _FRAME_PERIOD_US + AGENTS.index(self.agent)
 
-    def rows(self) -> _RowsByTable:
+    def make_rows(self) -> _RowsByTable:
         """Return the rows of `scene`, `log`, `sample` and `ego_pose`."""
         record = self.dataset.scenario.get(self.scenario)
-        scene = token("scene", agent_token(self.scenario, self.agent))
-        log = token("log", agent_token(self.scenario, self.agent))
-        samples = link_rows([self._sample_row(number, scene) for number in keyframes(self.last)])
+        recording = agent_token(self.scenario, self.agent)
+        scene = token("scene", recording)
+        log = token("log", recording)
+        samples = link_rows(
+            [self._make_sample_row(number, scene) for number in keyframes(self.last_frame)]
+        )
         facts = [record["town"], record["weather"], record["time_of_day"], record["road_type"]]
         if record["collision"]:
             facts.append("collision")
@@ -203,62 +217,61 @@ class AgentScene:
             "date_captured": "",
             "location": record["town"],
         }
-        poses = list(map(self._pose_row, self.frames))
+        poses = list(map(self._make_pose_row, self.frames))
         return {"scene": [scene_row], "log": [log_row], "sample": samples, "ego_pose": poses}
 
-    def _sample_row(self, number: int, scene: str) -> NuScenesRow:
+    def _make_sample_row(self, number: int, scene: str) -> NuScenesRow:
         sample = self.sample(number)
         return {
             "token": token("sample", sample),
-            "timestamp": self.stamp(number),
+            "timestamp": self.timestamp(number),
             "scene_token": scene,
             "agent": self.agent,
             "time_to_impact": self.dataset.sample.get(sample)["time_to_impact"],
             "deepaccident_token": sample,
         }
 
-    def _pose_row(self, number: int) -> NuScenesRow:
+    def _make_pose_row(self, number: int) -> NuScenesRow:
         pose = self.dataset.ego_pose.get(self.sample(number))
         return {
             "token": token("ego_pose", self.sample(number)),
-            "timestamp": self.stamp(number),
+            "timestamp": self.timestamp(number),
             "translation": pose["translation"],
             "rotation": pose["rotation"],
         }
 
 
-def scenes_of(
+def find_scenes(
     dataset: Dataset, scenario: str, agents: Sequence[str], *, sweeps: bool
 ) -> Iterator[AgentScene]:
-    """Return an iterator over the scenes of the selected agents that recorded a scenario."""
-    return (
-        AgentScene(dataset, scenario, agent, sweeps)
-        for agent in agents_of(dataset, scenario)
-        if agent in agents
-    )
+    """Yield the scenes of the agents that recorded a scenario."""
+    for agent in agents_of(dataset, scenario):
+        if agent in agents:
+            yield AgentScene(dataset, scenario, agent, sweeps)
 
 
 def link_rows(rows: list[NuScenesRow]) -> list[NuScenesRow]:
-    """Return the same rows with the tokens of their neighbours as `prev` and `next`.
+    """Add the tokens of the neighbours to rows as `prev` and `next`, and return the rows.
 
-    They are empty at the ends.
+    At the ends the token is empty.
     """
     tokens = ["", *(row["token"] for row in rows), ""]
     for row, before, after in zip(rows, tokens, tokens[2:], strict=False):
-        row["prev"], row["next"] = before, after
+        row["prev"] = before
+        row["next"] = after
     return rows
 
 
-def box_rows(scene: AgentScene, van: Van, output: Output) -> _RowsByTable:
+def make_box_rows(scene: AgentScene, van: Van, output: Output) -> _RowsByTable:
     """Return the rows of `instance` and `sample_annotation`.
 
-    An actor has an instance of its own in each scene. The agent's own row is left out, as nuScenes
-    does not annotate the ego. An untracked row is an instance by itself, and so is one with an id
-    that its label has already.
+    An actor is a different instance in each scene. The agent's own box is left out, since nuScenes
+    does not annotate the ego. An untracked box is an instance by itself, as is a box with an id
+    that its label already has.
     """
     rows: list[NuScenesRow] = []
     tracks: dict[str, list[NuScenesRow]] = {}
-    for number in range(1, scene.last + 1):
+    for number in range(1, scene.last_frame + 1):
         sample = scene.dataset.sample.get(scene.sample(number))
         if not scene.is_key(number):
             output.leave_out(
@@ -266,21 +279,21 @@ def box_rows(scene: AgentScene, van: Van, output: Output) -> _RowsByTable:
             )
             continue
         output.leave_out("labels that are not in this release", not sample["labelled"])
-        for row in _annotations(scene, number, output):
+        for row in _make_annotations(scene, number, output):
             rows.append(row)
             tracks.setdefault(row["instance_token"], []).append(row)
     for track in tracks.values():
         link_rows(track)
-    instances = [_instance(track, van) for track in tracks.values()]
+    instances = [_make_instance(track, van) for track in tracks.values()]
     return {"instance": instances, "sample_annotation": rows}
 
 
-def _annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuScenesRow]:
-    """Yield the row of each box of a keyframe, without the boxes before and after it."""
+def _make_annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuScenesRow]:
+    """Yield the row of each box of a keyframe, without links to the boxes before and after it."""
     sample = scene.sample(number)
     boxes = scene.dataset.boxes(sample)
     derived = scene.dataset.boxes(sample, velocity="derived").velocity
-    # an untracked actor has only the label's velocity
+    # An untracked actor only has the velocity of the label.
     velocity = np.where(np.isnan(derived), boxes.velocity, derived)
     speeds = np.hypot(velocity[:, 0], velocity[:, 1]).tolist()
     track_ids = {OWN_ACTOR_ID}
@@ -294,7 +307,7 @@ def _annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuS
         output.leave_out("tracks of untracked boxes (each is an instance of its own)", is_untracked)
         track_ids.add(actor)
         instance_key = (annotation,) if is_untracked else (scene.scenario, scene.agent, actor)
-        attributes = _attributes(category, actor, speeds[index])
+        attributes = _choose_attributes(category, actor, speeds[index])
         length, width, height = boxes.size[index].tolist()
         yield {
             "token": annotation,
@@ -312,10 +325,10 @@ def _annotations(scene: AgentScene, number: int, output: Output) -> Iterator[NuS
         }
 
 
-def _attributes(category: str, actor: int, speed: float) -> list[str]:
-    """Return nuScenes' attribute of an actor as a list.
+def _choose_attributes(category: str, actor: int, speed: float) -> list[str]:
+    """Return a list with the nuScenes attribute of an actor.
 
-    The list is empty if the attribute depends on an unknown speed.
+    The list is empty if the attribute depends on the speed, and the speed is unknown.
 
     Args:
         category: Class of DeepAccident.
@@ -334,8 +347,8 @@ def _attributes(category: str, actor: int, speed: float) -> list[str]:
     return ["vehicle.moving" if is_moving else "vehicle.stopped"]
 
 
-def _instance(rows: list[NuScenesRow], van: Van) -> NuScenesRow:
-    """Return the row of an actor in a scene; its class is that of its first box."""
+def _make_instance(rows: list[NuScenesRow], van: Van) -> NuScenesRow:
+    """Make the `instance` row of an actor in a scene, with the class of its first box."""
     category = rows[0]["category_deepaccident"]
     nuscenes_category = NUSCENES_CATEGORIES[van if category == "van" else category]
     return {
@@ -353,8 +366,9 @@ def write_sensors(scene: AgentScene, axes: LidarAxes, output: Output) -> _RowsBy
     """Write the clouds of a scene, link its images, and return their rows.
 
     The rows belong to `sample_data` and `calibrated_sensor`. Files that are missing in a partial
-    release have rows too, as in a partial nuScenes download: evaluations look up every keyframe's
-    `LIDAR_TOP`, but open no cloud. A missing image has the size of the camera's first one.
+    release have rows too, as in a partial nuScenes download, because evaluations look up the
+    `LIDAR_TOP` of every keyframe but open no cloud. A missing image has the size of the camera's
+    first image.
     """
     data: list[NuScenesRow] = []
     calibrated: dict[str, NuScenesRow] = {}
@@ -364,13 +378,15 @@ def write_sensors(scene: AgentScene, axes: LidarAxes, output: Output) -> _RowsBy
         for number in scene.frames:
             file = files.get(number, default_file)
             sensor, lens = _add_sensor(scene, number, channel, file, axes, calibrated)
-            path = sensor_path(scene.name, channel, scene.stamp(number), key=scene.is_key(number))
-            rows.append(_data_row(scene, number, channel, sensor, path, lens))
+            path = build_sensor_path(
+                scene.name, channel, scene.timestamp(number), is_key=scene.is_key(number)
+            )
+            rows.append(_make_data_row(scene, number, channel, sensor, path, lens))
             if number not in files:
                 continue
             source_path, _ = files[number]
             if channel == LIDAR:
-                output.write(path, _cloud_bytes(source_path, axes))
+                output.write(path, _encode_cloud(source_path, axes))
             else:
                 output.link(source_path, path)
         data += link_rows(rows)
@@ -387,38 +403,38 @@ def _add_sensor(
     scene: AgentScene,
     number: int,
     channel: str,
-    file: tuple[ReleasePath, int] | None,
+    file: SensorFile | None,
     axes: LidarAxes,
     calibrated: dict[str, NuScenesRow],
 ) -> tuple[str, PinholeCamera | None]:
-    """Add the row of a file's calibrated sensor if it is new.
+    """Add the row of the calibrated sensor of a file, if it is new.
 
     Returns:
         The name of the sensor, and the camera; None for the LiDAR.
     """
     source = sample_data_token(scene.sample(number), channel)
     record = scene.dataset.sample_data.get(source)
-    lens = None if channel == LIDAR else stored_camera(scene.dataset, source, file)
+    lens = None if channel == LIDAR else load_camera(scene.dataset, source, file)
     sensor = record["calibrated_sensor_token"]
     if lens is not None and (lens.width, lens.height) != (record["width"], record["height"]):
-        sensor = f"{sensor} {lens.width} x {lens.height}"  # with a K of its own
+        sensor = f"{sensor} {lens.width} x {lens.height}"  # It has a K of its own.
     if sensor not in calibrated:
-        calibrated[sensor] = _calibrated_row(
+        calibrated[sensor] = _make_calibrated_row(
             scene, record["calibrated_sensor_token"], sensor, lens, axes
         )
     return sensor, lens
 
 
-def _data_row(
+def _make_data_row(
     scene: AgentScene, number: int, channel: str, sensor: str, path: str, lens: PinholeCamera | None
 ) -> NuScenesRow:
     sample = scene.sample(number)
     return {
         "token": token("sample_data", sample, channel),
-        "sample_token": token("sample", scene.key_of(number)),
+        "sample_token": token("sample", scene.find_key_sample(number)),
         "ego_pose_token": token("ego_pose", sample),
         "calibrated_sensor_token": token("calibrated_sensor", sensor),
-        "timestamp": scene.stamp(number),
+        "timestamp": scene.timestamp(number),
         "fileformat": _SUFFIXES[channel].removesuffix(".bin"),
         "is_key_frame": scene.is_key(number),
         "height": 0 if lens is None else lens.height,
@@ -427,7 +443,7 @@ def _data_row(
     }
 
 
-def _calibrated_row(
+def _make_calibrated_row(
     scene: AgentScene, source: str, name: str, lens: PinholeCamera | None, axes: LidarAxes
 ) -> NuScenesRow:
     """Return the row of a calibrated sensor.
@@ -440,7 +456,8 @@ def _calibrated_row(
         axes: Axes of the LiDAR.
     """
     record = scene.dataset.calibrated_sensor.get(source)
-    rotation, intrinsic = record["rotation"], []
+    rotation = record["rotation"]
+    intrinsic = []
     if lens is None:
         matrix = quaternions.to_matrix(rotation) @ AXES_ROTATIONS[axes].T
         rotation = quaternions.from_matrix(matrix).tolist()
@@ -455,10 +472,10 @@ def _calibrated_row(
     }
 
 
-def _cloud_bytes(path: ReleasePath, axes: LidarAxes) -> bytes:
-    """Return the content of a `.pcd.bin` with points in the LiDAR frame with these axes.
+def _encode_cloud(path: ReleasePath, axes: LidarAxes) -> bytes:
+    """Encode a cloud as a `.pcd.bin` file, in the LiDAR frame with these axes.
 
-    The values are x, y, z, intensity, and ring (0).
+    Each point has the values x, y, z, intensity and ring (always 0).
     """
     cloud = read_lidar(path)
     points = np.zeros((len(cloud), 5), dtype="<f4")

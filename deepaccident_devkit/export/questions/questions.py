@@ -1,4 +1,4 @@
-"""The export of questions: its settings, and question and truth of each window of a recording."""
+"""The export of questions: its settings, and one question with its truth for each window."""
 
 from __future__ import annotations
 
@@ -15,24 +15,31 @@ import numpy as np
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation.accident import box_truth
 from deepaccident_devkit.export.bulk import Format, Output, Unit
-from deepaccident_devkit.export.frames import sensor_files
-from deepaccident_devkit.export.questions.answers import answer_schema, questions_readme
+from deepaccident_devkit.export.frames import FrameFiles, sensor_files
+from deepaccident_devkit.export.questions.answers import format_questions_readme, make_answer_schema
 from deepaccident_devkit.export.questions.observed import (
     RATE,
+    Facts,
     Observations,
     QuestionWindow,
     SeenRule,
     WindowRules,
-    digest,
-    names_of,
-    question_facts,
+    choose_names,
+    compute_digest,
+    describe_window,
 )
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes
-from deepaccident_devkit.support.text import AnyText, choice, choices, settle_choices, spelled
+from deepaccident_devkit.support.text import (
+    AnyText,
+    choice,
+    choices,
+    match_spelling,
+    settle_choices,
+)
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS, AgentName
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS
 from deepaccident_devkit.v2x.agents import AGENT_SETS, agents_of, cooperating_agents
 from deepaccident_devkit.v2x.collisions import collision, labelled_pair
 from deepaccident_devkit.v2x.tracks import scenario_tracks
@@ -41,33 +48,32 @@ if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
     from deepaccident_devkit.export.bulk import Output
     from deepaccident_devkit.export.questions.observed import Names
-    from deepaccident_devkit.release.store import ReleasePath
 
 QUESTIONS: Final = "questions.jsonl"
 TRUTH: Final = "truth.jsonl"
-# Characters of a line that hold the id.
-_ID_SLICE: Final = slice(len('{"id": "'), len('{"id": "') + 16)
+# Position of the id in a line, as indices of characters.
+_ID_SLICE = slice(len('{"id": "'), len('{"id": "') + 16)
 # Kinds of data that are left out.
-_ABSENT_AGENTS: Final = "agents of scenarios that are not in this release"
-_INCOMPLETE_RECORDINGS: Final = "recordings whose observers are not all in this release"
-_SHORT_RECORDINGS: Final = "recordings that are too short for a window"
-_UNLABELLED_WINDOWS: Final = "windows with a moment at which an observer has no label"
-_MISSING_PICTURES: Final = "pictures that are not in this release"
-# Folder in the export of everything that may be handed out.
-_PUBLIC_FOLDER: Final = "questions"
+_ABSENT_AGENTS = "agents of scenarios that are not in this release"
+_INCOMPLETE_RECORDINGS = "recordings whose observers are not all in this release"
+_SHORT_RECORDINGS = "recordings that are too short for a window"
+_UNLABELLED_WINDOWS = "windows with a moment at which an observer has no label"
+_MISSING_PICTURES = "pictures that are not in this release"
+# Folder of the export that holds everything that may be handed out.
+_PUBLIC_FOLDER = "questions"
 # A question and its truth.
-_QuestionPair: TypeAlias = tuple[dict[str, Any], dict[str, Any]]
-_FRAMES_PER_SECOND: Final = round(1 / FRAME_PERIOD)
-_DESIGN_FIELDS: Final = (
+_QuestionPair: TypeAlias = tuple[Facts, Facts]
+_FRAMES_PER_SECOND = round(1 / FRAME_PERIOD)
+_DESIGN_FIELDS = (
     "accident_type",
     "signalized",
     "spawn_side",
     "ego_direction",
     "other_direction",
 )
-_CONTACT_FIELDS: Final = ("sides", "speeds", "closing_speed", "impact_angle", "gap")
+_CONTACT_FIELDS = ("sides", "speeds", "closing_speed", "impact_angle", "gap")
 Seconds = list[bool | None]
-"""Whether there is an accident in each second ahead; None where the recording cannot show it."""
+"""Whether an accident happens in each second ahead; None if the recording does not show it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,27 +81,27 @@ class Questions(ShortRepr, Format):
     """Questions for language models on what happens next, given the observations of some agents.
 
     `questions/` holds everything that may be handed out: `questions.jsonl`, README.md,
-    `answer.schema.json` and pictures. `truth.jsonl` beside it holds the answers, and the meaning of
+    `answer.schema.json` and pictures. `truth.jsonl` beside it holds the answers and the meaning of
     the neutral names. docs/exports.md describes what a question shows, and what it does not.
 
     Attributes:
-        agents: The agents that ask, each with its own questions: the egos.
+        agents: Agents that ask, each with its own questions: the egos.
         observers: Agents that observe together with each ego: names, or one of `v2x.AGENT_SETS` as
             seen from the ego; the ego always observes.
         seen: Rule that decides what an agent sees: `released`, the released rule
-            (docs/released_code.md, Visibility and attributes), `camera`, only by its cameras, or
-            `annotated`, all tracked actors in its label.
-        window: The windows of a recording.
-        cameras: Cameras with pictures in the questions, of all observers at all moments; empty for
-            none.
-        link: How pictures are included: `hard` links, or copies where these are impossible; or
+            (docs/released_code.md, Visibility and attributes), `camera`, only what its cameras see,
+            or `annotated`, all tracked actors in its label.
+        window: Rules that select the windows of a recording.
+        cameras: Cameras that a question has pictures of, from all observers at all moments; empty
+            for none.
+        link: Way to include pictures: `hard` links, or copies where these are impossible; or
             `copy`. A symbolic link would show the name of the scenario.
-        seed: A text from which ids and order of the questions are drawn. Do not show yours to the
-            people who answer: with it and the release, ids reveal the sample of a question.
+        seed: Text from which the ids and the order of the questions are drawn. Do not show yours to
+            the people who answer: with it and the release, ids reveal the sample of a question.
 
     Raises:
-        ChoiceError: no such split, agent, rule, camera or kind of link.
-        ConfigError: `window` is no WindowRules, or `seed` no text.
+        ChoiceError: If there is no such split, agent, rule, camera or kind of link.
+        ConfigError: If `window` is not a `WindowRules`, or `seed` is not a text.
     """
 
     agents: tuple[str, ...] = VEHICLE_AGENTS[:1]
@@ -106,7 +112,7 @@ class Questions(ShortRepr, Format):
     seed: str = "0"
 
     name: ClassVar[str] = "questions"
-    nothing: ClassVar[str] = (
+    empty_reason: ClassVar[str] = (
         "no question can be asked: scenarios lack labels, meta or an observer; unpack them, or "
         "choose other scenarios or agents"
     )
@@ -114,44 +120,51 @@ class Questions(ShortRepr, Format):
     def __post_init__(self) -> None:
         """Check all choices."""
         super().__post_init__()
-        object.__setattr__(self, "observers", _observers(self.observers))
+        observers = self.observers
+        if isinstance(observers, str) and match_spelling(observers, AGENTS) not in AGENTS:
+            observers = choice("observers", observers, AGENT_SETS)
+        else:
+            observers = _check_names("observers", observers, AGENTS)
+        object.__setattr__(self, "observers", observers)
         settle_choices(self, {"seen": get_args(SeenRule)})
-        object.__setattr__(self, "cameras", _names("cameras", self.cameras, CAMERAS))
+        object.__setattr__(self, "cameras", _check_names("cameras", self.cameras, CAMERAS))
         if not isinstance(self.window, WindowRules):
             raise ConfigError(f"window: expected WindowRules, found {type(self.window).__name__}")
         if not isinstance(self.seed, str):
-            raise ConfigError(f"seed: expected a text, found {self.seed!r}")
+            raise ConfigError(f"seed: expected text, found {self.seed!r}")
         if self.link == "symbolic":
             raise ChoiceError(
-                "link: a symbolic link shows the name of the scenario, which may tell the answer; "
-                "choose hard or copy"
+                "link: a symbolic link shows the name of the scenario, which may give the "
+                "answer away; choose hard or copy"
             )
 
     def sensors(self) -> tuple[tuple[str, str], ...]:
-        """Return the pictures of questions; all agents, since the observers depend on the ego."""
+        """Return the cameras with pictures, for all agents, since observers depend on the ego."""
         return tuple(product(AGENTS, self.cameras))
 
     def units(self, dataset: Dataset, scenarios: Sequence[str]) -> list[Unit]:
-        """Return the scenarios as units, one each.
+        """Return the scenarios as units of one scenario each.
 
         Raises:
-            NotAvailableError: all of them are too short for a window.
+            NotAvailableError: If all scenarios are too short for a window.
         """
         lengths = [dataset.scenario.get(token)["num_frames"] for token in scenarios]
         if not any(map(self.window.windows, lengths)):
             raise NotAvailableError(
                 f"no recording is long enough for a window of {self.window.observe:g} s: the "
-                f"longest has {max(lengths) * FRAME_PERIOD:.1f} s; observe less "
+                f"longest has {max(lengths) * FRAME_PERIOD:.1f} s; choose a shorter window "
                 "(--observe)"
             )
         return super().units(dataset, scenarios)
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
-        """Write the questions of a scenario and their truth, a line each, and its pictures."""
-        pairs = questions_of(dataset, unit.scenarios[0], self, output)
+        """Write the questions of a scenario and their truth, one on each line, and the pictures."""
+        pairs = make_questions(dataset, unit.scenarios[0], self, output)
         output.tally.samples += len(pairs)
-        _write_lines(output.parts / QUESTIONS, [question for question, _ in pairs])
-        _write_lines(output.parts / TRUTH, [truth for _, truth in pairs])
+        questions = [question for question, _ in pairs]
+        truths = [truth for _, truth in pairs]
+        _write_lines(output.parts / QUESTIONS, questions)
+        _write_lines(output.parts / TRUTH, truths)
 
     def finish(
         self,
@@ -161,26 +174,30 @@ class Questions(ShortRepr, Format):
         parts: Callable[[Unit], Path],
     ) -> None:
         """Join the questions of all scenarios, and their truth, in the random order of the ids."""
-        folders, rules = list(map(parts, units)), self.window
-        for name, path in ((QUESTIONS, f"{_PUBLIC_FOLDER}/{QUESTIONS}"), (TRUTH, TRUTH)):
-            lines = _by_id([folder / name for folder in folders])
+        folders = list(map(parts, units))
+        rules = self.window
+        paths = {QUESTIONS: f"{_PUBLIC_FOLDER}/{QUESTIONS}", TRUTH: TRUTH}
+        for name, path in paths.items():
+            lines = _sort_lines([folder / name for folder in folders])
             with output.file(path) as temporary, temporary.open("wb") as file:
                 file.writelines(lines)
-        text = questions_readme(
+        text = format_questions_readme(
             seconds=rules.ahead, observe=rules.observe, seen=self.seen, pictures=bool(self.cameras)
         )
         output.write(f"{_PUBLIC_FOLDER}/README.md", text)
-        schema = json.dumps(answer_schema(rules.ahead), indent=1)
+        schema = json.dumps(make_answer_schema(rules.ahead), indent=1)
         output.write(f"{_PUBLIC_FOLDER}/answer.schema.json", f"{schema}\n".encode())
 
 
 def _write_lines(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Write records as JSON, a line each."""
-    lines = [f"{json.dumps(record, allow_nan=False)}\n" for record in records]
+    """Write records as JSON, one on each line."""
+    lines = []
+    for record in records:
+        lines.append(f"{json.dumps(record, allow_nan=False)}\n")
     write_bytes(path, "".join(lines).encode())
 
 
-def _by_id(paths: Sequence[Path]) -> Iterator[bytes]:
+def _sort_lines(paths: Sequence[Path]) -> Iterator[bytes]:
     """Yield the lines of files in the order of their ids; only their positions are in memory."""
     positions: list[tuple[bytes, int, int, int]] = []
     for number, path in enumerate(paths):
@@ -194,68 +211,69 @@ def _by_id(paths: Sequence[Path]) -> Iterator[bytes]:
             yield file.read(length)
 
 
-def _observers(observers: str | Sequence[str]) -> str | tuple[str, ...]:
-    """Return the name of a set, or agents' names in usual order; raises ChoiceError."""
-    if isinstance(observers, str) and spelled(observers, AGENTS) not in AGENTS:
-        return choice("observers", observers, AGENT_SETS)
-    return _names("observers", observers, AGENTS)
-
-
-def _names(
+def _check_names(
     argument: str, requested: str | Sequence[str], words: Sequence[AnyText]
 ) -> tuple[AnyText, ...]:
-    """Return the requested names, each once, in their usual order; raises ChoiceError."""
+    """Return the requested names once each, in their usual order; raise ChoiceError if unknown."""
     names = choices(argument, requested, words, empty=True)
     return tuple(name for name in words if name in names)
 
 
-def questions_of(
+def make_questions(
     dataset: Dataset, scenario: str, form: Questions, output: Output
 ) -> list[_QuestionPair]:
-    """Return the questions of a scenario, write their pictures, and count what is left out.
+    """Make a scenario's questions with their truth, and write the questions' pictures.
 
     Args:
         dataset: The release.
         scenario: Token of the scenario.
-        form: The export.
-        output: Output of the pictures.
+        form: Settings of the export.
+        output: Where the pictures are written, and what is left out is counted.
     """
     record = dataset.scenario.get(scenario)
-    reason = unanswerable(dataset, record)
+    reason = explain_omission(dataset, record)
     if reason:
         output.leave_out(reason)
         return []
     recording_agents = agents_of(dataset, scenario)
     absent = [agent for agent in form.agents if agent not in recording_agents]
     output.leave_out(_ABSENT_AGENTS, len(absent))
-    jobs = []
+    windows = form.window.windows(record["num_frames"])
+    all_observations = []
     for ego in recording_agents:
         if ego not in form.agents:
             continue
-        agents = _agents_of(dataset, scenario, ego, form.observers)
-        windows = form.window.windows(record["num_frames"])
-        output.leave_out(_INCOMPLETE_RECORDINGS, not agents)
-        output.leave_out(_SHORT_RECORDINGS, bool(agents) and not windows)
-        if agents and windows:
-            jobs.append((Observations(dataset, scenario, agents, form.seen), windows))
-    why = why_facts(dataset, record) if jobs else None
+        observers = form.observers if isinstance(form.observers, str) else (ego, *form.observers)
+        try:
+            agents = cooperating_agents(dataset, sample_token(scenario, ego, 1), observers)
+        except NotAvailableError:
+            output.leave_out(_INCOMPLETE_RECORDINGS)
+            continue
+        if windows:
+            all_observations.append(Observations(dataset, scenario, agents, form.seen))
+        else:
+            output.leave_out(_SHORT_RECORDINGS)
+    if not all_observations:
+        return []
+    accident = describe_accident(dataset, record)
     pairs: list[_QuestionPair] = []
-    for observations, windows in jobs:
-        pairs += _pairs(observations, windows, form, why, output)
+    for observations in all_observations:
+        pairs += _make_pairs(observations, windows, form, accident, output)
     return pairs
 
 
-def _pairs(
+def _make_pairs(
     observations: Observations,
     windows: Sequence[QuestionWindow],
     form: Questions,
-    why: Mapping[str, Any] | None,
+    accident: Mapping[str, Any] | None,
     output: Output,
 ) -> Iterator[_QuestionPair]:
-    """Yield question and truth of each window of a recording."""
-    dataset, rules = observations.dataset, form.window
+    """Yield the question and the truth of each window of a recording."""
+    dataset = observations.dataset
+    rules = form.window
     scenario = dataset.scenario.get(observations.scenario)
-    files: dict[tuple[str, str], dict[int, tuple[ReleasePath, int]]] = {
+    files: dict[tuple[str, str], FrameFiles] = {
         (agent, camera): sensor_files(dataset, observations.scenario, agent, camera)
         for agent, camera in product(observations.agents, form.cameras)
     }
@@ -264,41 +282,43 @@ def _pairs(
             output.leave_out(_UNLABELLED_WINDOWS)
             continue
         sample = sample_token(observations.scenario, observations.agents[0], window.present)
-        rows, paths = observations.seen_rows(window), observations.paths(window)
-        names = names_of(rows, paths, observations.own_ids, window.times)
-        # the same id for the same sample, observers and moments
+        rows = observations.collect_seen_rows(window)
+        paths = observations.collect_paths(window)
+        names = choose_names(rows, paths, observations.own_ids, window.times)
+        # Questions about the same sample, observers and moments have the same id.
         words = (sample, *observations.agents, f"{rules.observe:g}", str(RATE), form.seen)
-        key = digest(form.seed, "question", *words)
+        key = compute_digest(form.seed, "question", *words)
         question = {
             "id": key,
             "seconds": rules.ahead,
-            **question_facts(rows, paths, names, window, scenario),
+            **describe_window(rows, paths, names, window, scenario),
         }
         if form.cameras:
-            question["images"] = _pictures(files, form.cameras, window, names, key, output)
-        yield question, {"id": key, **truth_facts(dataset, sample, names, rules.ahead, why)}
+            question["images"] = _write_pictures(files, form.cameras, window, names, key, output)
+        truth = describe_truth(dataset, sample, names, rules.ahead, accident)
+        yield question, {"id": key, **truth}
 
 
-def _pictures(
-    files: Mapping[tuple[str, str], Mapping[int, tuple[ReleasePath, int]]],
+def _write_pictures(
+    files: Mapping[tuple[str, str], FrameFiles],
     cameras: Sequence[str],
     window: QuestionWindow,
     names: Names,
     question: str,
     output: Output,
-) -> list[dict[str, Any]]:
+) -> list[Facts]:
     """Write the pictures of a window, and list them by time, observer and camera.
 
-    A picture has another name in each question that shows it, so that names do not reveal questions
-    of the same recording.
+    A picture has a different name in each question that shows it, so that names do not reveal which
+    questions are about the same recording.
 
     Args:
-        files: Agent and camera → frame → path and bytes of the image.
-        cameras: The cameras.
-        window: The window.
+        files: Path and bytes of each image, by agent and camera, then by frame.
+        cameras: Cameras with pictures in the question.
+        window: Moments of the question.
         names: Names of the observers.
         question: Id of the question.
-        output: Output of the pictures.
+        output: Output that gets the pictures.
     """
     pictures = []
     moments = enumerate(zip(window.frames, window.times, strict=True))
@@ -314,19 +334,8 @@ def _pictures(
     return pictures
 
 
-def _agents_of(
-    dataset: Dataset, scenario: str, ego: AgentName, observers: str | tuple[str, ...]
-) -> tuple[AgentName, ...]:
-    """Return the agents that observe with an ego; none if one is not in this (partial) release."""
-    names = observers if isinstance(observers, str) else [ego, *observers]
-    try:
-        return cooperating_agents(dataset, sample_token(scenario, ego, 1), names)
-    except NotAvailableError:
-        return ()
-
-
-def unanswerable(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
-    """Return why nothing can be asked about a scenario, as a plural; None if it can."""
+def explain_omission(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
+    """Name the kind of scenario, if it is one without questions; None for all others."""
     if scenario["weather"] is None:
         return "scenarios without meta, which says whether there is an accident"
     actors = scenario_tracks(dataset, scenario["token"]).actor_id
@@ -339,50 +348,57 @@ def unanswerable(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
 
 
 def seconds_ahead(frames_to_impact: int | None, frames_to_end: int, ahead: int) -> Seconds:
-    """Return whether there is an accident in each second: after n − 1, and up to n seconds.
+    """Return whether there is an accident in each second from 1 to `ahead`.
 
-    n counts from 1 to `ahead`. Seconds are counted in recorded frames. Nobody knows what comes
-    after an impact, or after the recording: these seconds are None.
+    Second n begins after n − 1 seconds and ends after n seconds, counted in recorded frames. What
+    happens after an impact or after the recording is unknown, so these seconds are None.
     """
+    numbers = range(1, ahead + 1)
+    if frames_to_impact is None:
+        num_recorded = frames_to_end // _FRAMES_PER_SECOND
+        return [False if number <= num_recorded else None for number in numbers]
+    impact_second = math.ceil(frames_to_impact / _FRAMES_PER_SECOND)
     seconds: Seconds = []
-    for second in range(1, ahead + 1):
-        if frames_to_impact is None:
-            is_recorded = second * _FRAMES_PER_SECOND <= frames_to_end
-            seconds.append(False if is_recorded else None)
-        else:
-            impact_second = math.ceil(frames_to_impact / _FRAMES_PER_SECOND)
-            seconds.append(second == impact_second if second <= impact_second else None)
+    for number in numbers:
+        seconds.append(number == impact_second if number <= impact_second else None)
     return seconds
 
 
-def truth_facts(
+def describe_truth(
     dataset: Dataset, sample: str, names: Names, ahead: int, contact: Mapping[str, Any] | None
-) -> dict[str, Any]:
-    """Return the known facts on a question's answer; raises NotAvailableError.
+) -> Facts:
+    """Return what is known about the answer to a question.
 
-    They are `sample`, `last_frame`, the names, and `accident` for each second. For an accident in
-    one of the seconds they are also `when`, `who` (names, None for an actor that the question does
-    not show), `actor_ids`, `where` (2, 2) in the present ego frame, `last_seen` of each, and `why`;
-    otherwise these are None.
+    The fields are `sample`, `last_frame`, the names, and `accident` for each second. If there is an
+    accident in one of the seconds, there are also `when`, `who` (names; None for an actor that the
+    question does not show), `actor_ids`, `where` (2, 2) in the ego frame at t = 0, `last_seen` of
+    each actor, and `why`; otherwise these are None.
 
     Args:
         dataset: The release.
         sample: Token of the sample.
         names: Names in the question.
         ahead: Number of seconds.
-        contact: Why the accident happens, see `why_facts`.
+        contact: Description of the accident, see `describe_accident`.
+
+    Raises:
+        NotAvailableError: As in `box_truth`.
     """
     record = dataset.sample.get(sample)
-    to_impact, to_end = record["time_to_impact"], record["time_to_end"]
     scenario = dataset.scenario.get(record["scenario_token"])
-    seconds = seconds_ahead(_frames(to_impact), round(to_end / FRAME_PERIOD), ahead)
-    facts: dict[str, Any] = dict.fromkeys(("when", "who", "actor_ids", "where", "last_seen", "why"))
+    frames_to_end = round(record["time_to_end"] / FRAME_PERIOD)
+    frames_to_impact = None
+    if record["time_to_impact"] is not None:
+        frames_to_impact = round(record["time_to_impact"] / FRAME_PERIOD)
+    seconds = seconds_ahead(frames_to_impact, frames_to_end, ahead)
+    facts: Facts = dict.fromkeys(("when", "who", "actor_ids", "where", "last_seen", "why"))
     if True in seconds:
         impact = box_truth(dataset, sample, float(ahead)).accident
         if impact is not None and impact.ids is not None:
+            name_by_actor = {actor: name for name, actor in names.actors.items()}
             facts = {
                 "when": round(impact.time, 1),
-                "who": list(map(names.of_actor, impact.ids)),
+                "who": list(map(name_by_actor.get, impact.ids)),
                 "actor_ids": list(impact.ids),
                 "where": (np.round(impact.positions, 2) + 0.0).tolist(),
                 "last_seen": [names.last_seen.get(actor) for actor in impact.ids],
@@ -398,35 +414,29 @@ def truth_facts(
     }
 
 
-def why_facts(dataset: Dataset, scenario: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the design of an accident and how its actors met; None without a collision.
+def describe_accident(dataset: Dataset, scenario: Mapping[str, Any]) -> Facts | None:
+    """Describe an accident's design and how its actors collide; None without a collision.
 
-    Values are in metres, seconds, radians.
+    Values are in metres, seconds and radians.
     """
     if scenario["collision"] is None:
         return None
     facts = {name: scenario[name] for name in _DESIGN_FIELDS}
     try:
         contact = collision(dataset, scenario["token"])
-    except NotAvailableError:  # the two are never labelled together
-        return facts | dict.fromkeys(_CONTACT_FIELDS)
+    except NotAvailableError:  # No label shows both actors.
+        contact = None
     for name in _CONTACT_FIELDS:
-        facts[name] = None if contact is None else _plain(getattr(contact, name))
+        facts[name] = None if contact is None else _to_json_value(getattr(contact, name))
     return facts
 
 
-def _plain(value: Any) -> Any:
-    """Return a value in JSON form: numbers with two decimals, None for NaN."""
+def _to_json_value(value: Any) -> Any:
+    """Convert a value for JSON: numbers get two decimals, and NaN becomes None."""
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return list(map(_plain, value))
+        return list(map(_to_json_value, value))
     if isinstance(value, float):
         if math.isnan(value):
             return None
         return round(value, 2) + 0.0
     return value
-
-
-def _frames(seconds: float | None) -> int | None:
-    if seconds is None:
-        return None
-    return round(seconds / FRAME_PERIOD)

@@ -1,8 +1,8 @@
 """Arithmetic of other libraries, bit-exact and pinned by golden files.
 
-Users of the devkit need not read this. The released code calls these libraries, and its labels and
-scores depend on their last bits. Each rule is written out here for one version of the library, so
-that results do not depend on the installed version.
+Users of the devkit need not read this package. The released code calls these libraries, and its
+labels and scores depend on their last bits. Each rule is written out here for one version of the
+library, so that results do not depend on the installed version.
 
 | module | library | content |
 |---|---|---|
@@ -12,5 +12,5 @@ that results do not depend on the installed version.
 | `single_precision` | torch 2.13 | small float32 matrices, sampling points of the released warps |
 | `peaks` | torch 2.13 | the highest cells of a map, and the nearest of them for each point |
 
-Nothing here knows the devkit: arrays and numbers go in and come out.
+Nothing here depends on the devkit's types: functions take and return arrays and numbers.
 """

@@ -1,14 +1,12 @@
-"""Gaps between the outlines of the instances of one frame, as the released code measures them.
+"""Gaps between the outlines of one frame's instances, as the released code measures them.
 
 The released code takes `find_contours(mask * id, 0.1)[0]` and then `approximate_polygon(…,
-tolerance=0.5)`. Both are written out here (scikit-image 0.20, BSD), the first to the last bit. The
+tolerance=0.5)`. Both are written out here (scikit-image 0.20, BSD); the first is bit-exact. The
 second decides ties at exactly its tolerance by the last bit of trigonometric functions, which
-differs between machines; here lengths that differ by less than `LENGTH_TIE` compare equal.
+differs between machines; here lengths that differ by less than `LENGTH_TIE` count as equal.
 
-Points are (row, column), whole numbers in the middle of cells, counted in the full image.
+Points are (row, column) in the full image; integers are cell centres.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -25,20 +23,22 @@ A higher id moves the outline outwards.
 TOLERANCE: Final = 0.5
 """Largest error of a simplified outline, cells."""
 LENGTH_TIE: Final = 1e-9
-"""Lengths that differ by less than this compare equal, cells."""
+"""Lengths that differ by less than this count as equal, cells."""
 NO_OUTLINE: Final = 1e11
-"""The released code's distance to an instance without an outline, cells.
+"""Distance that the released code assumes to an instance without an outline, cells.
 
-The map lacks such an instance, or it is too small there.
+An instance has no outline if it is absent from the map or too small in it.
 """
-# Slices of the rows and of the columns.
+# Row slice and column slice.
 _Window = tuple[slice, slice]
+# Edges of a square.
 _TOP, _LEFT, _BOTTOM, _RIGHT = range(4)
-_BORDER_SQUARE: Final = 16
-# The edge at which an outline leaves a square, by the edge at which it enters, with the mask to its
+# Marks the squares at the image's border; the others hold a sum of cells from 0 to 15.
+_BORDER_SQUARE = 16
+# Edge where an outline leaves a square, by the edge where it enters, with the mask to its
 # right. The index is the sum of the square's cells in the mask: 1 top left, 2 top right, 4 bottom
-# left, 8 bottom right. If there are two entries, the first is scikit-image's first.
-_EXITS: Final[tuple[dict[int, int], ...]] = (
+# left, 8 bottom right. Where there are two entries, scikit-image tries the first one first.
+_EXITS: tuple[dict[int, int], ...] = (
     {},
     {_TOP: _LEFT},
     {_RIGHT: _TOP},
@@ -57,52 +57,55 @@ _EXITS: Final[tuple[dict[int, int], ...]] = (
     {},
     {},
 )
-_ENTRIES: Final = tuple({leave: enter for enter, leave in exits.items()} for exits in _EXITS)
-_OPPOSITE: Final = (_BOTTOM, _RIGHT, _TOP, _LEFT)
+# Edge where an outline enters a square, by the edge where it leaves.
+_ENTRIES = tuple(dict(zip(exits.values(), exits, strict=True)) for exits in _EXITS)
+_OPPOSITE = (_BOTTOM, _RIGHT, _TOP, _LEFT)
 
 
 def pair_gaps(
     image: AnyArray, ids: IntArray, *, below: float = np.inf
 ) -> tuple[IntArray, FloatArray]:
-    """Return pairs of instances and the distances between their outlines in a map.
+    """Return the pairs of instances in a map, and the distances between their outlines.
 
     Args:
         image: Instance ids, shape (H, W).
         ids: Ids of the instances, ascending.
-        below: Pairs that cannot be nearer than this are left out, cells.
+        below: Distance, cells; pairs that cannot be nearer are left out.
 
     Returns:
-        Pairs of ids, shape (P, 2), ascending; and distances, shape (P,), cells: 0 where outlines
-        overlap, `NO_OUTLINE` where an instance has none.
+        Pairs of ids, shape (P, 2), ascending; and distances, shape (P,), cells: 0 where the
+        outlines overlap, `NO_OUTLINE` where an instance has no outline.
     """
-    windows = _windows(image, ids)
+    windows = _find_windows(image, ids)
     first, second = np.triu_indices(len(ids), 1)
-    close = _box_gaps(windows)[first, second] < below
+    close = _measure_window_gaps(windows)[first, second] < below
     first = first[close]
     second = second[close]
-    shapes = _shapes(image, ids, windows, np.unique([first, second]))
+    shapes = _make_polygons(image, ids, windows, np.unique([first, second]))
     pairs = np.stack([ids[first], ids[second]], axis=1)
-    return pairs, _distances(shapes[first], shapes[second])
+    return pairs, _measure_distances(shapes[first], shapes[second])
 
 
 def first_outline(image: AnyArray, instance_id: int, window: _Window) -> FloatArray:
     """Return the outline of an instance that scikit-image lists first, shape (P, 2).
 
-    It runs around the instance's part with the highest cell. Cells that only touch at a corner are
-    two parts. Rows and columns are as in `find_contours`, beginning where the last segment in
-    row-major order ends.
+    The outline runs around the part of the instance that contains the topmost cell; cells that
+    touch only at a corner belong to different parts. Rows and columns are as in `find_contours`.
+    The outline begins where the last segment in row-major order ends.
 
     Args:
         image: Instance ids, shape (H, W).
         instance_id: Id of the instance.
-        window: Rows and columns that hold the instance.
+        window: Rows and columns that contain the instance.
     """
     rows, columns = window
     top = max(rows.start - 1, 0)
     left = max(columns.start - 1, 0)
-    mask = (image[top : rows.stop + 1, left : columns.stop + 1] == instance_id).view(np.uint8)
-    shape = (mask.shape[0] + 1, mask.shape[1] + 1)
-    squares = np.full(shape, _BORDER_SQUARE, dtype=np.uint8)
+    is_instance = image[top : rows.stop + 1, left : columns.stop + 1] == instance_id
+    mask = is_instance.view(np.uint8)
+    height, width = mask.shape
+    width += 1
+    squares = np.full((height + 1, width), _BORDER_SQUARE, dtype=np.uint8)
     inner = squares[1:-1, 1:-1]
     inner[:] = mask[:-1, :-1]
     inner += 2 * mask[:-1, 1:]
@@ -111,14 +114,16 @@ def first_outline(image: AnyArray, instance_id: int, window: _Window) -> FloatAr
     crossed = np.flatnonzero((squares > 0) & (squares < 15))
     if not len(crossed):
         return np.zeros((0, 2))
-    width = squares.shape[1]
-    cells, edges = _follow(squares.tobytes(), width, int(crossed[0]))
+    cells, edges = _follow_outline(squares.tobytes(), width, int(crossed[0]))
     row, column = np.divmod(np.array(cells), width)
-    return _points(row + (top - 1), column + (left - 1), np.array(edges), instance_id)
+    return _place_crossings(row + (top - 1), column + (left - 1), np.array(edges), instance_id)
 
 
 def simplified_outlines(outlines: list[FloatArray]) -> list[FloatArray]:
-    """Return outlines simplified by Douglas and Peucker at `TOLERANCE`; all at once."""
+    """Simplify outlines (each (P, 2)) with the Douglas–Peucker algorithm, all at once.
+
+    The tolerance is `TOLERANCE`, in cells.
+    """
     lengths = np.array([len(outline) for outline in outlines], dtype=np.int64)
     if not lengths.any():
         return outlines
@@ -129,14 +134,15 @@ def simplified_outlines(outlines: list[FloatArray]) -> list[FloatArray]:
     first = starts[has_points]
     last = ends[has_points] - 1
     is_corner = np.zeros(len(points), dtype=bool)
-    is_corner[first] = is_corner[last] = True
+    is_corner[first] = True
+    is_corner[last] = True
     while True:
         has_inner = last - first > 1
         first = first[has_inner]
         last = last[has_inner]
         if not len(first):
             break
-        farthest, distance = _farthest(points, first, last)
+        farthest, distance = _find_farthest(points, first, last)
         split = distance > TOLERANCE + LENGTH_TIE
         first = first[split]
         farthest = farthest[split]
@@ -150,8 +156,8 @@ def simplified_outlines(outlines: list[FloatArray]) -> list[FloatArray]:
     return simplified
 
 
-def _windows(image: AnyArray, ids: IntArray) -> list[_Window | None]:
-    """Return the window of each instance; None for instances that are not in the map.
+def _find_windows(image: AnyArray, ids: IntArray) -> list[_Window | None]:
+    """Return each instance's bounding rows and columns; None for instances that are not in the map.
 
     The instances are renumbered, since ids may be of any size.
     """
@@ -163,14 +169,16 @@ def _windows(image: AnyArray, ids: IntArray) -> list[_Window | None]:
     known = np.append(ids, -1)[rank] == cell_ids
     ranks = np.zeros(image.shape, dtype=np.int32)
     ranks.reshape(-1)[cells[known]] = rank[known] + 1
-    windows: list[Any] = find_objects(ranks, len(ids)) if len(ids) else []
+    if not len(ids):
+        return []
+    windows: list[Any] = find_objects(ranks, len(ids))
     return windows
 
 
-def _box_gaps(windows: Sequence[_Window | None]) -> FloatArray:
+def _measure_window_gaps(windows: Sequence[_Window | None]) -> FloatArray:
     """Return lower bounds of the distances between outlines of instances, shape (N, N), cells.
 
-    They are the gaps between the boxes of the instances, each widened by a cell on all sides.
+    These are the gaps between the windows of the instances, each widened by a cell on all sides.
     """
     lowest, highest = np.full((2, len(windows), 2), np.nan)
     for index, window in enumerate(windows):
@@ -178,16 +186,17 @@ def _box_gaps(windows: Sequence[_Window | None]) -> FloatArray:
             lowest[index] = [span.start - 1 for span in window]
             highest[index] = [span.stop for span in window]
     gaps = np.maximum(lowest[:, None] - highest, lowest - highest[:, None])
-    distances: FloatArray = np.sqrt((np.maximum(gaps, 0) ** 2).sum(axis=-1))
+    gaps = np.maximum(gaps, 0)
+    distances: FloatArray = np.sqrt((gaps**2).sum(axis=-1))
     return np.where(np.isnan(distances), NO_OUTLINE, distances)
 
 
-def _shapes(
+def _make_polygons(
     image: AnyArray, ids: IntArray, windows: Sequence[_Window | None], indices: IntArray
 ) -> AnyArray:
     """Return shapely's polygons of some instances, shape (N,).
 
-    None for the instances that are not in `indices`, and for instances without an outline.
+    The entry is None for instances that are not in `indices` or have no outline.
     """
     import shapely
 
@@ -201,40 +210,43 @@ def _shapes(
     owners = []
     rings = []
     for index, points in zip(present, simplified_outlines(outlines), strict=True):
-        if _num_corners(points) >= 3:
+        if _count_corners(points) >= 3:
             owners.append(index)
             rings.append(points)
     shapes = np.full(len(ids), None)
     if rings:
-        ring_numbers = np.repeat(np.arange(len(rings)), [len(points) for points in rings])
+        ring_lengths = [len(points) for points in rings]
+        ring_numbers = np.repeat(np.arange(len(rings)), ring_lengths)
         linear_rings = shapely.linearrings(np.concatenate(rings), indices=ring_numbers)
         shapes[owners] = shapely.polygons(linear_rings)
     return shapes
 
 
-def _num_corners(outline: FloatArray) -> int:
-    """Return the number of corners of an outline, whether or not it ends at its first point."""
+def _count_corners(outline: FloatArray) -> int:
+    """Count the corners of an outline; a closing point equal to the first one does not count."""
     count = len(outline)
     is_closed = count > 1 and bool((outline[0] == outline[-1]).all())
     return count - int(is_closed)
 
 
-def _distances(first: AnyArray, second: AnyArray) -> FloatArray:
-    """Return the distances between polygons, `NO_OUTLINE` where one is missing."""
+def _measure_distances(first: AnyArray, second: AnyArray) -> FloatArray:
+    """Return the distances between paired polygons; `NO_OUTLINE` where either one is missing."""
     import shapely
 
     distances = shapely.distance(first, second)
     return np.where(np.isnan(distances), NO_OUTLINE, distances)
 
 
-def _follow(squares: bytes, width: int, start: int) -> tuple[list[int], list[int]]:
+def _follow_outline(squares: bytes, width: int, start: int) -> tuple[list[int], list[int]]:
     """Return the squares of an outline, and the edges at which it leaves them.
 
-    The outline passes through square `start`, its first one in row-major order.
+    `start` is the outline's first square in row-major order.
     """
     moves = (-width, -1, width, 1)
     first_entry = next(iter(_EXITS[squares[start]]))
-    cells, edges, ranks = [], [], []
+    cells = []
+    edges = []
+    ranks = []
     cell = start
     entry = first_entry
     while squares[cell] != _BORDER_SQUARE:
@@ -242,9 +254,9 @@ def _follow(squares: bytes, width: int, start: int) -> tuple[list[int], list[int
         leave = exits[entry]
         cells.append(cell)
         edges.append(leave)
-        is_second = len(exits) > 1 and entry != next(iter(exits))
-        ranks.append(2 * cell + is_second)
-        cell = cell + moves[leave]
+        is_second_entry = entry != next(iter(exits))
+        ranks.append(2 * cell + is_second_entry)
+        cell += moves[leave]
         entry = _OPPOSITE[leave]
         if cell == start and entry == first_entry:
             latest = ranks.index(max(ranks))
@@ -258,20 +270,21 @@ def _follow(squares: bytes, width: int, start: int) -> tuple[list[int], list[int
         previous_cells.append(cell)
         previous_edges.append(leave)
         entry = _ENTRIES[squares[cell]][leave]
-        cell = cell + moves[entry]
+        cell += moves[entry]
         leave = _OPPOSITE[entry]
     previous_cells.append(cell)
     previous_edges.append(leave)
     return previous_cells[::-1] + cells, previous_edges[::-1] + edges
 
 
-def _points(row: IntArray, column: IntArray, edge: IntArray, instance_id: int) -> FloatArray:
-    """Return where the outline crosses edges of squares, shape (P, 2).
+def _place_crossings(
+    row: IntArray, column: IntArray, edge: IntArray, instance_id: int
+) -> FloatArray:
+    """Return the points where the outline crosses edges of squares, shape (P, 2).
 
-    The top left cells of the squares are at `row` and `column`.
+    `row` and `column` locate the squares' top left cells.
     """
-    # The share of the way from a cell beside the instance to one of its own, and in the other
-    # direction.
+    # The fraction of the way from a cell next to the instance to one of its cells, and back.
     inwards = LEVEL / instance_id
     outwards = (LEVEL - instance_id) / -instance_id
     across = np.array([inwards, 0.0, outwards, 1.0])
@@ -279,30 +292,35 @@ def _points(row: IntArray, column: IntArray, edge: IntArray, instance_id: int) -
     return np.stack([row + down[edge], column + across[edge]], axis=1)
 
 
-def _farthest(points: FloatArray, first: IntArray, last: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return the farthest point from each line, the first of ties, and its distance.
+def _find_farthest(
+    points: FloatArray, first: IntArray, last: IntArray
+) -> tuple[IntArray, FloatArray]:
+    """Return the point farthest from each line (the first one in a tie), and its distance.
 
     Args:
         points: Points of outlines, shape (P, 2).
-        first: Numbers of the points at which the lines begin, shape (L,).
-        last: Numbers of the points at which the lines end, shape (L,).
+        first: Indices of the first points of the lines, shape (L,).
+        last: Indices of the last points of the lines, shape (L,).
     """
     counts = last - first - 1
     begins = np.cumsum(counts) - counts
     line = np.repeat(np.arange(len(first)), counts)
     index = np.arange(len(line)) - begins[line] + first[line] + 1
     start = points[first]
-    direction = points[last] - points[first]
-    dr, dc = direction[line].T
-    r, c = (points[index] - start[line]).T
-    to_end_r = r - dr
-    to_end_c = c - dc
-    beside = (r * dr + c * dc > 0) & (-to_end_r * dr - to_end_c * dc > 0)
+    direction = points[last] - start
+    # Down the rows and across the columns.
+    line_down, line_across = direction[line].T
+    down, across = (points[index] - start[line]).T
+    end_down = down - line_down
+    end_across = across - line_across
+    is_after_start = down * line_down + across * line_across > 0
+    is_before_end = -end_down * line_down - end_across * line_across > 0
+    start_squared = down * down + across * across
+    end_squared = end_down * end_down + end_across * end_across
+    distance = np.sqrt(np.minimum(start_squared, end_squared))
     length = np.sqrt((direction**2).sum(axis=1))
-    to_start_squared = r * r + c * c
-    to_end_squared = to_end_r * to_end_r + to_end_c * to_end_c
-    distance = np.sqrt(np.minimum(to_start_squared, to_end_squared))
-    np.divide(np.abs(r * dc - c * dr), length[line], out=distance, where=beside)
+    area = np.abs(down * line_across - across * line_down)
+    np.divide(area, length[line], out=distance, where=is_after_start & is_before_end)
     largest = np.maximum.reduceat(distance, begins)
     ties = np.flatnonzero(distance >= largest[line] - LENGTH_TIE)
     _, first_tie = np.unique(line[ties], return_index=True)

@@ -1,12 +1,12 @@
-"""Small rigid matrices and sampling points of warps, with the float32 of the released code's torch.
+"""Small rigid matrices and the sample points of warps, in the released code's float32 (torch).
 
-A nearest warp rounds a sample point to a cell. For points close to a border between cells the last
-bit of the matrix decides. The labels' warps therefore repeat each rounding: products summed in
-order of the inner index, without fused multiply-add, the inverse by elimination as LAPACK's getrf
-and getrs do it, and sine and cosine by a polynomial. Checked against torch 2.13 on random poses:
-all bits are equal.
+A nearest warp rounds a sample point to a cell. For points close to a border between cells, the last
+bit of the matrix decides. The label warps therefore reproduce each rounding: products are summed in
+the order of the inner index, without fused multiply-add; the inverse is computed by elimination, as
+in LAPACK's getrf and getrs; sine and cosine are computed by a polynomial. Checked against torch
+2.13 on random poses: all bits are equal.
 
-The sampling points of target cells follow a protocol's rule, which `motion.warping` explains:
+The sample points of target cells follow a protocol's rule, explained in `motion.warping`:
 `stretched_lines`, `exact_lines` or `fiery_lines`.
 """
 
@@ -23,9 +23,9 @@ from deepaccident_devkit.support.arrays import AnyArray, Float32Array, FloatArra
 _Axis = tuple[float, float, float]
 CellIndices = NDArray[np.intp]
 OUTSIDE: Final = -1
-"""Index of a cell for a sample point outside the grid, which has no value."""
+"""Cell index of a sample point outside the grid, where there is no value to read."""
 
-_SINE: Final = (
+_SINE = (
     2.605780704850265e-06,
     -0.00019809602928568679,
     0.008333066246354204,
@@ -43,30 +43,30 @@ same results: of 24 million angles in [−π, π] very few differ.
 def pose_matrices(vectors: ArrayLike) -> Float32Array:
     """Return the matrices (…, 4, 4) of 6-vectors (…, 6): (Rx · Ry) · Rz.
 
-    The devkit's own matrices are the same in float64.
+    The devkit's own function computes the same matrices in float64.
     """
     vector = np.asarray(vectors, dtype=np.float32)
     sines, cosines = sines_and_cosines(vector[..., 3:])
     cx, cy, cz = np.moveaxis(cosines, -1, 0)
     sx, sy, sz = np.moveaxis(sines, -1, 0)
-    xy = sx * sy
-    yx = cx * sy
+    sx_sy = sx * sy
+    cx_sy = cx * sy
     rows = (
         (cy * cz, -cy * sz, sy),
-        (xy * cz + cx * sz, cx * cz - xy * sz, -sx * cy),
-        (sx * sz - yx * cz, yx * sz + sx * cz, cx * cy),
+        (sx_sy * cz + cx * sz, cx * cz - sx_sy * sz, -sx * cy),
+        (sx * sz - cx_sy * cz, cx_sy * sz + sx * cz, cx * cy),
     )
-    result = _rigid(np.float32(0), vector[..., :3])
+    matrix = _make_transforms(np.float32(0), vector[..., :3])
     for row, values in enumerate(rows):
         for column, value in enumerate(values):
-            result[..., row, column] = value
-    return result
+            matrix[..., row, column] = value
+    return matrix
 
 
 def sines_and_cosines(angle: ArrayLike) -> Float32Array:
     """Return sines and cosines of float32 angles (…), radians, shape (2, …).
 
-    Cosines are sines of the angles plus a quarter turn.
+    Cosines are computed as sines of the angle plus a quarter turn.
     """
     radians = np.asarray(angle, dtype=np.float32).astype(np.float64)
     turns = radians / np.pi
@@ -80,8 +80,9 @@ def sines_and_cosines(angle: ArrayLike) -> Float32Array:
         ratio *= square
         ratio += factor
     ratio *= reduced
-    result: Float32Array = np.where(half_turns % 2 == 0, ratio, -ratio).astype(np.float32)
-    return result
+    is_even = half_turns % 2 == 0
+    values: Float32Array = np.where(is_even, ratio, -ratio).astype(np.float32)
+    return values
 
 
 def product(first: Float32Array, second: Float32Array) -> Float32Array:
@@ -95,7 +96,7 @@ def product(first: Float32Array, second: Float32Array) -> Float32Array:
 def fused_product(first: Float32Array, second: Float32Array) -> Float32Array:
     """Return `product` with fused multiply-add.
 
-    Numpy's own products of two matrices use it on today's processors.
+    Numpy's matrix products use it on today's processors.
     """
     total = np.zeros((*first.shape[:-1], second.shape[-1]), dtype=np.float32)
     for inner in range(first.shape[-1]):
@@ -109,15 +110,16 @@ def fused_product(first: Float32Array, second: Float32Array) -> Float32Array:
 def rigid_inverse(matrix: Float32Array) -> Float32Array:
     """Return the inverses of rigid transforms (…, 4, 4), by transposing their rotations."""
     rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
-    translation = -product(rotation, matrix[..., :3, 3:])[..., 0]
-    return _rigid(rotation, translation)
+    rotated_translation = product(rotation, matrix[..., :3, 3:])
+    translation = -rotated_translation[..., 0]
+    return _make_transforms(rotation, translation)
 
 
 def inverse(matrix: Float32Array) -> Float32Array:
     """Return the inverses of transforms with a last row of (0, 0, 0, 1), shape (N, 4, 4).
 
-    The method is elimination with row exchanges. All products with the last row are zero, and its
-    diagonal is one: its steps are left out.
+    The method is elimination with row exchanges. The steps for the last row are skipped, because
+    all products with it are zero and its diagonal element is one.
     """
     factors = matrix.copy()  # the lower and the upper factor in one array
     index = np.arange(len(factors))
@@ -144,8 +146,10 @@ def inverse(matrix: Float32Array) -> Float32Array:
     return solution
 
 
-def _rigid(rotation: NDArray[Any] | np.float32, translation: NDArray[Any]) -> Float32Array:
-    """Return rigid transforms (…, 4, 4) of rotations (…, 3, 3) and translations (…, 3)."""
+def _make_transforms(
+    rotation: NDArray[Any] | np.float32, translation: NDArray[Any]
+) -> Float32Array:
+    """Build rigid transforms (…, 4, 4) from rotations (…, 3, 3) and translations (…, 3)."""
     result = np.zeros((*translation.shape[:-1], 4, 4), dtype=np.float32)
     result[..., :3, :3] = rotation
     result[..., :3, 3] = translation
@@ -154,16 +158,16 @@ def _rigid(rotation: NDArray[Any] | np.float32, translation: NDArray[Any]) -> Fl
 
 
 class SamplingLine(NamedTuple):
-    """Rows, or columns, at which target cells sample with N matrices.
+    """The rows, or the columns, at which target cells sample the source, for N matrices.
 
-    They are `finish(of_row + of_column + shift)`.
+    Each is computed as `finish(of_row + of_column + shift)`.
 
     Attributes:
         of_row: Contribution of a target cell's row, shape (N, H).
         of_column: Contribution of a target cell's column, shape (N, W).
         shift: Contribution to every cell, shape (N,).
-        finish: Function from sums to cells of the source, 0 the first cell's centre; may write into
-            its argument.
+        finish: Converts these sums to cells of the source, where 0 is the first cell's centre; may
+            overwrite its argument.
     """
 
     of_row: AnyArray
@@ -172,26 +176,26 @@ class SamplingLine(NamedTuple):
     finish: Callable[[AnyArray], AnyArray]
 
     def points(self, matrix: int) -> AnyArray:
-        """Return the sampling points of all target cells with one of the matrices, shape (H, W)."""
-        point = np.add.outer(self.of_row[matrix], self.of_column[matrix])
-        point += self.shift[matrix]
-        return self.finish(point)
+        """Return the sample points of all target cells for one of the matrices, shape (H, W)."""
+        sums = np.add.outer(self.of_row[matrix], self.of_column[matrix])
+        sums += self.shift[matrix]
+        return self.finish(sums)
 
     def points_of(
         self, matrix: IntArray, row: IntArray, column: IntArray, run: IntArray
     ) -> AnyArray:
-        """Return the sampling points of some target cells, shape (P,), with the bits of `points`.
+        """Return the sample points of some target cells, shape (P,), bit-identical to `points`.
 
         Args:
-            matrix: Matrices of the runs, shape (R,).
-            row: Rows of the runs, shape (R,).
+            matrix: Index of each run's matrix, shape (R,).
+            row: Row of each run, shape (R,).
             column: Columns of the cells, shape (P,); the columns of matrix m count from m · W.
-            run: Runs of the cells, shape (P,).
+            run: Index of each cell's run, shape (P,).
         """
-        point = self.of_row[matrix, row].take(run)
-        point += self.of_column.reshape(-1).take(column)
-        point += self.shift[matrix].take(run)
-        return self.finish(point)
+        sums = self.of_row[matrix, row].take(run)
+        sums += self.of_column.reshape(-1).take(column)
+        sums += self.shift[matrix].take(run)
+        return self.finish(sums)
 
 
 def stretched_lines(
@@ -200,46 +204,49 @@ def stretched_lines(
     """Return the rows and columns at which the released warp samples a raster.
 
     Args:
-        planes: Factors of the target's metres along rows and along columns, and a shift, for rows
-            and for columns, shape (N, 2, 3).
+        planes: Affine maps from the target's to the source's metres along rows and along columns:
+            two factors and a shift each, shape (N, 2, 3).
         axes: Axes of the raster's rows and columns.
     """
-    rows = _released_coordinates(axes[0])
-    columns = _released_coordinates(axes[1])
+    row_axis, column_axis = axes
+    rows = _space_released_points(row_axis)
+    columns = _space_released_points(column_axis)
     lines = []
     for axis, plane in zip(axes, planes.swapaxes(0, 1), strict=True):
         of_row = plane[:, :1] * rows
         of_column = plane[:, 1:2] * columns
-        finish = functools.partial(_stretched, axis)
+        finish = functools.partial(_stretch_points, axis)
         lines.append(SamplingLine(of_row, of_column, plane[:, 2], finish))
     return lines[0], lines[1]
 
 
-def _stretched(axis: _Axis, point: AnyArray) -> AnyArray:
+def _stretch_points(axis: _Axis, sums: AnyArray) -> AnyArray:
     """Convert sums of metres (…) to cells along an axis, in place.
 
-    The outermost points are as in BEVerse's grid_sample.
+    The outermost points are treated as in BEVerse's grid_sample.
     """
     low, high, size = axis
     middle = (low + high) / 2
+    count = round((high - low) / size)
     if middle:
-        point -= np.float32(middle)
-    point /= np.float32((high - low) / 2)
-    point += np.float32(1)
-    point *= np.float32((round((high - low) / size) - 1) / 2)
-    return point
+        sums -= np.float32(middle)
+    sums /= np.float32((high - low) / 2)
+    sums += np.float32(1)
+    sums *= np.float32((count - 1) / 2)
+    return sums
 
 
 def exact_lines(planes: FloatArray, axes: tuple[_Axis, _Axis]) -> tuple[SamplingLine, SamplingLine]:
-    """Return `stretched_lines` by the cells' own centres, in float64."""
-    rows = _centers(axes[0])
-    columns = _centers(axes[1])
+    """Return the same lines as `stretched_lines`, but for the true cell centres and in float64."""
+    row_axis, column_axis = axes
+    rows = _space_centers(row_axis)
+    columns = _space_centers(column_axis)
     lines = []
     for plane, (low, _, size) in zip(planes.swapaxes(0, 1), axes, strict=True):
         of_row = plane[:, :1] / size * rows
         of_column = plane[:, 1:2] / size * columns
         shift = (plane[:, 2] - low) / size - 0.5
-        lines.append(SamplingLine(of_row, of_column, shift, lambda point: point))
+        lines.append(SamplingLine(of_row, of_column, shift, lambda sums: sums))
     return lines[0], lines[1]
 
 
@@ -256,25 +263,29 @@ def fiery_lines(
         y: Axis of the grid's columns.
     """
     sine, cosine = sines_and_cosines(yaw)
-    half = np.float32((x[1] - x[0]) / 2)
-    forward = _fiery_coordinates(x, float(half))
-    sideways = _fiery_coordinates(y, float(half))
+    low, high, _ = x
+    half = np.float32((high - low) / 2)
+    forward = _space_fiery_points(x, float(half))
+    sideways = _space_fiery_points(y, float(half))
 
-    def finish(axis: _Axis, point: AnyArray) -> AnyArray:
-        point -= np.float32(axis[0] / half)
-        # torch fuses these two steps: one rounding
-        return (point.astype(np.float64) * float(half / axis[2]) - 0.5).astype(np.float32)
+    finish_row = functools.partial(_finish_fiery_points, x, half)
+    finish_column = functools.partial(_finish_fiery_points, y, half)
+    row_line = SamplingLine(cosine * forward, sine * sideways, -tx[:, 0] / half, finish_row)
+    column_line = SamplingLine(-sine * forward, cosine * sideways, ty[:, 0] / half, finish_column)
+    return row_line, column_line
 
-    finish_row = functools.partial(finish, x)
-    finish_column = functools.partial(finish, y)
-    return (
-        SamplingLine(cosine * forward, sine * sideways, -tx[:, 0] / half, finish_row),
-        SamplingLine(-sine * forward, cosine * sideways, ty[:, 0] / half, finish_column),
-    )
+
+def _finish_fiery_points(axis: _Axis, half: np.float32, sums: AnyArray) -> AnyArray:
+    """Convert sums in units of `half` metres to cells along an axis; overwrites the sums."""
+    low, _, size = axis
+    sums -= np.float32(low / half)
+    # torch fuses these two steps, with one rounding.
+    cells = sums.astype(np.float64) * float(half / size) - 0.5
+    return cells.astype(np.float32)
 
 
 def take_cells(cells: AnyArray, indices: CellIndices, fill: float = 0) -> AnyArray:
-    """Return the cells (…, H·W) at indices, `fill` where the index is `OUTSIDE`."""
+    """Return the values of cells (…, H·W) at indices, and `fill` where an index is `OUTSIDE`."""
     padded = np.empty((*cells.shape[:-1], cells.shape[-1] + 1), dtype=cells.dtype)
     padded[..., :-1] = cells
     padded[..., OUTSIDE] = fill
@@ -287,8 +298,8 @@ def blend_cells(
 ) -> Float32Array:
     """Return the values of a raster at sample points, shape (…, H, W).
 
-    Each value is the weighted mean of the four cells around the point. The computation overwrites
-    the points.
+    Each value is the weighted mean of the four cells around a point. The arrays of points are
+    overwritten.
     """
     rows, columns = raster.shape[-2:]
     stride = columns + 3
@@ -306,7 +317,7 @@ def blend_cells(
     # All indices are valid; this mode is the fastest.
     result: Float32Array = cells.take(index, axis=-1, mode="wrap")
     result *= upper_share * left_share
-    # The memory of the shares is reused for the weights of the other three cells.
+    # The memory of the fractions is reused for the weights of the other three cells.
     upper_share *= column_share
     left_share *= row_share
     row_share *= column_share
@@ -319,9 +330,9 @@ def blend_cells(
 
 
 def _split_points(points: AnyArray, count: int) -> tuple[AnyArray, Float32Array]:
-    """Return the cell before each point, and the distance of the point from it.
+    """Return the cell before each point, and the point's distance from that cell.
 
-    The cells go from −1 (padding) to `count` (padding).
+    Cells range from −1 to `count`; both ends are padding.
     """
     np.clip(points, -1, count, out=points)
     cell_before = np.floor(points)
@@ -330,14 +341,16 @@ def _split_points(points: AnyArray, count: int) -> tuple[AnyArray, Float32Array]
 
 
 @functools.lru_cache(maxsize=64)
-def _released_coordinates(axis: _Axis) -> Float32Array:
+def _space_released_points(axis: _Axis) -> Float32Array:
     """Return metres from the first cell's centre to the last cell's *end*, evenly, shape (n,)."""
     low, high, size = axis
-    return _linspace(low + size / 2, high, round((high - low) / size))
+    first_center = low + size / 2
+    count = round((high - low) / size)
+    return _linspace(first_center, high, count)
 
 
 @functools.lru_cache(maxsize=64)
-def _centers(axis: _Axis) -> FloatArray:
+def _space_centers(axis: _Axis) -> FloatArray:
     """Return the cells' centres, shape (n,), metres."""
     low, high, size = axis
     numbers = np.arange(round((high - low) / size), dtype=np.float64)
@@ -346,22 +359,22 @@ def _centers(axis: _Axis) -> FloatArray:
 
 
 @functools.lru_cache(maxsize=64)
-def _fiery_coordinates(axis: _Axis, half: float) -> Float32Array:
-    """Return the cells' centres in units of `half` metres, shape (n,), float32.
+def _space_fiery_points(axis: _Axis, half: float) -> Float32Array:
+    """Return the cell centres in units of `half` metres, shape (n,), float32.
 
     On an axis from −half to half they equal torch's affine_grid.
     """
     low, high, size = axis
     count = round((high - low) / size)
     if (low, high) != (-half, half):
-        return (_centers(axis) / half).astype(np.float32)
+        return (_space_centers(axis) / half).astype(np.float32)
     return _linspace(-1, 1, count) * np.float32(count - 1) / np.float32(count)
 
 
 def _linspace(start: float, end: float, count: int) -> Float32Array:
     """Return torch's linspace in float32, shape (count,).
 
-    It has a rounded step, and goes from both ends to the middle with one rounding for each value.
+    The step is rounded; values are counted from both ends to the middle, with one rounding each.
     """
     start_value = np.float32(start)
     end_value = np.float32(end)

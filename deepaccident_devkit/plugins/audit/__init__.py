@@ -1,4 +1,4 @@
-"""Audits of splits, scores and readers: leaks, what scores depend on, and misread columns."""
+"""Audits of splits, scores and readers: leaks, shortcuts in scores, and misread columns."""
 
 from deepaccident_devkit.plugins.audit.reader import audit_reader, write_audit_release
 from deepaccident_devkit.plugins.audit.report import AuditFinding, AuditReport

@@ -1,8 +1,8 @@
-"""What the plug-in `audit` offers."""
+"""What the plug-in `audit` adds to the devkit."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.support.plugins import PROTOCOL_VERSION, LazyVerb, Plugin
 
@@ -28,14 +28,14 @@ def _check_splits() -> click.Command:
     return check_splits
 
 
-PLUGIN: Final = Plugin(
+PLUGIN = Plugin(
     name="audit",
     protocol_version=PROTOCOL_VERSION,
     verbs={
         "check reader": LazyVerb(
-            "Find columns that a reader of the files mistakes for others.", _check_reader
+            "Find columns that a reader of the files confuses with others.", _check_reader
         ),
-        "check scores": LazyVerb("Find what scores of accidents depend on.", _check_scores),
-        "check splits": LazyVerb("Find what stands on two sides of a split.", _check_splits),
+        "check scores": LazyVerb("Find what accident scores depend on.", _check_scores),
+        "check splits": LazyVerb("Find data that occurs in two parts of a split.", _check_splits),
     },
 )

@@ -1,6 +1,4 @@
-"""`AuditReport`: the findings of an audit, with remedies and the tables that they rest on."""
-
-from __future__ import annotations
+"""`AuditReport`: the findings of an audit, with remedies and the tables behind them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +9,12 @@ from deepaccident_devkit.support.reports import CheckReport, Report, Row
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditFinding(ShortRepr):
-    """A fault of splits, scores or a reader.
+    """A fault in splits, scores or a reader.
 
     Attributes:
-        kind: A word for programs, such as `twins` or `misread`.
-        what: A sentence that describes the fault and why it is wrong.
-        remedy: A remedy, as a sentence.
+        kind: A keyword for programs, such as `twins` or `misread`.
+        what: A sentence that describes the fault, and why it is one.
+        remedy: A sentence that explains what to do.
         number: Number of cases.
         examples: A few of the cases.
     """
@@ -30,11 +28,11 @@ class AuditFinding(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditReport(CheckReport):
-    """The findings of an audit, and the numbers of things that it compared.
+    """The findings of an audit, and what was compared.
 
     Attributes:
-        findings: The faults; empty if nothing that was compared is wrong.
-        tables: Name → rows, the heading first, which the findings rest on.
+        findings: The faults; empty if everything that was compared is right.
+        tables: Name → rows on which the findings are based; the first is the heading.
         notes: Sentences on how the numbers were computed, and on what was left out.
     """
 
@@ -44,20 +42,20 @@ class AuditReport(CheckReport):
 
     @property
     def is_good(self) -> bool:
-        """Whether there is no finding."""
+        """Whether there are no findings."""
         return not self.findings
 
     def named_tables(self) -> Mapping[str, Sequence[Row]]:
-        """Return the tables that the findings rest on."""
+        """Return the tables on which the findings are based."""
         return self.tables
 
     def to_text(self) -> str:
-        """Return a paragraph for each finding, what was compared, the tables and the notes."""
+        """Return the report as text: findings, what was compared, tables and notes."""
         paragraphs = []
         for finding in self.findings:
             examples = [f"such as {example}" for example in finding.examples]
             lines = [f"FOUND {finding.kind}: {finding.what}", *examples, finding.remedy]
             paragraphs.append("\n  ".join(lines))
         if self.exit_status == 0:
-            paragraphs.append("Nothing was found.")
+            paragraphs.append("No problems found.")
         return "\n\n".join([*paragraphs, self.basis_text(), Report.to_text(self), *self.notes])

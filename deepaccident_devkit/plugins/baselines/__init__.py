@@ -1,8 +1,8 @@
-"""Predictions without a model.
+"""Predictions without a trained model.
 
-The actors that a set of agents sees by the labels continue at a constant velocity or turn rate, or
-stand still (`outlook`). `predict` turns them into motion maps, accidents, detections and paths, and
-`predict_results` writes files of these.
+The actors that some agents see according to the labels continue at a constant velocity or turn
+rate, or stand still (`outlook`). `predict` turns this into motion maps, accidents, detections and
+paths; `predict_results` writes them to results files.
 """
 
 from deepaccident_devkit.plugins.baselines.outlook import (

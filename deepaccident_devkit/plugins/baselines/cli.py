@@ -12,15 +12,15 @@ from deepaccident_devkit.cli.agents import (
 )
 from deepaccident_devkit.cli.options import (
     PATH,
-    engine_of,
+    engine_options,
     model_parameters,
     open_release,
     refuse_unused,
     release_of,
     release_parameters,
     seed_parameter,
+    split_words,
     use_threads_sparingly,
-    words_of,
 )
 from deepaccident_devkit.cli.verbs import WordChoice, field_option, verb
 from deepaccident_devkit.deepaccident import DeepAccident
@@ -31,7 +31,7 @@ from deepaccident_devkit.plugins.baselines import MOTION_MODELS, Baseline, predi
 from deepaccident_devkit.plugins.baselines.predict_results import is_predicted
 from deepaccident_devkit.selection.samples import no_samples_text
 from deepaccident_devkit.support.files import writable_folder
-from deepaccident_devkit.support.parallel import workers_kept
+from deepaccident_devkit.support.parallel import keep_workers
 from deepaccident_devkit.support.plugins import need_plugin
 from deepaccident_devkit.support.text import choice, counted
 from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS, VEHICLE_AGENTS
@@ -39,7 +39,7 @@ from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.messages import Payload
 
 _SINGLE_AGENT = "single"
-# Names of the link's options as parameters of a verb.
+# Names of the link's options as parameters of a subcommand.
 _LINK_OPTIONS = ("latency", "pose_noise", "packet_loss", "seed", "budget")
 _RELEASED_HORIZON = Baseline().horizon
 # Default tasks, which are the tasks of trained models.
@@ -57,24 +57,27 @@ Examples:
 @click.argument("model")
 @release_parameters
 @click.option(
-    "--split", default="val", show_default=True, help="Name of a split, or a split file (.txt)."
+    "--split",
+    default="val",
+    show_default=True,
+    help="Split to predict: its name, or a split file (.txt).",
 )
-@cooperating_parameter("Agents that cooperate with each ego", "all; of a baseline: single")
+@cooperating_parameter("Agents that cooperate with each ego", "all; with a baseline: single")
 @click.option(
     "--task",
     "tasks",
     multiple=True,
     metavar="NAME[,NAME…]",
     default=_DEFAULT_TASKS,
-    help=f"Of a baseline: tasks to write results for: {', '.join(RESULTS_NAMES)}, or all.  "
+    help=f"With a baseline: tasks to write results for: {', '.join(RESULTS_NAMES)}, or all.  "
     f"[default: {','.join(_DEFAULT_TASKS)}]",
 )
 @click.option(
     "--horizon",
     default=_RELEASED_HORIZON,
     show_default=True,
-    help="Of a baseline: how many seconds to predict, in steps of 0.5; planning and forecasting "
-    "predict at least 3.",
+    help="With a baseline: how many seconds to predict, a multiple of 0.5; planning and "
+    "forecasting predict at least 3.",
 )
 @link_parameters()
 @field_option(Link, "packet_loss")
@@ -86,15 +89,15 @@ Examples:
     type=WordChoice(["evaluate", "all"]),
     default="evaluate",
     show_default=True,
-    help="evaluate: samples within the horizon before the end. all: two samples per second of each "
-    "scenario.",
+    help="Samples to predict. evaluate: samples within the horizon before the end of a scenario. "
+    "all: two per second of each scenario.",
 )
 @click.option(
     "--scope",
     type=WordChoice(["accident", "all"]),
     default="accident",
     show_default=True,
-    help="Accident scenarios only, or all scenarios.",
+    help="Predict only accident scenarios, or all scenarios.",
 )
 @model_parameters
 @click.option("--out", required=True, type=PATH, metavar="DIR", help="Folder to write into.")
@@ -102,16 +105,16 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
     """Predict a split of the release in DATAROOT.
 
     MODEL is the folder of a run of `deepaccident train`, a file of weights, or `tiny` or
-    `tiny_lidar`, which the devkit ships. Or a baseline, which needs no training:
-    `constant_velocity`, `constant_turn_rate` or `standing` say how actors go on that some agents
-    see. The files motion/, accident.json, … are what `deepaccident evaluate` takes. The path that a
-    baseline plans for a vehicle is its own, if it goes on so.
+    `tiny_lidar`, two trained models of the devkit. MODEL can also be a baseline, which needs no
+    training: `constant_velocity`, `constant_turn_rate` or `standing`. A baseline assumes that each
+    actor that the agents see continues to move in this way, and so does the ego in its plan. The
+    command writes the files motion/, accident.json, …, for `deepaccident evaluate`.
     """
-    if not Path(model).exists():  # a wrong name fails before PyTorch is imported
+    if not Path(model).exists():  # so that a wrong name fails before PyTorch is imported
         names = (*MOTION_MODELS, *SHIPPED_WEIGHTS)
-        model = choice("MODEL, which is no file and no folder", model, names)
+        model = choice("MODEL", model, names, also=", or an existing file or folder")
     if purpose == "all":
-        refuse_unused("with --samples all, which are those of all scenarios", "scope")
+        refuse_unused("with --samples all, which always uses all scenarios", "scope")
     is_baseline = model in MOTION_MODELS
     seed = options["seed"]
     link = _pop_link(options, "boxes" if is_baseline else "bev")
@@ -120,42 +123,45 @@ def predict(model: str, purpose: Any, **options: Any) -> None:
     write_predictions(model, purpose, agents=agents, link=link, seed=seed, **options)
 
 
-@workers_kept()
+@keep_workers()
 def _predict_with_baseline(
     model: Any, purpose: Any, *, agents: Any, link: Link | None, out: Path, **options: Any
 ) -> None:
-    """Write a baseline's results of each task."""
+    """Write the results of a baseline for each task."""
     refuse_unused("with a baseline", "device", "images_cache")
     agents = agents or _SINGLE_AGENT
     if agents == _SINGLE_AGENT:
         refuse_unused("with --agents single, which has no partners", *_LINK_OPTIONS)
     if link is None or not (link.pose_noise or link.packet_loss):
         refuse_unused("without --pose-noise or --packet-loss", "seed")
-    words = [choice("--task", word, (*RESULTS_NAMES, "all")) for word in words_of(options["tasks"])]
+    words = [
+        choice("--task", word, (*RESULTS_NAMES, "all")) for word in split_words(options["tasks"])
+    ]
     tasks = [task for task in RESULTS_NAMES if task in words or "all" in words]
     baseline = Baseline(agents=agents, model=model, link=link, horizon=options["horizon"])
     folder = writable_folder(out)
     is_released = baseline.horizon == _RELEASED_HORIZON and options["scope"] == "accident"
     rules = "released" if is_released else "paper"
-    engine = engine_of(options)
+    engine = engine_options(options)
     dataset = open_release(**release_of(options), **engine)
     tokens = _samples(dataset, purpose, rules, baseline.horizon, options)
     for task in tasks:
-        path, task_tokens = folder / RESULTS_NAMES[task], tokens
+        path = folder / RESULTS_NAMES[task]
+        task_tokens = tokens
         if task == "planning":
             task_tokens = [token for token in tokens if agent_of(token) in VEHICLE_AGENTS]
         was_predicted = is_predicted(dataset, task, task_tokens, path, baseline)
         predict_results(dataset, task, task_tokens, path, baseline, **engine, progress=True)
-        note = ", which were there already" if was_predicted else ""
-        click.echo(f"{task}: {counted(len(task_tokens), 'sample')} in {path}{note}")
+        action = "kept" if was_predicted else "wrote"
+        click.echo(f"{action} {path} ({task}, {counted(len(task_tokens), 'sample')})")
 
 
 def _predict_with_network(
     model: str, purpose: Any, *, agents: Any, link: Link | None, seed: int, **options: Any
 ) -> None:
-    """Write a trained model's results of all tasks."""
+    """Write the results of a trained model for all tasks."""
     refuse_unused(
-        "with a trained model, which predicts all tasks as far as it was trained",
+        "with a trained model, which always predicts its own tasks and horizon",
         "tasks",
         "horizon",
     )
@@ -187,13 +193,13 @@ def _predict_with_network(
     )
     paths = predict_results(network, dataset, tokens, options["out"], config, progress=True)
     for task, path in paths.items():
-        click.echo(f"{task}: {counted(len(tokens), 'sample')} in {path}")
+        click.echo(f"wrote {path} ({task}, {counted(len(tokens), 'sample')})")
     if dataset.layout == "nuScenes":
-        # The plug-in opened the release, so it is installed.
+        # the plug-in opened the release, so it is installed
         from deepaccident_devkit.plugins.nuscenes.results import write_detections
 
         nuscenes_path = write_detections(dataset, paths["detection"])
-        click.echo(f"detection, for nuScenes' own evaluation: {nuscenes_path}")
+        click.echo(f"wrote {nuscenes_path} (detection, for nuScenes' own evaluation)")
     if model in SHIPPED_WEIGHTS and "scored" in network.notes:
         click.echo(scores_text(network, dataset, tokens, paths["motion"]))
 
@@ -201,8 +207,9 @@ def _predict_with_network(
 def _samples(
     dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: dict[str, Any]
 ) -> list[str]:
-    """Return the samples to predict; raises NotAvailableError if there are none."""
-    split, scope = options["split"], options["scope"]
+    """Return the samples to predict; raise NotAvailableError if there are none."""
+    split = options["split"]
+    scope = options["scope"]
     tokens = dataset.samples(split, purpose, rules, horizon=horizon, scope=scope)
     if not tokens:
         raise NotAvailableError(
@@ -212,12 +219,19 @@ def _samples(
 
 
 def _pop_link(options: dict[str, Any], payload: Payload) -> Link | None:
-    """Remove the link's options from a verb's options and return the link.
+    """Remove the link's options from a subcommand's options, and return the link.
 
-    Return None if nothing happens to the partners' data, which are `payload`.
+    Return None if nothing happens to the partners' data.
+
+    Args:
+        options: Options of the subcommand.
+        payload: What partners send.
     """
     values = {name: options.pop(name) for name in _LINK_OPTIONS}
     noise = values.pop("pose_noise") or None  # noise with a mean of 0 m would still have a spread
     if not (values["latency"] or noise or values["packet_loss"] or values["budget"]):
         return None
-    return Link(pose_noise=noise, payload=payload if values["budget"] else None, **values)
+    link_payload = None
+    if values["budget"]:
+        link_payload = payload
+    return Link(pose_noise=noise, payload=link_payload, **values)

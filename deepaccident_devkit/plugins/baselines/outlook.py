@@ -1,10 +1,9 @@
-"""`Outlook`: where an agent and its partners expect the actors that they see now.
+"""`Outlook`: how an agent and its partners expect the actors that they see to move.
 
-The visible actors and their positions come from the labels (`v2x.cooperation`): an oracle. Actors
-continue at a constant velocity, optionally with a constant turn rate, or all stand still.
+The visible actors and their positions are taken from the labels (`v2x.cooperation`), as if by a
+perfect detector. Actors continue at a constant velocity, optionally with a constant turn rate; or
+all of them stand still.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
@@ -21,97 +20,101 @@ from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
 
 MotionModel = Literal["constant_velocity", "constant_turn_rate", "standing"]
 MOTION_MODELS: Final[tuple[MotionModel, ...]] = get_args(MotionModel)
-# Number of recorded frames that turn rates look back: 0.5 s.
+# Largest number of recorded frames that turn rates look back (0.5 s).
 MAX_HISTORY_FRAMES: Final = 5
-# Turn below which a path is straight, to all digits.
-_MIN_TURN_RAD: Final = 1e-6
+# A path that turns less than this is straight to all digits.
+_MIN_TURN_RAD = 1e-6
 
 
 def constant_velocity(pose: FloatArray, velocity: FloatArray, times: FloatArray) -> FloatArray:
-    """Return poses of actors that move straight on at a constant velocity.
+    """Return the poses of actors that move straight ahead at a constant velocity.
 
     Args:
         pose: x, y (metres), yaw (radians) at time 0, in any right-handed frame, shape (N, 3).
-        velocity: Velocity over the ground in m/s, in the same frame, shape (N, 2); NaN counts as
-            standing.
-        times: Seconds, shape (T,).
+        velocity: Velocity over the ground in m/s, in the same frame, shape (N, 2); NaN means that
+            the actor stands still.
+        times: Seconds after time 0, shape (T,).
 
     Returns:
         x, y, yaw, shape (T, N, 3).
     """
-    return constant_turn_rate(pose, velocity, np.zeros(len(pose)), times)
+    turn_rate = np.zeros(len(pose))
+    return constant_turn_rate(pose, velocity, turn_rate, times)
 
 
 def constant_turn_rate(
     pose: FloatArray, velocity: FloatArray, turn_rate: FloatArray, times: FloatArray
 ) -> FloatArray:
-    """Return poses of actors at a constant speed, with velocity and heading turning alike.
+    """Return the poses of actors with a constant speed and a constant turn rate.
+
+    Velocity and heading turn at the same rate.
 
     Args:
-        pose: As in `constant_velocity`, shape (N, 3).
-        velocity: As in `constant_velocity`, shape (N, 2).
-        turn_rate: Radians a second, counter-clockwise, shape (N,); 0 goes straight on.
-        times: Seconds, shape (T,).
+        pose: x, y (metres), yaw (radians) at time 0, shape (N, 3).
+        velocity: Velocity over the ground in m/s, shape (N, 2); NaN means standing still.
+        turn_rate: Radians per second, counter-clockwise, shape (N,); 0 for straight ahead.
+        times: Seconds after time 0, shape (T,).
 
     Returns:
         x, y, yaw, shape (T, N, 3).
     """
-    known_velocity = np.where(np.isfinite(velocity), velocity, 0.0)
+    velocity = np.where(np.isfinite(velocity), velocity, 0.0)
+    velocity_x, velocity_y = velocity.T
     turn = times[:, None] * turn_rate
     is_straight = np.abs(turn) < _MIN_TURN_RAD
     divisor = np.where(is_straight, 1.0, turn)
     # ∫ (cos, sin)(rate · s) ds from 0 to t, over t
     forward_factor = np.where(is_straight, 1.0, np.sin(turn) / divisor)
     lateral_factor = np.where(is_straight, turn / 2, (1 - np.cos(turn)) / divisor)
-    x = forward_factor * known_velocity[:, 0] - lateral_factor * known_velocity[:, 1]
-    y = lateral_factor * known_velocity[:, 0] + forward_factor * known_velocity[:, 1]
-    offsets = times[:, None, None] * np.stack([x, y], axis=-1)
-    return np.concatenate([pose[:, :2] + offsets, (pose[:, 2] + turn)[..., None]], axis=-1)
+    mean_velocity_x = forward_factor * velocity_x - lateral_factor * velocity_y
+    mean_velocity_y = lateral_factor * velocity_x + forward_factor * velocity_y
+    x = pose[:, 0] + times[:, None] * mean_velocity_x
+    y = pose[:, 1] + times[:, None] * mean_velocity_y
+    yaw = pose[:, 2] + turn
+    return np.stack([x, y, yaw], axis=-1)
 
 
 def turn_rates(
     dataset: Dataset, sample: RowArgument, *, agents: Agents = "single", link: Link | None = None
 ) -> FloatArray:
-    """Return the turn rates of the actors of `seen_actors`, from headings now and up to 0.5 s ago.
+    """Return the turn rates of the actors that `seen_actors` returns.
 
-    The earlier heading of an actor is from the earliest of these moments at which the agents saw
-    it. Arguments and errors are as in `seen_actors`.
+    A turn rate is computed from the heading at t = 0 and an earlier heading: the first one within
+    the last 0.5 s at which the agents saw the actor. Arguments and errors are as in `seen_actors`.
 
     Returns:
-        Radians a second, counter-clockwise, shape (N,); 0 for actors that nobody saw before.
+        Radians per second, counter-clockwise, shape (N,); 0 for actors that no agent saw before.
     """
     scenario, agent, number = dataset.get("sample", sample)["token"].rsplit("/", 2)
-    present = seen_actors(dataset, sample, agents=agents, link=link, frame="world").boxes
-    rates = np.zeros(len(present))
-    is_known = np.zeros(len(present), dtype=bool)
-    delay = 0 if link is None else link.latency_frames
-    for age in range(min(MAX_HISTORY_FRAMES, int(number) - 1 - delay), 0, -1):
+    boxes = seen_actors(dataset, sample, agents=agents, link=link, frame="world").boxes
+    rates = np.zeros(len(boxes))
+    is_known = np.zeros(len(boxes), dtype=bool)
+    latency = 0 if link is None else link.latency_frames
+    history_frames = min(MAX_HISTORY_FRAMES, int(number) - 1 - latency)
+    for age in range(history_frames, 0, -1):
         if is_known.all():
             break
         token = sample_token(scenario, agent, int(number) - age)
-        past = seen_actors(dataset, token, agents=agents, link=link, frame="world").boxes
-        _, present_rows, past_rows = np.intersect1d(
-            present.actor_id, past.actor_id, return_indices=True
+        past_boxes = seen_actors(dataset, token, agents=agents, link=link, frame="world").boxes
+        _, rows, past_rows = np.intersect1d(
+            boxes.actor_id, past_boxes.actor_id, return_indices=True
         )
-        turns = present.yaw[present_rows] - past.yaw[past_rows]
-        is_matched = np.zeros(len(present), dtype=bool)
-        is_matched[present_rows] = True
-        matched_rates = np.zeros(len(present))
+        is_new = ~is_known[rows]
+        new_rows = rows[is_new]
+        turns = boxes.yaw[new_rows] - past_boxes.yaw[past_rows[is_new]]
         wrapped_turns = np.arctan2(np.sin(turns), np.cos(turns))
-        matched_rates[present_rows] = wrapped_turns / (age * FRAME_PERIOD)
-        is_new = is_matched & ~is_known
-        rates[is_new] = matched_rates[is_new]
-        is_known |= is_matched
+        rates[new_rows] = wrapped_turns / (age * FRAME_PERIOD)
+        is_known[new_rows] = True
     return rates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outlook(FrozenArrays):
-    """Actors in the present ego frame, and how they are expected to move; arrays are read-only.
+    """Actors in the ego frame at t = 0, and their expected motion; arrays are read-only.
 
     Attributes:
-        seen: The known actors; boxes in the frame `ego`.
-        turn_rate: Radians a second, counter-clockwise, shape (N,).
+        seen: The N actors that the agents see; their boxes are in the frame `ego`.
+        turn_rate: Radians per second, counter-clockwise, shape (N,).
     """
 
     seen: SeenActors
@@ -120,7 +123,7 @@ class Outlook(FrozenArrays):
     def poses(self, times: FloatArray) -> FloatArray:
         """Return the actors' poses at times (T,) in seconds, shape (T, N, 3).
 
-        Poses are x forward, y left (metres), yaw (radians), in the present ego frame.
+        A pose is x forward, y left (metres), yaw (radians), in the ego frame at t = 0.
         """
         boxes = self.seen.boxes
         pose = np.column_stack([boxes.center[:, :2], boxes.yaw])
@@ -135,27 +138,27 @@ def outlook(
     model: MotionModel = "constant_velocity",
     link: Link | None = None,
 ) -> Outlook:
-    """Return the outlook of some agents at a sample.
+    """Return the actors that some agents see in a sample, with their expected motion.
 
     Args:
         dataset: The release.
-        sample: Token or record; its agent is the ego, its frame the present.
-        agents: The cooperating agents.
-        model: Motion model of the actors; also at a constant turn rate, an actor that nobody saw
-            before goes straight on.
+        sample: Token or record of the sample; its agent is the ego, its frame is t = 0.
+        agents: Agents that cooperate.
+        model: Motion model of the actors; in all models, actors that no agent saw before do not
+            turn.
         link: Degradation of the partners' data; None for none.
 
     Raises:
-        ChoiceError: There is no such model.
-        DeepAccidentError: As in `seen_actors`.
+        ChoiceError: If `model` is not a motion model.
+        DeepAccidentError: For the reasons in `seen_actors`.
     """
     model = choice("model", model, MOTION_MODELS)
     actors = seen_actors(dataset, sample, agents=agents, link=link)
+    rates = np.zeros(len(actors.boxes))
     if model == "standing":
-        standing = replace(actors.boxes, velocity=np.zeros_like(actors.boxes.velocity))
-        actors = replace(actors, boxes=standing)
-    if model == "constant_turn_rate":
+        no_velocity = np.zeros_like(actors.boxes.velocity)
+        standing_boxes = replace(actors.boxes, velocity=no_velocity)
+        actors = replace(actors, boxes=standing_boxes)
+    elif model == "constant_turn_rate":
         rates = turn_rates(dataset, sample, agents=agents, link=link)
-    else:
-        rates = np.zeros(len(actors.boxes))
     return Outlook(seen=actors, turn_rate=rates)

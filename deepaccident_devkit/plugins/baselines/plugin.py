@@ -1,4 +1,4 @@
-"""What the plug-in `baselines` offers."""
+"""What the plug-in `baselines` adds to the devkit."""
 
 from __future__ import annotations
 

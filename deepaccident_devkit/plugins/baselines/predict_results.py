@@ -1,12 +1,11 @@
-"""Results files of the baselines: predictions of many samples, in the format of a model's results.
+"""Results files of the baselines: predictions of many samples, in the format of model results.
 
-Each scenario's samples first get their own results, beside the final file: a killed run only loses
-the scenarios that it was working on, and several processes share the scenarios.
+The results of each scenario are first written to a separate file. A killed run thus only loses the
+scenarios that it was working on, and several processes can share the scenarios.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
@@ -35,7 +34,7 @@ from deepaccident_devkit.plugins.baselines.predict import (
 )
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.parallel import Places, Store, unfinished_folder
-from deepaccident_devkit.support.text import choice, path_of, settle_choices
+from deepaccident_devkit.support.text import PathType, choice, path_of, settle_choices
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
@@ -50,14 +49,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Baseline:
-    """The agents that see, and the motion model of the actors that they see.
+    """A baseline: the agents that see, and the motion model of the actors that they see.
 
     Attributes:
-        agents: The cooperating agents, as in `v2x.cooperating_agents`.
+        agents: Agents that cooperate; see `v2x.cooperating_agents`.
         model: Motion model of the actors.
-        link: Degradation of the partners' data; None for none. Partners send boxes unless it
-            defines another payload.
-        horizon: Seconds to look ahead, for motion and accidents; a multiple of 0.5. Plans and
+        link: Degradation of the partners' data; None for none. Partners send boxes unless the link
+            sets another payload.
+        horizon: Seconds to look ahead for motion and accidents; a multiple of 0.5. Plans and
             forecasts look at least 3 s ahead.
     """
 
@@ -67,41 +66,40 @@ class Baseline:
     horizon: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check the model and the link; raises ChoiceError or ConfigError."""
+        """Raise a ChoiceError or ConfigError if the model or the link is not allowed."""
         checked_link(self.link)
         settle_choices(self, {"model": get_args(MotionModel)})
 
     @property
     def config(self) -> MotionLabelConfig:
-        """The config of the released labels with this horizon; raises ConfigError."""
-        return MotionLabelConfig(future_frames=len(path_times(self.horizon)))
+        """The config of the released labels with this horizon; raise ConfigError if not allowed."""
+        times = path_times(self.horizon)
+        return MotionLabelConfig(future_frames=len(times))
 
     def predict(self, dataset: Dataset, task: ResultsTask, token: str) -> Prediction:
-        """Predict a sample for a task; raises DeepAccidentError as the functions of `predict`."""
+        """Predict a sample for a task; errors are as in the functions of `predict`."""
         cooperation: dict[str, Any] = {"agents": self.agents, "link": self.link}
+        if task == "detection":
+            return predict_detections(dataset, token, **cooperation)
         if task == "motion":
             return predict_motion(
                 dataset, token, model=self.model, config=self.config, **cooperation
             )
-        if task == "accident":
-            return predict_accidents(
-                dataset, token, model=self.model, horizon=self.horizon, **cooperation
-            )
-        if task == "detection":
-            return predict_detections(dataset, token, **cooperation)
         extrapolation: dict[str, Any] = {"model": self.model, "horizon": self.horizon_of(task)}
+        if task == "accident":
+            return predict_accidents(dataset, token, **extrapolation, **cooperation)
         if task == "planning":
             return [predict_plan(dataset, token, **extrapolation)]
         return predict_forecasts(dataset, token, **extrapolation, **cooperation)
 
     def horizon_of(self, task: ResultsTask) -> float:
-        """Return the horizon of the predictions for a task, in seconds."""
+        """Return how far predictions for a task look ahead, in seconds."""
         if task in ("planning", "forecasting"):
             return max(self.horizon, PATH_HORIZON)
         return self.horizon
 
     def meta(self) -> dict[str, Any]:
-        """Return the notes on the baseline in a results file, as JSON holds them."""
+        """Return notes on the baseline for a results file, as JSON values."""
         model_text = self.model.replace("_", " ")
         return {
             "method": f"baseline: what the agents see by the labels, {model_text}",
@@ -116,49 +114,50 @@ def predict_results(
     dataset: Dataset,
     task: ResultsTask,
     tokens: Sequence[str],
-    out: str | os.PathLike[str],
+    out: PathType,
     baseline: Baseline | None = None,
     **engine: Unpack[Engine],
 ) -> Path:
     """Write a baseline's predictions of samples to a results file (a folder for motion).
 
-    The file lists one scenario after another, in the order in which the samples mention them. Its
-    notes have, as `bytes`, how much partners send.
+    The file lists one scenario after another, in the order in which `tokens` first contains them.
+    `bytes` in its notes is how much partners send.
 
-    The bytes do not depend on workers. If a call is interrupted, the same call continues it: only
-    the current scenarios are lost. Several processes with the same `out` share the scenarios.
-    Complete results of the same samples and settings are left unchanged.
+    The content does not depend on the number of workers. If a call is interrupted, the same call
+    resumes it: only the current scenarios are lost. Several processes with the same `out` share the
+    scenarios. Complete results of the same samples and settings are left unchanged.
 
     Args:
         dataset: The release.
-        task: A task of `RESULTS_NAMES`; planning only takes samples of vehicles.
+        task: A task in `RESULTS_NAMES`; for planning, all samples must be of vehicles.
         tokens: Tokens of the samples.
-        out: The file or folder to write.
+        out: File or folder to write.
         baseline: The baseline; None for a single vehicle and constant velocity.
-        **engine: `workers`, `executor` and `progress`, as in `parallel.Engine`.
+        **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Returns:
-        The path of the results.
+        Path of the results.
 
     Raises:
-        ChoiceError: There is no such task.
-        NotAvailableError: A cooperating agent is not in this (partial) release.
-        ResultsError: A token occurs twice, something else exists at `out`, or nothing can be
+        ChoiceError: If `task` is unknown.
+        NotAvailableError: If the (partial) release lacks a cooperating agent.
+        ResultsError: If a token occurs twice, something else exists at `out`, or nothing can be
             written.
-        SomeFailedError: Samples of some scenarios cannot be predicted; the others are done.
-        WorkerError: A worker was killed, or cannot do the work.
+        SomeFailedError: If samples of some scenarios cannot be predicted; the others are finished.
+        WorkerError: If a worker was killed, or cannot do the work.
     """
-    task, path = choice("task", task, get_args(ResultsTask)), path_of(out).absolute()
+    task = choice("task", task, get_args(ResultsTask))
+    path = path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
     work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))
     name = work.digest(scenarios)
-    store = Store(unfinished_folder(path), path, "predicts for it", ResultsError, name)
+    store = Store(unfinished_folder(path), path, "is predicting", ResultsError, name)
     if work.is_done(path, scenarios):
-        store.remove()  # of a process that was killed just before
+        store.remove()  # left behind by a process that was killed just before this
         return path
-    work.writer(path)  # refuses other content at the path
+    work.writer(path)  # raises if there is other content at the path
     for scenario_tokens in scenarios.values():
-        # An agent that is missing fails here, and not in every worker.
+        # so that a missing agent fails here, and not in every worker
         cooperating_agents(dataset, scenario_tokens[0], work.baseline.agents)
     jobs = {}
     for scenario, scenario_tokens in scenarios.items():
@@ -167,7 +166,9 @@ def predict_results(
     places = Places(reads=dataset.places, writes=(store.folder,))
     with store.shared() as turn:
         if not work.is_done(path, scenarios):  # another process may have finished meanwhile
-            store.run(_predict_scenario, jobs, label=work.task, places=places, **engine)
+            store.run(
+                _predict_scenario, jobs, label=f"Predicting ({work.task})", places=places, **engine
+            )
         if turn.alone() and not work.is_done(path, scenarios):
             sent_bytes: list[Any] = []
             for job in jobs.values():
@@ -184,12 +185,13 @@ def is_predicted(
     dataset: Dataset,
     task: ResultsTask,
     tokens: Sequence[str],
-    out: str | os.PathLike[str],
+    out: PathType,
     baseline: Baseline | None = None,
 ) -> bool:
     """Return whether `predict_results` has already written results with these arguments.
 
-    Raises ResultsError as `predict_results`.
+    Raises:
+        ResultsError: If a token occurs twice.
     """
     path = path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
@@ -198,22 +200,23 @@ def is_predicted(
 
 
 def samples_by_scenario(path: Path, tokens: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return the samples of each scenario, in the order of `tokens`.
+    """Group samples by scenario, in the order of `tokens`.
 
-    Raises ResultsError, with `path` in its message, if a sample occurs twice.
+    Raises:
+        ResultsError: If a sample occurs twice; the message names `path`.
     """
     scenarios: dict[str, dict[str, None]] = {}
     for token in tokens:
         scenario_tokens = scenarios.setdefault(scenario_of(token), {})
         if token in scenario_tokens:
-            raise ResultsError(f"{path}: {token}: comes twice; give each sample once")
+            raise ResultsError(f"{path}: {token}: appears twice; give each sample once")
         scenario_tokens[token] = None
     return {scenario: tuple(scenario_tokens) for scenario, scenario_tokens in scenarios.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """Settings of predictions; cheap to pickle."""
+    """The settings of predictions; cheap to pickle."""
 
     dataset: Dataset
     task: ResultsTask
@@ -222,14 +225,17 @@ class _Work:
 
     @property
     def payload(self) -> Payload | int:
-        """The payload of partners' messages."""
-        return (self.baseline.link and self.baseline.link.payload) or "boxes"
+        """What each partner sends."""
+        link = self.baseline.link
+        if link is None:
+            return "boxes"
+        return link.payload or "boxes"
 
     @property
     def meta(self) -> dict[str, Any]:
-        """The notes in the results, except the bytes that partners send.
+        """The notes in the results, except the number of bytes that partners send.
 
-        The bytes follow from these notes and the samples.
+        That number is determined by these notes and the samples.
         """
         return {
             **self.baseline.meta(),
@@ -239,7 +245,7 @@ class _Work:
         }
 
     def digest(self, scenarios: Mapping[str, tuple[str, ...]]) -> str:
-        """Return a digest of everything that decides the results of these samples."""
+        """Return a digest of everything that determines the results of these samples."""
         tokens = list(chain(*scenarios.values()))
         return digest_of(
             {
@@ -252,19 +258,20 @@ class _Work:
         )
 
     def is_done(self, path: Path, scenarios: Mapping[str, tuple[str, ...]]) -> bool:
-        """Return whether the results of these samples exist."""
+        """Return whether complete results of these samples exist."""
         try:
             results = read_results(path)
-        except ResultsError:  # nothing, or something else
+        except ResultsError:  # there are no results there, or something else
             return False
-        expected = self.task, self.meta, tuple(chain(*scenarios.values()))
         meta = {name: value for name, value in results.meta.items() if name != "bytes"}
-        return (results.task, meta, results.tokens) == expected
+        tokens = tuple(chain(*scenarios.values()))
+        return (results.task, meta, results.tokens) == (self.task, self.meta, tokens)
 
     def writer(self, path: Path, sent_bytes: object = None) -> ResultsWriter:
-        """Return a writer of the results, with a note on the bytes.
+        """Return a writer for the results, with a note on the bytes that partners send.
 
-        Raises ResultsError if something exists at the path.
+        Raises:
+            ResultsError: If something else exists at the path.
         """
         meta = self.meta | {"bytes": sent_bytes}
         if self.task != "motion":
@@ -278,7 +285,7 @@ class _Work:
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """The samples of a scenario, and the store of their results until all scenarios are done."""
+    """The samples of one scenario, and the store of their results until all are finished."""
 
     work: _Work
     tokens: tuple[str, ...]
@@ -287,26 +294,30 @@ class _Job:
 
     @property
     def path(self) -> Path:
-        suffix = "" if self.work.task == "motion" else ".json"
+        suffix = ""
+        if self.work.task != "motion":
+            suffix = ".json"
         return self.store.path(f"{self.name}{suffix}")
 
 
 def _predict_scenario(job: _Job) -> None:
     """Write the results of a scenario if they are missing.
 
-    An error in writing is raised as an OSError, which ends all work.
+    If writing fails, an OSError is raised, which ends all work.
     """
     work = job.work
+    baseline = work.baseline
+    dataset = work.dataset
     if job.path.exists():
         return
-    agents, link = work.baseline.agents, work.baseline.link
     try:
-        sent_bytes = [
-            traffic(work.dataset, token, agents, link, work.payload) for token in job.tokens
-        ]
+        sent_bytes = []
+        for token in job.tokens:
+            sent_bytes.append(traffic(dataset, token, baseline.agents, baseline.link, work.payload))
         with work.writer(job.path, sent_bytes) as writer:
             for token in job.tokens:
-                writer.add(token, work.baseline.predict(work.dataset, work.task, token))
+                prediction = baseline.predict(dataset, work.task, token)
+                writer.add(token, prediction)
     except ResultsError as error:
         if isinstance(error.__cause__, OSError):
             raise error.__cause__ from None

@@ -1,8 +1,8 @@
 """Pages in the browser: find a scenario, watch it, see a model's predictions (extra `explore`).
 
-`explore` serves them, `export_pages` writes the pages of some scenarios as files; `make_app`
-returns the ASGI application itself, without access control. Everything is read-only: nothing that a
-browser sends changes a file of the release.
+`explore` serves the pages, `export_pages` writes the pages of some scenarios as files, and
+`make_app` returns the ASGI application itself, without access control. Everything is read-only:
+nothing that a browser sends can change a file of the release.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Explorer", "explore", "export_pages", "make_app"]
 
-# Name → its module, for names that the help of the command does not need; all but the first need
+# Modules of the names that the command's help does not need, by name; all except the first one need
 # the extra.
 _LAZY_MODULES = {"Explorer": "explorer", "export_pages": "static_pages", "make_app": "pages"}
 
@@ -33,22 +33,22 @@ def explore(
 ) -> None:
     """Serve the pages of an explorer until Ctrl-C.
 
-    Only a browser with the token of the printed address can read them; docs/explore.md explains how
-    they are reached through an SSH tunnel or a notebook's proxy, and what is checked.
+    Only a browser that has the token of the printed address can read them. docs/explore.md explains
+    how to reach them through an SSH tunnel or a notebook's proxy, and what is checked.
 
     Args:
         explorer: Explorer of a release and of models.
-        host: Address to listen on; any except this machine's own, 127.0.0.1, lets other machines
-            in.
+        host: Address to listen on. With any address other than 127.0.0.1, which is this machine
+            itself, other machines can connect.
         port: Port to listen on; None for the first free one from 8765 on.
-        root_path: Place where a proxy shows the pages, such as `/user/me/proxy/8765`, or the
+        root_path: Path at which a proxy shows the pages, such as `/user/me/proxy/8765`, or the
             complete URL.
         open_browser: Whether to open the address in a browser, if there is one.
-        say: Function that gets each line about the address.
+        say: Function that is called with each line about the address, for example to print it.
 
     Raises:
-        MissingExtraError: The extra `explore` is not installed.
-        ConfigError: The host, port or root path is impossible.
+        MissingExtraError: If the extra `explore` is not installed.
+        ConfigError: If the host, port or root path is impossible.
 
     Examples:
         >>> explore(Explorer(da, bundles=["bundle"]))  # doctest: +SKIP
@@ -76,7 +76,7 @@ def explore(
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name's module when the name is used."""
+    """Import the module of a name when the name is first used."""
     if name not in _LAZY_MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

@@ -1,8 +1,8 @@
-"""Access to the pages: what is checked of every request before the explorer's own pages answer it.
+"""Access to the pages: the checks that each request must pass before a page answers it.
 
 The server often runs on a machine that others use too, and any of them can reach its port; so can
-any page that is open in the reader's browser. A token in the printed address keeps other users out.
-`Host`, `Origin` and `Sec-Fetch-Site` keep out pages of other sites, and other sites' names that
+any page that is open in the reader's browser. A token in the printed address keeps out other users.
+`Host`, `Origin` and `Sec-Fetch-Site` keep out pages of other sites, and names of other sites that
 lead to this machine.
 """
 
@@ -20,10 +20,10 @@ from urllib.parse import quote, unquote, unquote_plus, urlsplit
 
 from deepaccident_devkit.errors import ConfigError
 
-_HOST: Final = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::([0-9]{1,5}))?")
-_ROOT: Final = re.compile(r"(/[A-Za-z0-9._~!$&'()*+,=:@%-]+)*/?")
-# Scheme → its default port.
-_SCHEME_PORTS: Final = {"http": 80, "https": 443}
+_HOST = re.compile(r"([A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::([0-9]{1,5}))?")
+_ROOT = re.compile(r"(/[A-Za-z0-9._~!$&'()*+,=:@%-]+)*/?")
+# Default port of each scheme.
+_SCHEME_PORTS = {"http": 80, "https": 443}
 AsgiScope = MutableMapping[str, Any]
 AsgiMessage = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[AsgiMessage]]
@@ -31,11 +31,11 @@ Send = Callable[[AsgiMessage], Awaitable[None]]
 # An ASGI application.
 App = Callable[[AsgiScope, Receive, Send], Awaitable[None]]
 _log = logging.getLogger(__name__)
-_LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-_METHODS: Final = ("GET", "HEAD")
+_LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
+_METHODS = ("GET", "HEAD")
 TICKET_SECONDS: Final = 60.0
-# Characters that a relative address need not quote: none of them can end it or a header.
-_SAFE_CHARACTERS: Final = "!$&'()*+,;=:@/?%[]|^`{}-._~"
+# Characters that need no quoting in a relative address, since none of them can end it or a header.
+_SAFE_CHARACTERS = "!$&'()*+,;=:@/?%[]|^`{}-._~"
 # Headers of every answer, unless the application has set another value.
 HEADERS: Final[Mapping[bytes, bytes]] = {
     b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -53,14 +53,14 @@ HEADERS: Final[Mapping[bytes, bytes]] = {
 
 @dataclass(frozen=True, slots=True)
 class HostPort:
-    """A host, in small letters and without brackets, and a port if there is one."""
+    """A host, in small letters and without brackets, and its port if there is one."""
 
     name: str
     port: int | None
 
     @classmethod
     def parse(cls, text: str) -> HostPort | None:
-        """Read `localhost:8765`, `[::1]` and the like; None if it is malformed."""
+        """Parse a text such as `localhost:8765` or `[::1]`; return None if it is malformed."""
         match = _HOST.fullmatch(text)
         if match is None or int(match[2] or 0) > 0xFFFF:
             return None
@@ -73,37 +73,39 @@ class HostPort:
         return cls(name, int(match[2]) if match[2] else None)
 
     def __str__(self) -> str:
-        """Return it as it stands in an address."""
-        name = f"[{self.name}]" if ":" in self.name else self.name
+        """Return the host and the port as written in an address."""
+        name = self.name
+        if ":" in self.name:
+            name = f"[{self.name}]"
         if self.port is None:
             return name
         return f"{name}:{self.port}"
 
     @property
     def is_address(self) -> bool:
-        """Whether it is an IP address and no name."""
+        """Whether the host is an IP address instead of a name."""
         try:
             ip_address(self.name)
         except ValueError:
             return False
         return True
 
-    def is_at(self, scheme: str, other: HostPort) -> bool:
-        """Return whether both are the same to a scheme, where its default port can be left out."""
+    def is_same(self, scheme: str, other: HostPort) -> bool:
+        """Return whether both are equal under a scheme, whose default port may be left out."""
         default_port = _SCHEME_PORTS[scheme]
-        return self.name == other.name and (self.port or default_port) == (
-            other.port or default_port
-        )
+        own_port = self.port or default_port
+        other_port = other.port or default_port
+        return self.name == other.name and own_port == other_port
 
 
 @dataclass(frozen=True, slots=True)
 class RootPath:
-    """The place where a proxy shows the pages: at the root, below a path, or at a complete URL.
+    """Where a proxy shows the pages: at the root, below a path, or at a complete URL.
 
     Attributes:
-        path: `/user/me/proxy/8000`, or nothing.
-        scheme: `http` or `https` of a URL.
-        location: Host and port of a URL.
+        path: Path, such as `/user/me/proxy/8000`; empty for the root.
+        scheme: Scheme of a URL, `http` or `https`; empty for a path.
+        location: Host and port of a URL; None for a path.
     """
 
     path: str = ""
@@ -112,16 +114,17 @@ class RootPath:
 
     @classmethod
     def parse(cls, text: str) -> RootPath:
-        """Read a path or a URL; raise ConfigError."""
+        """Parse a path or a URL; raise ConfigError for any other text."""
         try:
             parts = urlsplit(text)
-        except ValueError:  # brackets that do not match
+        except ValueError:  # The brackets do not match.
             parts = urlsplit("?")
-        location = HostPort.parse(parts.netloc)
-        if location is not None and parts.scheme in _SCHEME_PORTS:
+        address = parts.path
+        location = None
+        if parts.scheme in _SCHEME_PORTS:
+            location = HostPort.parse(parts.netloc)
+        if location is not None:
             address = f"{parts.scheme}://{parts.netloc}{parts.path}"
-        else:
-            address, location = parts.path, None
         if text != address or not _ROOT.fullmatch(parts.path):
             raise ConfigError(
                 "--root-path: expected a path such as /user/me/proxy/8000 or a URL such as "
@@ -130,33 +133,35 @@ class RootPath:
         return cls(parts.path.rstrip("/"), parts.scheme, location)
 
     def __str__(self) -> str:
-        """Return the path or the URL, without a slash at its end."""
+        """Return the path or the URL, without a slash at the end."""
         if self.location is None:
             return self.path
         return f"{self.scheme}://{self.location}{self.path}"
 
-    def below(self, path: str) -> str | None:
-        """Return the part of a request's path after this one.
+    def remove_from(self, path: str) -> str | None:
+        """Return the part of a request's path that follows this path.
 
-        None if it does not begin with this path, segment by segment.
+        Return None if the request's path does not begin with this one, segment by segment.
         """
-        own_segments, segments = self.path.split("/"), path.split("/")
-        if not self.path or [*map(unquote, own_segments)] != [
-            *map(unquote, segments[: len(own_segments)])
-        ]:
+        own_segments = self.path.split("/")
+        segments = path.split("/")
+        first_segments = segments[: len(own_segments)]
+        is_below = list(map(unquote, own_segments)) == list(map(unquote, first_segments))
+        if not self.path or not is_below:
             return None
         return "".join(f"/{segment}" for segment in segments[len(own_segments) :])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
-    """What a `Gate` lets in.
+    """The requests that a `Gate` lets in.
 
     Attributes:
-        port: Port of the server; it only names the cookie, since a tunnel may show another port.
-        root: Place where a proxy shows the pages.
+        port: Port of the server. It is only used in the cookie's name, since browsers may see
+            another port through a tunnel.
+        root: Where a proxy shows the pages.
         names: Hosts that a request may name, apart from `localhost`, `127.0.0.1` and `::1`.
-        any_address: Whether a request may name any IP address, as the server listens on all
+        any_address: Whether a request may name any IP address, because the server listens on all
             addresses of the machine.
         token: Secret of the printed address.
         session: Secret of the cookie.
@@ -177,22 +182,21 @@ class Access:
     def knows(self, host: HostPort) -> bool:
         """Return whether a request may name this host.
 
-        Behind a proxy with only a path, it may name any: the proxy passes its own name on, which
-        only the proxy knows. There, only the token keeps out names of other sites that lead to this
-        machine.
+        If the root is only the path of a proxy, any host is allowed, since the proxy passes on its
+        own host name, which this server does not know. In that case, only the token keeps out other
+        sites' host names that resolve to this machine.
         """
-        return (
-            host.name in _LOOPBACK
-            or host.name in self.names
-            or (self.any_address and host.is_address)
-            or (self.root.location is None and bool(self.root.path))
-            or (self.root.location is not None and host.name == self.root.location.name)
-        )
+        location = self.root.location
+        if location is None and self.root.path:
+            return True
+        is_proxy = location is not None and host.name == location.name
+        is_address = self.any_address and host.is_address
+        return host.name in _LOOPBACK or host.name in self.names or is_address or is_proxy
 
 
 @dataclass(frozen=True, slots=True)
 class _Answer:
-    """An answer of the gate itself: plain text that repeats nothing from the request."""
+    """An answer of the gate itself, in plain text that repeats nothing from the request."""
 
     status: int
     sentence: str = ""
@@ -215,23 +219,23 @@ class _Answer:
 _PATH_MISSING = _Answer(400, "The request has no path.")
 _HOST_UNKNOWN = _Answer(
     400,
-    "The explorer does not know the host that the request names: start it with --root-path and the "
-    "address that the browser shows, if a proxy is between them, or else with --address and that "
-    "host.",
+    "The explorer does not know the host in the request. Behind a proxy, start the explorer "
+    "with --root-path and the address that the browser shows; otherwise start it with --address "
+    "and that host.",
 )
 _METHOD_NOT_ALLOWED = _Answer(
-    405, "The explorer only shows: it answers GET and HEAD.", {"allow": ", ".join(_METHODS)}
+    405, "The explorer is read-only: it answers only GET and HEAD.", {"allow": ", ".join(_METHODS)}
 )
 _FOREIGN_PAGE = _Answer(
-    403, "A page of another site asked for this; open the address that the command printed."
+    403, "This request came from a page of another site; open the address that the command printed."
 )
 _TOKEN_WRONG = _Answer(
     403,
-    "The token is wrong; open the address that the command printed. Every start of it makes a new "
-    "token.",
+    "The token is wrong; open the address that the command printed. Each start of the explorer "
+    "creates a new token.",
 )
 _TOKEN_MISSING = _Answer(
-    401, "Open the address that the command `deepaccident explore` printed: it has the token."
+    401, "Open the address that `deepaccident explore` printed; it contains the token."
 )
 
 
@@ -245,7 +249,7 @@ class _Request:
         path: Path of the request without the root path.
         has_root: Whether the request had the root path.
         query: Parameters of the address.
-        headers: Name in small letters → values.
+        headers: Values of each header, by name in lower case.
     """
 
     method: str
@@ -259,7 +263,7 @@ class _Request:
     def of(cls, scope: AsgiScope, root: RootPath) -> _Request:
         raw_path = scope.get("raw_path") or quote(scope["path"]).encode("ascii")
         target = raw_path.partition(b"?")[0].decode("latin-1")
-        path = root.below(target)
+        path = root.remove_from(target)
         headers: dict[str, tuple[str, ...]] = {}
         for raw_name, value in scope["headers"]:
             name = raw_name.decode("latin-1").lower()
@@ -275,7 +279,7 @@ class _Request:
 
     @property
     def host(self) -> HostPort | None:
-        """The host that the request names; None if it names none, or several."""
+        """The host that the request names; None if it names none or several."""
         values = self.headers.get("host", ())
         if len(values) == 1:
             return HostPort.parse(values[0])
@@ -284,53 +288,52 @@ class _Request:
     @property
     def tokens(self) -> list[str]:
         """Values of the parameter `token`."""
-        return [
-            unquote_plus(part.partition("=")[2])
-            for part in self.query.split("&")
-            if _is_token(part)
-        ]
+        tokens = []
+        for part in self.query.split("&"):
+            if _is_token_parameter(part):
+                tokens.append(unquote_plus(part.partition("=")[2]))
+        return tokens
 
     def without_token(self) -> _Request:
         """Return the request without the parameter `token`."""
-        parts = [part for part in self.query.split("&") if not _is_token(part)]
+        parts = [part for part in self.query.split("&") if not _is_token_parameter(part)]
         return replace(self, query="&".join(parts))
 
     def address(self, end: str = "") -> str:
-        """Return the address of the request with `end` after its path.
+        """Return the address of the request, with `end` after its path.
 
-        It is relative, so that it is right behind all proxies.
+        It is relative, so that it is right behind any proxy.
         """
         query = ""
         if self.query:
             query = f"?{self.query}"
-        address = f"./{self.target.rpartition('/')[2]}{end}{query}"
+        page = self.target.rpartition("/")[2]
+        address = f"./{page}{end}{query}"
         return quote(address.encode("latin-1"), safe=_SAFE_CHARACTERS)
 
 
 class Gate:
-    """An ASGI application in front of another: it refuses forbidden requests and passes others on.
+    """An ASGI application in front of another one, which refuses forbidden requests.
 
-    The application gets paths without the root path, whether the proxy has removed it or not, and
-    no cookies. All answers, also the gate's own, have `HEADERS`. If the application fails, that is
-    logged, and the answer is 500.
+    It passes all other requests on without cookies, and without the root path, whether or not the
+    proxy has already removed that. All answers have `HEADERS`, including the gate's own answers.
+    If the application fails, the error is logged, and the answer is 500.
 
-    The right token in the address is exchanged for a cookie, so that no later address has it.
-    Cookies do not know ports: a browser sends ours to all servers of the same host name, such as
-    others behind `localhost` at the end of tunnels, and any of them could set one of the same name.
-    So the cookie has a secret of its own, which opens nothing but this server and ends with it, and
-    a name with the port, so that two explorers do not replace each other's. Do not open pages of
-    people that you do not trust under the same host name.
+    The right token in the address is exchanged for a cookie, so that no later address contains it.
+    Cookies are not bound to a port: a browser sends ours to all servers with the same host name,
+    such as other tunnels' `localhost`, and any of them could set a cookie with the same name. The
+    cookie therefore has its own secret, which is valid only for this server and while it runs.
+    Its name contains the port, so that two explorers do not overwrite each other's cookie. Do not
+    open pages of people that you do not trust under the same host name.
     """
 
     def __init__(self, app: App, access: Access) -> None:
-        """Guard `app`."""
+        """Guard an application with the checks of `access`."""
         self._app = app
         self._access = access
         self._ticket: tuple[str, float] | None = None
         self._checks = (
-            self._check_target,
-            self._check_host,
-            self._check_method,
+            self._check_address,
             self._check_origin,
             self._check_fetch,
             self._check_token,
@@ -338,32 +341,32 @@ class Gate:
         )
 
     def ticket(self) -> str:
-        """Return a token that is valid once, and for a minute.
+        """Return a token that is valid only once, within a minute.
 
-        Other users can see the command line that opens a browser.
+        It is needed because other users can see the command line that opens a browser.
         """
         ticket = secrets.token_urlsafe(32)
         self._ticket = ticket, time.monotonic() + TICKET_SECONDS
         return ticket
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
-        """Answer a request, or let the application do so."""
+        """Answer a request, or let the application answer it."""
         if scope["type"] == "http":
-            await self._http(scope, receive, _Sender(send))
+            await self._answer_request(scope, receive, _Sender(send))
         elif scope["type"] == "lifespan":
-            await self._lifespan(scope, receive, send)
+            await self._serve_lifespan(scope, receive, send)
         else:
             await receive()
             await send({"type": "websocket.close", "code": 1008})
 
-    async def _lifespan(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+    async def _serve_lifespan(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         try:
             await self._app(scope, receive, send)
         except Exception:
-            _log.exception("the explorer's pages failed at their start or end")
+            _log.exception("the explorer failed while it started or stopped")
             raise
 
-    async def _http(self, scope: AsgiScope, receive: Receive, send: _Sender) -> None:
+    async def _answer_request(self, scope: AsgiScope, receive: Receive, send: _Sender) -> None:
         request = _Request.of(scope, self._access.root)
         head = request.method == "HEAD"
         for check in self._checks:
@@ -381,27 +384,22 @@ class Gate:
         }
         try:
             await self._app(inner_scope, receive, send)
-        except Exception:  # noqa: BLE001 - an error of ours, which the reader's terminal shows
+        except Exception:  # noqa: BLE001 - our own error, which the reader's terminal shows
             _log.exception("a page of the explorer failed")
             if not send.started:
                 failure = _Answer(500, "The page failed; the terminal of the command says why.")
                 await failure.send(send, head=head)
 
-    def _check_target(self, request: _Request) -> _Answer | None:
-        if request.target.startswith("/"):
-            return None
-        return _PATH_MISSING
-
-    def _check_host(self, request: _Request) -> _Answer | None:
+    def _check_address(self, request: _Request) -> _Answer | None:
+        """Check the path, the host and the method of a request."""
+        if not request.target.startswith("/"):
+            return _PATH_MISSING
         host = request.host
-        if host is not None and self._access.knows(host):
-            return None
-        return _HOST_UNKNOWN
-
-    def _check_method(self, request: _Request) -> _Answer | None:
-        if request.method in _METHODS:
-            return None
-        return _METHOD_NOT_ALLOWED
+        if host is None or not self._access.knows(host):
+            return _HOST_UNKNOWN
+        if request.method not in _METHODS:
+            return _METHOD_NOT_ALLOWED
+        return None
 
     def _check_origin(self, request: _Request) -> _Answer | None:
         values = request.headers.get("origin")
@@ -412,20 +410,20 @@ class Gate:
         if len(values) > 1 or scheme not in _SCHEME_PORTS or origin is None:
             return _FOREIGN_PAGE
         for own_host in (request.host, self._access.root.location):
-            if own_host is not None and origin.is_at(scheme, own_host):
+            if own_host is not None and origin.is_same(scheme, own_host):
                 return None
         return _FOREIGN_PAGE
 
     def _check_fetch(self, request: _Request) -> _Answer | None:
-        """Let other sites only link to the pages.
+        """Refuse requests from other sites, except links to the pages.
 
-        Other ports of this host are the same site, but not the reader's.
+        Other ports of this host belong to the same site, but may be other users' pages.
         """
-        if request.headers.get("sec-fetch-site") in (None, ("same-origin",), ("none",)):
+        headers = request.headers
+        if headers.get("sec-fetch-site") in (None, ("same-origin",), ("none",)):
             return None
-        fetch = (request.headers.get("sec-fetch-mode"), request.headers.get("sec-fetch-dest"))
-        is_link = fetch == (("navigate",), ("document",))
-        if is_link:
+        is_navigation = headers.get("sec-fetch-mode") == ("navigate",)
+        if is_navigation and headers.get("sec-fetch-dest") == ("document",):
             return None
         return _FOREIGN_PAGE
 
@@ -441,13 +439,13 @@ class Gate:
             303,
             headers={
                 "location": request.without_token().address(),
-                "set-cookie": self._set_cookie(request),
+                "set-cookie": self._format_cookie(request),
                 "cache-control": "no-store",
             },
         )
 
     def _check_slash(self, request: _Request) -> _Answer | None:
-        """Add a slash to the root path, which the relative links of its page need."""
+        """Add a slash to the root path, since the relative links of its page need it."""
         if request.path:
             return None
         return _Answer(308, headers={"location": request.address("/")})
@@ -467,25 +465,27 @@ class Gate:
                     return True
         return False
 
-    def _set_cookie(self, request: _Request) -> str:
-        """Return the cookie for the root path, if the reader may see the pages there.
+    def _format_cookie(self, request: _Request) -> str:
+        """Return the cookie for the root path if the reader may see the pages there.
 
-        Without a proxy the pages are below `/`.
+        Without a proxy, the pages are below `/`.
         """
-        access, root, host = self._access, self._access.root, request.host
-        is_direct = not request.has_root and host is not None and host.name in _LOOPBACK
+        access = self._access
+        root = access.root
+        host_name = ""
+        if request.host is not None:
+            host_name = request.host.name
+        is_direct = not request.has_root and host_name in _LOOPBACK
         path = "/" if is_direct else root.path or "/"
         cookie = f"{access.cookie}={access.session}; Path={path}; HttpOnly; SameSite=Lax"
-        is_behind_proxy = (
-            root.location is not None and host is not None and host.name == root.location.name
-        )
+        is_behind_proxy = root.location is not None and host_name == root.location.name
         if is_behind_proxy and root.scheme == "https":
             return f"{cookie}; Secure"
         return cookie
 
 
 class _Sender:
-    """A function that sends an answer with `HEADERS`, and knows whether the answer has begun."""
+    """A function that sends an answer with `HEADERS` and knows whether the answer has begun."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -501,9 +501,11 @@ class _Sender:
         await self._send(message)
 
 
-def _is_token(part: str) -> bool:
-    return unquote_plus(part.partition("=")[0]) == "token"
+def _is_token_parameter(part: str) -> bool:
+    name = part.partition("=")[0]
+    return unquote_plus(name) == "token"
 
 
 def _is_same_secret(text: str, secret: str) -> bool:
-    return secrets.compare_digest(text.encode("utf-8", "replace"), secret.encode())
+    content = text.encode("utf-8", "replace")
+    return secrets.compare_digest(content, secret.encode())

@@ -1,6 +1,4 @@
-"""Slow work beside the pages, in a thread of its own, one job after another; results are kept."""
-
-from __future__ import annotations
+"""Slow work in a background thread, one job after the other; results are kept."""
 
 import itertools
 import logging
@@ -14,26 +12,28 @@ from deepaccident_devkit.errors import DeepAccidentError
 logger = logging.getLogger(__name__)
 
 State = Literal["waiting", "running", "ready", "failed"]
-_DONE_STATES: Final = ("ready", "failed")
-# Largest number of jobs: beyond it, the least recently used finished job is removed, so that memory
-# stays flat.
+_DONE_STATES = ("ready", "failed")
+# Largest number of jobs; above it, the least recently used finished job is removed, so that memory
+# does not grow.
 MAX_JOBS: Final = 200
 
 
 class Job:
-    """A piece of work.
+    """A piece of work in the background.
 
     Attributes:
-        name: Name that identifies it.
-        title: What it does, for readers: `lead times`.
+        name: Name that identifies the job.
+        title: Title for readers, such as `lead times`.
         state: State of the work.
         result: Result of the work; None until it is ready.
-        error: Reason why it failed, for readers; empty if it did not.
-        last_request: Number of the last request for it; numbers grow.
+        error: Why the work failed, for readers; empty if it did not.
+        last_request: Number of the last request for the job; numbers increase with time.
     """
 
     def __init__(self, name: str, title: str, work: Callable[[], Any]) -> None:
-        self.name, self.title, self._work = name, title, work
+        self.name = name
+        self.title = title
+        self._work = work
         self.state: State = "waiting"
         self.result: Any = None
         self.error = ""
@@ -41,11 +41,11 @@ class Job:
 
     @property
     def is_done(self) -> bool:
-        """Whether it is ready, or has failed."""
+        """Whether the work is ready or has failed."""
         return self.state in _DONE_STATES
 
     def run(self) -> None:
-        """Do the work; nothing is raised, so that the next job is done too."""
+        """Do the work; its errors are stored instead of raised, so that the next job still runs."""
         self.state = "running"
         try:
             self.result = self._work()
@@ -59,7 +59,7 @@ class Job:
 
 
 class Jobs:
-    """All requested work, each piece once, as long as its result is kept."""
+    """All requested work; each piece is done only once as long as its result is kept."""
 
     def __init__(self) -> None:
         self._jobs: dict[str, Job] = {}
@@ -69,7 +69,7 @@ class Jobs:
         self._requests = itertools.count()
 
     def ask(self, name: str, title: str, work: Callable[[], Any]) -> Job:
-        """Return the job of a name; a new one begins after all jobs that were requested before."""
+        """Return the job with a name; a new one starts after all jobs requested before it."""
         with self._changed:
             if name not in self._jobs:
                 self._make_room()
@@ -89,14 +89,14 @@ class Jobs:
             return list(self._jobs.values())
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until all requested jobs are done; return whether they are."""
+        """Wait until all requested jobs are done, and return whether they are."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: all(job.is_done for job in self._jobs.values()), timeout
             )
 
     def end(self) -> None:
-        """Begin no more jobs. A running job is not waited for: its thread ends with the process."""
+        """Start no more jobs. A running job is not awaited: its thread ends with the process."""
         self._queue.put(None)
 
     def _make_room(self) -> None:

@@ -11,10 +11,10 @@ from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE
 
 
-def _address(
+def _parse_address(
     context: click.Context, parameter: click.Parameter, value: str | None
 ) -> dict[str, Any]:
-    """Parse a host, a port, or both with a colon between them; nothing without a text."""
+    """Parse a host, a port, or both with a colon in between; without a text, return nothing."""
     if value is None:
         return {}
     from deepaccident_devkit.plugins.explore.access import HostPort
@@ -40,17 +40,17 @@ def _address(
 )
 @click.option(
     "--address",
-    callback=_address,
+    callback=_parse_address,
     metavar="HOST:PORT",
-    help="Address to listen on, or the port alone. With another host than 127.0.0.1, the pages can "
-    "be reached from other machines.  [default: 127.0.0.1, and the first free port from 8765 on]",
+    help="Address to listen on, or only the port. With a host other than 127.0.0.1, other machines "
+    "can open the pages.  [default: 127.0.0.1, and the first free port from 8765]",
 )
 @click.option("--no-open", is_flag=True, help="Do not open a browser.")
 @advanced(
     "--root-path",
     default="",
     metavar="PATH",
-    help="Where a proxy shows the pages, such as /user/me/proxy/8765, or the whole URL.",
+    help="Path at which a proxy shows the pages, such as /user/me/proxy/8765, or the whole URL.",
 )
 @click.option(
     "--out",
@@ -85,13 +85,14 @@ def explore(target: Path | None, predictions: tuple[Path, ...], **options: Any) 
         if (path / SUMMARY_FILE).is_file():
             kind = "bundles"
         models[kind].append(path)
-    where, no_open = options.pop("where"), options.pop("no_open")
+    where = options.pop("where")
+    no_open = options.pop("no_open")
     server = {**options.pop("address"), "root_path": options.pop("root_path")}
     dataset = DeepAccident(**options)
     if target is not None:
         engine: dict[str, Any] = {"workers": options["workers"], "progress": True}
         path = export_pages(dataset, target, where=where, **models, **engine)
-        click.echo(f"written: {path}; open it in a browser")
+        click.echo(f"wrote {path}; open it in a browser")
         return
     explorer = Explorer(dataset, **models, workers=options["workers"])
     show(explorer, open_browser=not no_open, say=click.echo, **server)

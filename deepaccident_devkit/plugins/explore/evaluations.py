@@ -1,15 +1,13 @@
-"""The numbers of a bundle's summary for pages, checked before they are shown.
+"""The numbers in a bundle's summary, which are checked before pages show them.
 
-These are facts, headline numbers and breakdowns.
+They are facts, headline numbers and breakdowns.
 """
-
-from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 
@@ -22,16 +20,18 @@ from deepaccident_devkit.evaluation.runs.setups import evaluator_class
 from deepaccident_devkit.evaluation.task import LIMITS, value_text
 from deepaccident_devkit.plugins.explore.scenarios import UNKNOWN_VALUE
 from deepaccident_devkit.render.outcomes.above import count_words
+from deepaccident_devkit.support.human_names import column_name, human_name
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.pages import scalar
+from deepaccident_devkit.support.text import counted
 
-# Metadata of results that is shown if present.
-_METHOD_FIELDS: Final = ("method", "name", "authors", "url", "date")
+# Fields of the results' metadata that are shown if present.
+_METHOD_FIELDS = ("method", "name", "authors", "url", "date")
 _Json = Mapping[str, Any]
 _Interval = tuple[float, float]
 _Row = Mapping[str, Any]
 # Columns that identify the sample.
-_SAMPLE_COLUMNS: Final = (
+_SAMPLE_COLUMNS = (
     "token",
     "scenario",
     "agent",
@@ -40,12 +40,12 @@ _SAMPLE_COLUMNS: Final = (
     "accident_visibility",
     "recording",
 )
-_NUMBER: Final = r"[0-9]+(?:\.[0-9]+)?"
-_CASES: Final = ("tp", "fp", "fn")
-# Column → text of the error.
-_ERROR_TEXTS: Final = {
-    "position_error": "places {:.1f} m off in sum",
-    "time_error": "time {:.1f} s off",
+_NUMBER = r"[0-9]+(?:\.[0-9]+)?"
+_CASES = ("tp", "fp", "fn")
+# Text about the error in each column.
+_ERROR_TEXTS = {
+    "position_error": "position error {:.1f} m",
+    "time_error": "time error {:.1f} s",
 }
 
 
@@ -83,7 +83,7 @@ class _Breakdown(msgspec.Struct):
 
 
 class _Summary(msgspec.Struct):
-    """The parts of a summary that are shown, beyond what `read_bundle` has checked."""
+    """The parts of a summary that pages show and that `read_bundle` has not checked."""
 
     devkit_version: Line
     counts: _SampleCounts
@@ -97,9 +97,9 @@ class MainNumber:
     """The number by which samples are ranked.
 
     Attributes:
-        name: Name, such as `apa`.
-        path: Path in the result.
-        unit: Unit, such as `share`.
+        name: Name of the number, such as `apa`.
+        path: Path of the number in the result.
+        unit: Unit of the number, such as `share`.
         limit: Largest possible value.
     """
 
@@ -114,15 +114,15 @@ class EvaluationNumbers:
     """The numbers of a bundle.
 
     Attributes:
-        facts: Name → what was evaluated, and how.
-        mark: Mark of a partial evaluation; empty for a complete one.
-        headlines: Headlines of all samples: `name`, `text`, `interval` (empty if there is none),
-            `better` (`higher`, `lower` or empty).
-        interval: Heading of the intervals: `95 % interval`.
+        facts: Texts about what was evaluated and how, by name.
+        mark: Text that marks a partial evaluation; empty for a complete one.
+        headlines: Headline numbers over all samples, each with `name`, `text`, `interval` (empty if
+            there is none) and `better` (`higher`, `lower` or empty).
+        interval: Heading of the intervals, such as `95 % interval`.
         notes: Notes on the intervals.
         main: Number that the bars show; None if the result has none.
-        breakdowns: Attribute → a bar for each of several values, as `_bar` describes it.
-        common: Attribute → the only value that the samples have.
+        breakdowns: Bars (see `_make_bar`) of each attribute that has several values, by attribute.
+        common: Value of each attribute that is the same for all samples, by attribute.
     """
 
     facts: Mapping[str, str]
@@ -136,7 +136,7 @@ class EvaluationNumbers:
 
 
 def read_numbers(bundle: Bundle) -> EvaluationNumbers:
-    """Return a bundle's numbers; raise ResultsError if its summary does not hold them."""
+    """Read the numbers of a bundle; raise ResultsError if its summary does not contain them."""
     summary = bundle.summary
     try:
         as_record(summary, _Summary)
@@ -145,24 +145,25 @@ def read_numbers(bundle: Bundle) -> EvaluationNumbers:
             f"{bundle.folder / SUMMARY_FILE}: cannot be shown ({error}); evaluate again"
         ) from error
     overall = summary["breakdowns"].get(EVERYTHING)
-    group, interval = None, "interval"
+    group = None
+    interval = "interval"
     if overall is not None:
         group = next(iter(overall["groups"]), None)
         interval = f"{100 * overall['resampling']['confidence']:g} % interval"
-    main = _main_number(summary)
+    main = _choose_main_number(summary)
     breakdowns: dict[str, tuple[dict[str, Any], ...]] = {}
     common: dict[str, str] = {}
     for attribute, breakdown in summary["breakdowns"].items():
         if attribute in ATTRIBUTES and attribute != EVERYTHING:
-            bars = tuple(_bar(bar_group, main) for bar_group in breakdown["groups"])
+            bars = tuple(_make_bar(bar_group, main) for bar_group in breakdown["groups"])
             if len(bars) > 1:
                 breakdowns[attribute] = bars
             elif bars:
                 common[attribute] = bars[0]["value"]
     return EvaluationNumbers(
-        facts=_facts(bundle),
+        facts=_collect_facts(bundle),
         mark="" if summary["partial"] is None else summary["partial"]["mark"],
-        headlines=tuple(_headline_row(headline, group) for headline in summary["headlines"]),
+        headlines=tuple(_make_headline_row(headline, group) for headline in summary["headlines"]),
         interval=interval,
         notes=() if group is None else tuple(group["notes"]),
         main=main,
@@ -171,18 +172,23 @@ def read_numbers(bundle: Bundle) -> EvaluationNumbers:
     )
 
 
-def _facts(bundle: Bundle) -> dict[str, str]:
-    summary, setup = bundle.summary, bundle.setup
-    counts, results, release = summary["counts"], summary["results"], summary["release"]
-    switches = ", ".join(f"{name} = {scalar(value)}" for name, value in setup.switches.items())
-    protocol = f"{setup.protocol}, but {switches}" if switches else setup.protocol
-    facts = {"task": setup.task, "protocol": protocol}
+def _collect_facts(bundle: Bundle) -> dict[str, str]:
+    summary = bundle.summary
+    setup = bundle.setup
+    counts = summary["counts"]
+    results = summary["results"]
+    release = summary["release"]
+    switches = [f"{name} = {scalar(value)}" for name, value in setup.switches.items()]
+    protocol = human_name(setup.protocol, "protocols")
+    if switches:
+        protocol = f"{protocol}, but {', '.join(switches)}"
+    facts = {"task": human_name(setup.task, "tasks"), "protocol": protocol}
     for name in _METHOD_FIELDS:
         if name in results["meta"]:
             facts[name] = scalar(results["meta"][name])
-    samples = f"{counts['samples']:,} of {counts['scenarios']:,} scenarios"
+    samples = f"{counts['samples']:,} from {counted(counts['scenarios'], 'scenario')}"
     if counts["left_out"]:
-        samples += f"; {counts['left_out']:,} predictions of other samples left out"
+        samples += f"; left out: {counted(counts['left_out'], 'prediction')} for other samples"
     facts |= {"samples": samples, "selection": bundle.selection.text()}
     if evaluator_class(setup.task).has_horizon:
         facts["horizon"] = f"{setup.horizon:g} s"
@@ -195,8 +201,8 @@ def _facts(bundle: Bundle) -> dict[str, str]:
     }
 
 
-def _main_number(summary: _Json) -> MainNumber | None:
-    """Return the first of the task's main numbers that the result has."""
+def _choose_main_number(summary: _Json) -> MainNumber | None:
+    """Return the first of the task's main numbers that the result has; None if it has none."""
     headlines = {headline["path"]: headline for headline in summary["headlines"]}
     for path in evaluator_class(summary["task"]).main_numbers:
         if path in headlines:
@@ -207,36 +213,41 @@ def _main_number(summary: _Json) -> MainNumber | None:
     return None
 
 
-def _headline_row(headline: _Json, group: _Json | None) -> dict[str, str]:
+def _make_headline_row(headline: _Json, group: _Json | None) -> dict[str, str]:
     better = ""
     if headline.get("higher_is_better") is True:
         better = "higher"
     elif headline.get("higher_is_better") is False:
         better = "lower"
-    ends = _interval_ends(group, headline["path"])
+    ends = _read_interval(group, headline["path"])
     return {
         "name": headline["name"],
         "text": headline["text"],
-        "interval": _interval_text(ends, headline["unit"]),
+        "interval": _format_interval(ends, headline["unit"]),
         "better": better,
     }
 
 
-def _bar(group: _Json, main: MainNumber | None) -> dict[str, Any]:
-    """Return the main number of the samples that have one `value` of an attribute.
+def _make_bar(group: _Json, main: MainNumber | None) -> dict[str, Any]:
+    """Make the bar for the samples that have one value of an attribute.
 
-    `samples` and `scenarios` count them, `text` and `interval` are for readers; `width` of the bar
-    and both `ends` of the interval are percents of the longest bar, None where there is no number.
+    The bar has that `value`, the numbers of `samples` and `scenarios`, and `text` and `interval`
+    for readers. Its `width` and the `ends` of its interval are percentages of the longest possible
+    bar, or None if there is no number.
     """
-    text, interval, width, end_percents = "–", "", None, None
+    text = "–"
+    interval = ""
+    width = None
+    end_percents = None
     if main is not None:
-        value = finite(group["headlines"].get(main.path))
-        ends = _interval_ends(group, main.path)
-        text, interval = value_text(value, main.unit), _interval_text(ends, main.unit)
+        value = read_finite(group["headlines"].get(main.path))
+        ends = _read_interval(group, main.path)
+        text = value_text(value, main.unit)
+        interval = _format_interval(ends, main.unit)
         if value is not None:
-            width = _percents([value], main.limit)[0]
+            width = _scale_to_percent(value, main.limit)
         if ends is not None:
-            end_percents = _percents(ends, main.limit)
+            end_percents = [_scale_to_percent(end, main.limit) for end in ends]
     return {
         "value": UNKNOWN_VALUE if group["value"] is None else group["value"],
         "samples": group["samples"],
@@ -248,29 +259,34 @@ def _bar(group: _Json, main: MainNumber | None) -> dict[str, Any]:
     }
 
 
-def _percents(values: Iterable[float], limit: float) -> list[float]:
-    return [round(100 * min(max(value / limit, 0.0), 1.0), 2) for value in values]
+def _scale_to_percent(value: float, limit: float) -> float:
+    share = min(max(value / limit, 0.0), 1.0)
+    return round(100 * share, 2)
 
 
-def _interval_ends(group: _Json | None, path: str) -> _Interval | None:
-    """Return both ends of an interval; None if there is none."""
+def _read_interval(group: _Json | None, path: str) -> _Interval | None:
+    """Return both ends of the interval at a path; None if there is none."""
     if group is None:
         return None
-    ends = [finite(value) for value in group["intervals"].get(path, ())]
-    if len(ends) != 2 or ends[0] is None or ends[1] is None:
+    ends = [read_finite(value) for value in group["intervals"].get(path, ())]
+    if len(ends) != 2:
         return None
-    return ends[0], ends[1]
+    low, high = ends
+    if low is None or high is None:
+        return None
+    return low, high
 
 
-def _interval_text(ends: _Interval | None, unit: str) -> str:
-    digits = 2 if unit == "%" else 3
+def _format_interval(ends: _Interval | None, unit: str) -> str:
     if ends is None:
         return ""
-    return f"{ends[0]:.{digits}f} to {ends[1]:.{digits}f}"
+    low, high = ends
+    digits = 2 if unit == "%" else 3
+    return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
-def finite(value: object) -> float | None:
-    """Return a number of a file as a float; None if it is no finite number."""
+def read_finite(value: object) -> float | None:
+    """Convert a value from a file to a float; return None if it is not a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -283,104 +299,114 @@ def finite(value: object) -> float | None:
 
 
 def verdict_text(task: str, row: _Row, *, in_full: bool = False) -> str:
-    """Return a sample's verdict: `FN`, or `TP, places 1.2 m off in sum, time 0.1 s off`.
+    """Describe the verdict on a sample: `FN`, or `TP, position error 1.2 m, time error 0.1 s`.
 
-    The values of the row may be anything. With `in_full` it covers all distances, ranges and
-    thresholds; without it only the widest, and the middle threshold.
+    The row comes from a file, so its values are not trusted. With `in_full`, the verdict covers all
+    distances, ranges and thresholds; otherwise only the widest ones and the middle threshold.
     """
     return _VERDICT_FUNCTIONS[task](row, in_full=in_full)
 
 
-def other_values(row: _Row) -> dict[str, str]:
-    """Return the columns that do not identify the sample: name → text."""
-    return {
-        name.replace("_", " "): scalar(value)
-        for name, value in row.items()
-        if name not in _SAMPLE_COLUMNS
-    }
+def list_other_values(row: _Row) -> dict[str, str]:
+    """Return the texts, by column name, of the columns that do not identify the sample."""
+    texts = {}
+    for name, value in row.items():
+        if name not in _SAMPLE_COLUMNS:
+            texts[column_name(name)] = scalar(value)
+    return texts
 
 
-def _accident(row: _Row, *, in_full: bool) -> str:
-    distances = _named_parts(row, rf"tp_({_NUMBER})m")
-    if in_full and distances:
-        texts = [f"{distance} m: {_cases(row, distance)}" for distance in distances]
+def _format_accident(row: _Row, *, in_full: bool) -> str:
+    distances = _find_name_parts(row, rf"tp_({_NUMBER})m")
+    if in_full:
+        texts = [f"{distance} m: {_format_cases(row, distance)}" for distance in distances]
     else:
-        texts = [_cases(row, distance) for distance in distances[-1:]]
+        texts = [_format_cases(row, distance) for distance in distances[-1:]]
     for name, template in _ERROR_TEXTS.items():
-        value = finite(row.get(name))
+        value = read_finite(row.get(name))
         if value is not None:
             texts.append(template.format(value))
-    if finite(row.get("id_error")):
-        texts.append("names others")
+    if read_finite(row.get("id_error")):
+        texts.append("wrong actors")
     return ", ".join(texts)
 
 
-def _cases(row: _Row, distance: str) -> str:
-    tp, fp, fn = (_count(row, f"{case}_{distance}m") for case in _CASES)
+def _format_cases(row: _Row, distance: str) -> str:
+    counts = {case: _read_count(row, f"{case}_{distance}m") for case in _CASES}
     unknown: dict[str, Any] = {"id_error": None, "position_error": None, "time_error": None}
-    outcome = AccidentsWithin(
-        distance=float(distance), tp=tp, fp=fp, fn=fn, accuracy=math.nan, **unknown
-    )
+    outcome = AccidentsWithin(distance=float(distance), accuracy=math.nan, **counts, **unknown)
     return count_words(outcome)
 
 
-def _motion(row: _Row, *, in_full: bool) -> str:
-    ranges = _named_parts(row, rf"pq_({_NUMBER}x{_NUMBER})")
+def _format_motion(row: _Row, *, in_full: bool) -> str:
+    ranges = _find_name_parts(row, rf"pq_({_NUMBER}x{_NUMBER})")
     if not in_full:
         ranges = ranges[-1:]
-    return "; ".join(_range_text(row, range_name) for range_name in ranges)
+    texts = [_format_range(row, range_name) for range_name in ranges]
+    return "; ".join(texts)
 
 
-def _range_text(row: _Row, range_name: str) -> str:
-    texts = []
-    for title, key in (("VPQ", "pq"), ("IoU", "iou")):
-        texts.append(f"{title} {_percent(row.get(f'{key}_{range_name}'))}")
-    for case in _CASES:
-        texts.append(f"{_count(row, f'{case}_{range_name}')} {case.upper()}")
-    return f"{range_name} m: {', '.join(texts)}"
-
-
-def _detection(row: _Row, *, in_full: bool) -> str:
-    thresholds = _named_parts(row, rf"tp_({_NUMBER})")
-    if not in_full:
-        thresholds = thresholds[len(thresholds) // 2 :][:1]
+def _format_range(row: _Row, range_name: str) -> str:
     texts = [
-        f"{_count(row, 'truths')} true boxes",
-        f"{_count(row, 'detections')} detections",
+        f"VPQ {_format_percent(row.get(f'pq_{range_name}'))}",
+        f"IoU {_format_percent(row.get(f'iou_{range_name}'))}",
+    ]
+    for case in _CASES:
+        count = _read_count(row, f"{case}_{range_name}")
+        texts.append(f"{count} {case.upper()}")
+    return f"{human_name(range_name)}: {', '.join(texts)}"
+
+
+def _format_detection(row: _Row, *, in_full: bool) -> str:
+    thresholds = _find_name_parts(row, rf"tp_({_NUMBER})")
+    if not in_full:
+        middle = len(thresholds) // 2
+        thresholds = thresholds[middle : middle + 1]
+    texts = [
+        f"{_read_count(row, 'truths')} true boxes",
+        f"{_read_count(row, 'detections')} detections",
     ]
     for threshold in thresholds:
-        texts.append(f"{_count(row, f'tp_{threshold}')} TP at {threshold}")
+        count = _read_count(row, f"tp_{threshold}")
+        texts.append(f"{count} TP at {threshold}")
     return ", ".join(texts)
 
 
-def _values(row: _Row, **_: bool) -> str:
-    return ", ".join(f"{name} {text}" for name, text in other_values(row).items())
+def _format_values(row: _Row, **_: bool) -> str:
+    texts = []
+    for name, text in list_other_values(row).items():
+        texts.append(f"{name} {text}")
+    return ", ".join(texts)
 
 
-_VERDICT_FUNCTIONS: Final[Mapping[str, Callable[..., str]]] = {
-    "accident": _accident,
-    "motion": _motion,
-    "detection": _detection,
-    **dict.fromkeys(("warning", "planning", "forecasting"), _values),
+_VERDICT_FUNCTIONS: Mapping[str, Callable[..., str]] = {
+    "accident": _format_accident,
+    "motion": _format_motion,
+    "detection": _format_detection,
+    **dict.fromkeys(("warning", "planning", "forecasting"), _format_values),
 }
 
 
-def _named_parts(row: _Row, pattern: str) -> list[str]:
-    """Return the parts of columns' names that a pattern captures, from the smallest number on."""
-    matches = [re.fullmatch(pattern, name) for name in row]
-    parts = [match[1] for match in matches if match is not None]
-    return sorted(parts, key=lambda text: float(text.partition("x")[0]))
+def _find_name_parts(row: _Row, pattern: str) -> list[str]:
+    """Return what a pattern captures in the columns' names, sorted by the numbers in it."""
+    parts = []
+    for name in row:
+        match = re.fullmatch(pattern, name)
+        if match is not None:
+            parts.append(match[1])
+    parts.sort(key=lambda part: float(part.partition("x")[0]))
+    return parts
 
 
-def _count(row: _Row, name: str) -> int:
-    value = finite(row.get(name))
+def _read_count(row: _Row, name: str) -> int:
+    value = read_finite(row.get(name))
     if value is None:
         return 0
     return int(value)
 
 
-def _percent(value: object) -> str:
-    number = finite(value)
+def _format_percent(value: object) -> str:
+    number = read_finite(value)
     if number is None:
         return "–"
     return f"{number:.1f} %"

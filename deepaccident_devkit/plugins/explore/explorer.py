@@ -1,9 +1,8 @@
-"""`Explorer`: all data of a release and of models that pages read, with its caches."""
+"""The data that pages read from a release and from models, with caches."""
 
 from __future__ import annotations
 
 import hashlib
-import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Mapping
@@ -35,6 +34,7 @@ from deepaccident_devkit.support.arrays import as_floats
 from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import is_writable_folder, place_in
 from deepaccident_devkit.support.parallel import Store
+from deepaccident_devkit.support.text import PathType
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS
 from deepaccident_devkit.v2x.agents import agents_of
@@ -44,31 +44,33 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 _Value = TypeVar("_Value")
-_THUMBNAILS: Final = "thumbnails"
-# Width and height in pixels.
+_THUMBNAILS = "thumbnails"
+# Width and height of thumbnails in pixels.
 PICTURE_SIZE: Final = (320, 180)
-# Increased whenever the same release gives different pictures.
-_THUMBNAIL_VERSION: Final = 1
-_JPEG_QUALITY: Final = 75
+# Increased whenever the same release would give different thumbnails.
+_THUMBNAIL_VERSION = 1
+_JPEG_QUALITY = 75
 # Metres from the centre of a picture from above to its left edge.
-_HALF_WIDTH_M: Final = 40.0
-# Bytes of pictures in memory; and scenarios with a replay in memory, some megabytes each.
-_MAX_PICTURE_BYTES, _MAX_REPLAYS = 64_000_000, 6
+_HALF_WIDTH_M = 40.0
+# Largest size of all pictures in memory in bytes.
+_MAX_PICTURE_BYTES = 64_000_000
+# Largest number of replays in memory, which have some megabytes each.
+_MAX_REPLAYS = 6
 # Pixels per inch of rendered figures.
 DPI: Final = 80
-# Smallest number of scenarios for which processes are worth their start.
-_MIN_SCENARIOS_FOR_PROCESSES: Final = 64
+# Smallest number of scenarios for which it is worth starting processes.
+_MIN_SCENARIOS_FOR_PROCESSES = 64
 
 
 class Explorer:
-    """A release and models, opened for reading; safe to use from several threads.
+    """A release and models that are opened for reading; safe to use from several threads.
 
     Attributes:
         dataset: The release.
-        models: Models by name, in the order given.
+        models: Models by name, in the order in which they were passed.
         jobs: Slow work in the background.
-        workers: Processes for slow work.
-        scenarios: Columns of the release's scenarios.
+        workers: Number of processes for slow work.
+        scenarios: Columns of the scenarios of the release.
         pictures: JPEG and PNG files in memory, by what they show.
         replays: Data of replays, by scenario and model.
         thumbnails: Files of thumbnails.
@@ -78,23 +80,24 @@ class Explorer:
         self,
         dataset: Dataset,
         *,
-        bundles: Iterable[str | os.PathLike[str]] = (),
-        results: Iterable[str | os.PathLike[str]] = (),
+        bundles: Iterable[PathType] = (),
+        results: Iterable[PathType] = (),
         workers: int | None = None,
     ) -> None:
-        """Open bundles and results.
+        """Open a release with bundles and results.
 
         Args:
             dataset: The release.
             bundles: Folders that `save_run` wrote.
-            results: Files or folders of results; the results of a bundle join it.
-            workers: Processes for slow work; None uses few.
+            results: Files or folders of results. Results that a bundle was computed from are shown
+                together with it.
+            workers: Number of processes for slow work; None for a few.
 
         Raises:
-            ResultsError: One of them cannot be read.
+            ResultsError: If a bundle or a results file cannot be read.
         """
         self.dataset = dataset
-        self.workers = workers or _few_workers(len(dataset.scenario))
+        self.workers = workers or _choose_workers(len(dataset.scenario))
         self.jobs = Jobs()
         self.scenarios = Scenarios(dataset, self.jobs, workers=self.workers)
         self.models: Mapping[str, Model] = open_models(
@@ -107,10 +110,11 @@ class Explorer:
 
     def __repr__(self) -> str:
         """Return the release and the names of the models."""
-        return f"Explorer({self.dataset!r}, models: {', '.join(self.models) or 'none'})"
+        names = ", ".join(self.models) or "none"
+        return f"Explorer({self.dataset!r}, models: {names})"
 
     def begin(self) -> None:
-        """Begin slow work in the background: the columns of the scenarios, and models' scores."""
+        """Start slow work in the background: scenarios' columns and models' scores."""
         for model in self.models.values():
             if model.bundle is not None:
                 _ = model.job
@@ -118,7 +122,7 @@ class Explorer:
 
     @property
     def first_page(self) -> str:
-        """Path of the first page: of the model, of several models, or of the scenarios."""
+        """Path of the first page: the page of the only model, the list of models, or scenarios."""
         pages = [f"model/{quote(name, safe='')}/" for name in self.models] or [""]
         if len(pages) == 1:
             return pages[0]
@@ -126,7 +130,7 @@ class Explorer:
 
     @property
     def scores(self) -> dict[str, Model]:
-        """Column `score:MODEL` → model, for models with scores."""
+        """The models with scores, by column (`score:MODEL`)."""
         return {
             f"{SCORE_PREFIX}{name}": model
             for name, model in self.models.items()
@@ -134,22 +138,23 @@ class Explorer:
         }
 
     def thumbnail(self, token: str) -> bytes:
-        """Return a scenario's thumbnail as JPEG; raise TokenError."""
+        """Return the thumbnail of a scenario as JPEG; raise TokenError if there is none."""
         record = self.dataset.scenario.get(token)
-        images = _last_images(self.dataset, record)
+        images = _find_last_images(self.dataset, record)
         dataroot = str(self.dataset.dataroot)
         identity = repr((_THUMBNAIL_VERSION, PICTURE_SIZE, token, dataroot, images))
         make = partial(thumbnail, self.dataset, record)
         return self.thumbnails.get(identity, "thumbnail.jpg", make)
 
     def recording(self, token: str) -> ReplayRecording:
-        """Return what replays know of a scenario; raise TokenError."""
-        return self._recordings.get(token, lambda: recording_of(self.dataset, token, None))
+        """Return what replays need to know about a scenario; raise TokenError if it is unknown."""
+        make = partial(recording_of, self.dataset, token, None)
+        return self._recordings.get(token, make)
 
     def replay(self, token: str, model: str | None) -> dict[str, Any]:
-        """Return the data of a scenario's replay (`served_replay`), with a model's predictions.
+        """Return the data for a scenario's replay (`served_replay`), with a model's predictions.
 
-        Without a model it has no predictions.
+        If `model` is None, there are no predictions.
         """
 
         def make() -> dict[str, Any]:
@@ -161,14 +166,14 @@ class Explorer:
         return self.replays.get((token, model), make)
 
     def drawn(self, key: Hashable, draw: Callable[[], Any]) -> bytes:
-        """Return a figure as PNG, rendered at the first call with a key."""
+        """Return a figure as PNG; it is only drawn at the first call with the same key."""
         return self.pictures.get(key, lambda: figure_png(draw(), dpi=DPI))
 
 
-def _few_workers(scenarios: int) -> int:
-    """Return the number of processes in the background.
+def _choose_workers(scenarios: int) -> int:
+    """Return how many background processes to use for a number of scenarios.
 
-    They leave cores for other users of the machine; a small release needs no processes of its own.
+    They leave some cores to other users of the machine. A small release needs no extra processes.
     """
     if scenarios >= _MIN_SCENARIOS_FOR_PROCESSES:
         return max(2, min(4, usable_cores() // 2))
@@ -176,22 +181,28 @@ def _few_workers(scenarios: int) -> int:
 
 
 class ValueCache(Generic[_Value]):
-    """Values made at their first request; the least recently used ones are evicted first.
+    """A cache of values that are made on demand; the least recently used ones are evicted first.
 
-    Each is made once, also if several threads request it at the same time; other values are made
-    meanwhile.
+    Each value is made once, even if several threads request it at the same time, and does not delay
+    other values.
     """
 
     def __init__(self, max_size: float, size: Callable[[_Value], float] = lambda _: 1.0) -> None:
-        """Keep values with sizes that sum up to at most `max_size`; each counts 1 by default."""
-        self._max_size, self._size = max_size, size
+        """Make an empty cache.
+
+        Args:
+            max_size: Largest sum of the sizes of all values.
+            size: Function that returns the size of a value; by default each value has size 1.
+        """
+        self._max_size = max_size
+        self._size = size
         self._values: OrderedDict[Hashable, _Value] = OrderedDict()
         self._total = 0.0
         self._lock = threading.Lock()
         self._key_locks: dict[Hashable, threading.Lock] = {}
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
-        """Return the value of a key; raise what `make` raises, and then keep nothing."""
+        """Return the value of a key; if `make` raises an error, raise it and keep nothing."""
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)
@@ -216,44 +227,49 @@ class ValueCache(Generic[_Value]):
 
 
 class FileStore:
-    """Small files that are made once.
+    """Small files; each is made only once.
 
-    They lie beside the index, or in the user's cache where that folder cannot be written.
+    They are stored next to the index, or in the user's cache if that folder is not writable.
     """
 
     def __init__(self, dataset: Dataset) -> None:
-        """Store files beside the index of this release: rebuilding its tables removes them."""
+        """Store files next to the index of a release, so that rebuilding the index removes them."""
         self.folder = place_in(dataset.tables_folder, _THUMBNAILS, opened=True)
         if not is_writable_folder(dataset.tables_folder):
             self.folder = FileCache.of_user().folder.with_name(_THUMBNAILS)
         self._store = Store(self.folder, self.folder, "keeps thumbnails", IndexStoreError)
 
     def get(self, identity: str, name: str, make: Callable[[], bytes]) -> bytes:
-        """Return the content of a file; raise what `make` raises.
+        """Return the content of a file, which `make` produces at the first call.
 
-        `identity` distinguishes it from all others.
+        Errors of `make` are raised.
+
+        Args:
+            identity: Text that distinguishes the file from all others.
+            name: Name of the file.
+            make: Function that makes the content.
         """
         identity_bytes = identity.encode(errors="surrogateescape")
         digest = hashlib.blake2b(identity_bytes, digest_size=16).hexdigest()
         path = f"{digest[:2]}/{digest[2:]}/{name}"
-        stored = self._store.kept(path, digest, "image")
+        stored = self._store.read_result(path, digest, "image")
         if stored is not None:
             return stored
         content = make()
-        # If the disk is full, or the folder may not be written to, it is made again the next time.
+        # If the disk is full or the folder cannot be written to, it is made again the next time.
         with suppress(OSError):
-            self._store.keep(path, digest, content)
+            self._store.write_result(path, digest, content)
         return content
 
 
 def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
-    """Return a picture of a scenario's last moment with an image, as JPEG.
+    """Draw a thumbnail (JPEG) of the last moment of a scenario at which there is an image.
 
-    It shows the colliding pair with red boxes in the best camera; without a collision, the front
-    camera. Without downloaded images it shows the actors from above, and without labels a grey
-    panel.
+    It shows the image of the camera that shows the colliding pair best, with the pair in red boxes.
+    Without a collision, it shows the front camera's image. Without downloaded images, it shows the
+    actors from above, and if there are no labels either, a grey panel.
     """
-    frame, _ = _last_images(dataset, record)
+    frame, _ = _find_last_images(dataset, record)
     boxes = scenario_tracks(dataset, record).at(frame)
     collision = record["collision"]
     pair_ids = [] if collision is None else collision["ids"]
@@ -262,30 +278,33 @@ def thumbnail(dataset: Dataset, record: ScenarioRecord) -> bytes:
     camera = _choose_camera(dataset, samples, pair)
     image = None
     if camera is not None:
-        image = _camera_picture(dataset, camera, pair)
+        image = _draw_camera_picture(dataset, camera, pair)
     if image is None:
-        image = _picture_from_above(dataset, record, boxes, pair)
+        image = _draw_from_above(dataset, record, boxes, pair)
     return picture_bytes(image, "JPEG", quality=_JPEG_QUALITY)
 
 
-def _last_images(dataset: Dataset, record: ScenarioRecord) -> tuple[int, list[tuple[str, str]]]:
-    """Return the number of the last frame with an image, and the agents and cameras that have one.
+def _find_last_images(
+    dataset: Dataset, record: ScenarioRecord
+) -> tuple[int, list[tuple[str, str]]]:
+    """Return the last frame with an image, and the (agent, camera) pairs that have one there.
 
-    Without any image it is the last frame.
+    If there are no images, the frame is the last one of the scenario.
     """
-    frames_by_camera = {
-        key: frames for key, frames in dataset.sensor_frames(record).items() if key[1] in CAMERAS
-    }
-    last_frames = (frames[-1] for frames in frames_by_camera.values() if frames)
+    frames_by_camera = {}
+    for key, frames in dataset.sensor_frames(record).items():
+        if key[1] in CAMERAS and frames:
+            frames_by_camera[key] = frames
+    last_frames = [frames[-1] for frames in frames_by_camera.values()]
     last_frame = max(last_frames, default=record["num_frames"])
-    cameras = [key for key, frames in frames_by_camera.items() if last_frame in frames[-1:]]
+    cameras = [key for key, frames in frames_by_camera.items() if frames[-1] == last_frame]
     return last_frame, cameras
 
 
 def _choose_camera(dataset: Dataset, samples: list[str], pair: Boxes) -> str | None:
-    """Return the token of the camera to show; None if no image exists.
+    """Return the token of the camera image to show; None if there is no image.
 
-    Without a pair it is a front camera if there is any.
+    Without a pair, a front camera is chosen if there is one.
     """
     view = None
     if len(pair):
@@ -300,8 +319,8 @@ def _choose_camera(dataset: Dataset, samples: list[str], pair: Boxes) -> str | N
     return None
 
 
-def _camera_picture(dataset: Dataset, camera: str, pair: Boxes) -> Any:
-    """Return the image of a camera with the pair's boxes; None if the file cannot be read."""
+def _draw_camera_picture(dataset: Dataset, camera: str, pair: Boxes) -> Any:
+    """Draw a camera's image with boxes around the pair; return None if it cannot be read."""
     from PIL import Image, ImageDraw
 
     width, height = PICTURE_SIZE
@@ -323,15 +342,16 @@ def _camera_picture(dataset: Dataset, camera: str, pair: Boxes) -> Any:
     return picture
 
 
-def _picture_from_above(dataset: Dataset, record: ScenarioRecord, boxes: Boxes, pair: Boxes) -> Any:
-    """Return a picture of all actors from above, around the pair or the centre of all."""
+def _draw_from_above(dataset: Dataset, record: ScenarioRecord, boxes: Boxes, pair: Boxes) -> Any:
+    """Draw all actors from above, centred on the pair or, without one, on all actors."""
     from PIL import Image, ImageDraw
 
     width, height = PICTURE_SIZE
     picture = Image.new("RGB", PICTURE_SIZE, "#ffffff" if len(boxes) else MISSING_COLOR)
     if not len(boxes):
         return picture
-    middle = (pair if len(pair) else boxes).center[:, :2].mean(axis=0)
+    central_boxes = pair if len(pair) else boxes
+    middle = central_boxes.center[:, :2].mean(axis=0)
     scale = width / 2 / _HALF_WIDTH_M
     recorders = recorders_of(dataset, record["token"])
     pen = ImageDraw.Draw(picture)

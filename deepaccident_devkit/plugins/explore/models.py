@@ -1,4 +1,4 @@
-"""`Model`: what a model predicts, and how an evaluation scores it, with its worst samples."""
+"""A model: its predictions, the scores of an evaluation, and its worst samples."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from deepaccident_devkit.evaluation.runs import Bundle, read_bundle
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, scenario_of
 from deepaccident_devkit.evaluation.task import headlines, value_text
 from deepaccident_devkit.plugins.explore.background import Job, Jobs
-from deepaccident_devkit.plugins.explore.evaluations import finite
+from deepaccident_devkit.plugins.explore.evaluations import read_finite
 from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
     from deepaccident_devkit.plugins.explore.scenarios import Scenarios
 
-# Kind of results → the protocol that pages use without a bundle; `clean` for other kinds.
-_PROTOCOL_BY_TASK: Final[Mapping[str, str]] = {
+# Protocol that pages use without a bundle, by kind of results; `clean` for other kinds.
+_PROTOCOL_BY_TASK: Mapping[str, str] = {
     "motion": "released",
     "accident": "boxes",
     "detection": "released",
@@ -35,10 +35,10 @@ FORESEEN: Final = ("motion", "accident")
 
 
 class Score(NamedTuple):
-    """The main number of some samples.
+    """The main number of one or several samples.
 
     Attributes:
-        value: The number; None where there is nothing to count.
+        value: The number; None if there is nothing to count.
         text: The number with its unit.
     """
 
@@ -48,13 +48,14 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
-    """A bundle's main number.
+    """The main numbers of a bundle's samples and scenarios.
 
     Attributes:
         name: Name of the number, such as `apa`.
-        higher_is_better: Whether more is better.
-        samples: Token → score of the sample; the worst first, samples with nothing to count last.
-        scenarios: Scenario → score of its samples.
+        higher_is_better: Whether a higher number is better.
+        samples: Score of each sample by token, the worst first; samples with nothing to count are
+            last.
+        scenarios: Score over each scenario's samples, by scenario.
     """
 
     name: str
@@ -65,12 +66,12 @@ class Scores:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A model's results, an evaluation's bundle, or both; safe to read from several threads.
+    """A model's results, the bundle of an evaluation, or both; safe to read from several threads.
 
     Attributes:
         name: Name in addresses and for readers, from the bundle's folder or the results' file.
         bundle: Bundle of the evaluation; None for results without one.
-        results: Results; None for a bundle without a copy of its results, if these were not passed.
+        results: Results; None if the bundle has no copy of them and they were not passed either.
         jobs: Background work, which computes the scores.
     """
 
@@ -81,12 +82,14 @@ class Model:
 
     @cached_property
     def setup(self) -> EvaluationSetup:
-        """Rules of the evaluation: of the bundle, or the rules for results without one."""
+        """Rules of the evaluation: the bundle's or, without one, those for the kind of results."""
         if self.bundle is not None:
             return self.bundle.setup
-        task, form = "accident", None
+        task = "accident"
+        form = None
         if self.results is not None:
-            task, form = self.results.task, self.results.form
+            task = self.results.task
+            form = self.results.form
         horizon = 2.0
         if form is not None:
             horizon = min(2.0, (form.frames - 1) * form.step)
@@ -95,7 +98,7 @@ class Model:
 
     @cached_property
     def rows(self) -> Mapping[str, Mapping[str, Any]]:
-        """Token → the row of `samples.parquet`; empty without a bundle."""
+        """Rows of `samples.parquet` by sample token; empty without a bundle."""
         if self.bundle is None:
             return {}
         return self.bundle.rows()
@@ -118,21 +121,23 @@ class Model:
 
     @property
     def job(self) -> Job:
-        """The job that computes the scores, begun if necessary.
+        """Job that computes the scores; it is started if necessary.
 
         Its result is `Scores`, or None without a bundle.
         """
-        return self.jobs.ask(f"scores {self.name}", f"scores of {self.name}", self._scores)
+        name = f"scores {self.name}"
+        title = f"scores of {self.name}"
+        return self.jobs.ask(name, title, self._compute_scores)
 
     @property
     def scores(self) -> Scores | None:
-        """The scores; None until they are computed, and without a bundle."""
+        """The scores; None until they are computed, and always None without a bundle."""
         return None if self.bundle is None else self.job.result
 
     def numbers(self, scenarios: Scenarios) -> FloatArray | None:
-        """Return the score of each scenario, shape (N,), NaN without one.
+        """Return the score of each scenario, shape (N,), with NaN for scenarios without one.
 
-        None until the scores are computed.
+        Return None until the scores are computed.
         """
         scores = self.scores
         if scores is None:
@@ -143,17 +148,19 @@ class Model:
                 numbers[scenarios.row_of[token]] = score.value
         return numbers
 
-    def _scores(self) -> Scores | None:
+    def _compute_scores(self) -> Scores | None:
         if self.bundle is None:
             return None
         evaluator = self.bundle.evaluator()
         by_path = {headline.path: headline for headline in headlines(evaluator.compute())}
         paths = [path for path in evaluator.main_numbers if path in by_path]
-        if not paths:  # this protocol has no such number
+        if not paths:  # This protocol has no such number.
             name = next(iter(evaluator.main_numbers), "")
             return Scores(name=name, higher_is_better=True, samples={}, scenarios={})
         main = by_path[paths[0]]
         higher_is_better = main.higher_is_better is not False
+
+        sign = 1 if higher_is_better else -1
 
         def score(tokens: Sequence[str]) -> Score:
             value = None
@@ -163,33 +170,29 @@ class Model:
                     break
             return Score(value, value_text(value, main.unit))
 
-        def badness(item: tuple[str, Score]) -> tuple[bool, float]:
-            return _badness(item[1].value, higher_is_better=higher_is_better)
+        def sort_key(item: tuple[str, Score]) -> tuple[bool, float]:
+            value = item[1].value
+            return value is None, sign * (value or 0.0)
 
         by_scenario: dict[str, list[str]] = {}
+        samples = {}
         for token in sorted(evaluator.tokens):
             by_scenario.setdefault(scenario_of(token), []).append(token)
-        samples = {token: score([token]) for tokens in by_scenario.values() for token in tokens}
+            samples[token] = score([token])
         return Scores(
             name=main.name,
             higher_is_better=higher_is_better,
-            samples=dict(sorted(samples.items(), key=badness)),
+            samples=dict(sorted(samples.items(), key=sort_key)),
             scenarios={scenario: score(tokens) for scenario, tokens in by_scenario.items()},
         )
 
 
-def _badness(value: float | None, *, higher_is_better: bool) -> tuple[bool, float]:
-    """Return a key that sorts the worst first, and unknown values last."""
-    if value is None:
-        return True, 0.0
-    return False, value if higher_is_better else -value
-
-
 def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) -> dict[str, Model]:
-    """Return the models of bundles and results, by name in the order given; raise ResultsError.
+    """Open the models of bundles and results; return them by name, in the order passed.
 
-    A bundle's results are its own copy, or the passed results with its fingerprint: the path that
-    it names is not opened, since a bundle may come from anywhere.
+    The results of a bundle are its own copy or, without one, the results among `results` with the
+    bundle's fingerprint. The path that a bundle names is never opened, since a bundle may come from
+    anywhere. Raises ResultsError if a bundle or results cannot be read.
     """
     results_by_path = {str(path): read_results(path) for path in results}
     models: dict[str, Model] = {}
@@ -206,58 +209,63 @@ def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) ->
                 paired_paths.add(path)
                 own_results = own_results or candidate
         # `resolve` would follow links.
-        name = _unused_name(Path(os.path.abspath(folder)).name, models)  # noqa: PTH100
+        name = _choose_name(Path(os.path.abspath(folder)).name, models)  # noqa: PTH100
         models[name] = Model(name=name, bundle=bundle, results=own_results, jobs=jobs)
     for path, unpaired in results_by_path.items():
         if path not in paired_paths:
-            name = _unused_name(Path(os.path.abspath(path)).stem, models)  # noqa: PTH100
+            name = _choose_name(Path(os.path.abspath(path)).stem, models)  # noqa: PTH100
             models[name] = Model(name=name, bundle=None, results=unpaired, jobs=jobs)
     return models
 
 
-def _unused_name(name: str, used_names: Mapping[str, object]) -> str:
-    """Return the name, with a number if another model has it.
+def _choose_name(name: str, used_names: Mapping[str, object]) -> str:
+    """Choose a model's name; a number is appended if another model already has the name.
 
-    A name made only of dots would be no part of an address.
+    A name that consists only of dots is replaced, since it cannot be part of an address.
     """
-    name = name if name.strip(".") else "model"
-    names = [name, *(f"{name}-{number}" for number in range(2, len(used_names) + 3))]
-    return next(candidate for candidate in names if candidate not in used_names)
+    base_name = name if name.strip(".") else "model"
+    unused_name = base_name
+    number = 2
+    while unused_name in used_names:
+        unused_name = f"{base_name}-{number}"
+        number += 1
+    return unused_name
 
 
-def sample_values_job(jobs: Jobs, model: Model) -> Job:
-    """Return the job that computes the `sample_values` of a model with a bundle.
+def request_sample_values(jobs: Jobs, model: Model) -> Job:
+    """Return the job that computes `rank_samples` of a model that has a bundle.
 
-    It runs after the job that computes the model's scores.
+    It runs after the job that computes the scores of the model.
     """
-    _ = model.job  # begins first
+    _ = model.job  # This job begins first.
     title = f"the worst samples of {model.name}"
-    return jobs.ask(f"order {model.name}", title, lambda: sample_values(model))
+    return jobs.ask(f"order {model.name}", title, lambda: rank_samples(model))
 
 
-def sample_values(model: Model) -> dict[str, float | None]:
-    """Return sample → its main number, the worst first; raise EvaluationError without scores.
+def rank_samples(model: Model) -> dict[str, float | None]:
+    """Return the main number of each sample by token, the worst first.
 
-    Some protocols have no such number for a sample where there is nothing to detect. It counts as 0
-    if something is predicted there, so that false alarms are among the worst; a sample with nothing
-    at all has None, and is last.
+    Some protocols have no main number for a sample where there is nothing to detect. If something
+    is predicted there, its number is 0, so that false alarms are among the worst samples. If
+    nothing is, its number is None, and the sample is last. Raises EvaluationError if the model has
+    no scores.
     """
-    scores = scores_of(model)
+    scores = require_scores(model)
     values = {token: score.value for token, score in scores.samples.items()}
     for token, value in values.items():
         if value is None and _has_false_alarm(model.rows.get(token, {})):
             values[token] = 0.0
     sign = 1 if scores.higher_is_better else -1
 
-    def badness(item: tuple[str, float | None]) -> tuple[bool, float, str]:
+    def sort_key(item: tuple[str, float | None]) -> tuple[bool, float, str]:
         token, value = item
         return value is None, sign * (value or 0.0), token
 
-    return dict(sorted(values.items(), key=badness))
+    return dict(sorted(values.items(), key=sort_key))
 
 
-def scores_of(model: Model) -> Scores:
-    """Return a model's scores; raise EvaluationError if it has none."""
+def require_scores(model: Model) -> Scores:
+    """Return the scores of a model; raise EvaluationError if it has none."""
     scores = model.scores
     if scores is None:
         raise EvaluationError(
@@ -267,9 +275,9 @@ def scores_of(model: Model) -> Scores:
 
 
 def _has_false_alarm(row: Mapping[str, Any]) -> bool:
-    """Return whether something is predicted at a sample where there is nothing to detect."""
-    for name in row:
-        if name.startswith("fp_") or name == "detections":
-            if (finite(row[name]) or 0) > 0:
-                return True
+    """Return whether anything is predicted at a sample where there is nothing to detect."""
+    for name, value in row.items():
+        is_count = name.startswith("fp_") or name == "detections"
+        if is_count and (read_finite(value) or 0) > 0:
+            return True
     return False

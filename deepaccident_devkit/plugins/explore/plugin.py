@@ -1,4 +1,4 @@
-"""The offers of the plug-in `explore`."""
+"""The subcommand that the plug-in `explore` provides."""
 
 from __future__ import annotations
 

@@ -1,16 +1,17 @@
-"""Columns of the scenarios: from tables at once, and computed ones as soon as they are ready."""
+"""Columns of the scenarios: fast ones from tables, and slow ones as soon as they are computed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.collisions.recorded import each_scenario, those_of
+from deepaccident_devkit.collisions.recorded import map_scenarios, select_results
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.interactions import interactions_of
@@ -27,19 +28,19 @@ if TYPE_CHECKING:
 UNKNOWN_VALUE: Final = "unknown"
 INTERACTIONS: Final = "interactions"
 ACCIDENTS: Final = "accidents"
-# Slow column → the job that computes it.
-_JOB_BY_COLUMN: Final = {
+# The job that computes each slow column.
+_JOB_BY_COLUMN = {
     **dict.fromkeys(("min_ttc", "min_pet", "min_gap", "max_drac"), INTERACTIONS),
     **dict.fromkeys(("closing_speed", "accident_visibility", "lead", "lead_all"), ACCIDENTS),
 }
-_TITLES: Final = {
+_TITLES = {
     INTERACTIONS: "how near pairs come",
     ACCIDENTS: "lead times, visibility and closing speeds",
 }
-# Visibility of an approaching accident → its rank.
+# Rank of each visibility of an approaching accident.
 VISIBILITY_RANKS: Final[Mapping[str, float]] = {"visible": 0.0, "partial": 1.0, "invisible": 2.0}
-# Facets that stand above the others.
-_TOP_FACETS: Final = (
+# Facets that are shown above the others.
+_TOP_FACETS = (
     "collision",
     "accident_visibility",
     "split",
@@ -53,12 +54,12 @@ _TOP_FACETS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facet:
-    """A field with few values, for readers to choose from.
+    """A field with few values that readers can choose from.
 
     Attributes:
         name: Name of the field, as filters name it.
-        values: Texts of the values, `unknown` last.
-        codes: Index of each scenario's value, shape (N,).
+        values: Texts of the values, with `unknown` at the end.
+        codes: Index of the value of each scenario, shape (N,).
     """
 
     name: str
@@ -69,57 +70,60 @@ class Facet:
 class Scenarios:
     """The scenarios of a release, in the order of its table, and their columns.
 
-    Safe to read from several threads.
+    It is safe to read from several threads.
     """
 
     def __init__(self, dataset: Dataset, jobs: Jobs, *, workers: int | None = None) -> None:
-        """Read the fast columns of a release; `begin` begins the slow ones."""
+        """Read the fast columns of a release; `begin` computes the slow ones."""
         self.dataset = dataset
         self.records: Sequence[ScenarioRecord] = dataset.scenario[:]
         self.tokens = [record["token"] for record in self.records]
         self.row_of = {token: row for row, token in enumerate(self.tokens)}
-        self._jobs, self._workers = jobs, workers
+        self._jobs = jobs
+        self._workers = workers
         self._values: dict[str, list[Any]] = {}
         self._facets: dict[str, Facet] = {}
         texts = [group_texts(dataset, record) for record in self.records]
         grouping_fields = [name for name, field in FIELDS.items() if field.groups]
         for name in [*_TOP_FACETS, *grouping_fields]:
             if name not in self._facets and not FIELDS[name].costly:
-                self._facets[name] = _facet(name, [row[name] for row in texts])
+                self._facets[name] = _make_facet(name, [row[name] for row in texts])
 
     def __len__(self) -> int:
         """Return the number of scenarios."""
         return len(self.records)
 
     def begin(self) -> None:
-        """Begin to compute the slow columns."""
+        """Start to compute the slow columns."""
         for name in (ACCIDENTS, INTERACTIONS):
             self.job(name)
 
     def job(self, name: str) -> Job:
-        """Return the job that computes one or several slow columns, begun if necessary."""
-        work = {INTERACTIONS: self._interactions, ACCIDENTS: self._accidents}[name]
+        """Return the job that computes some slow columns; it is started if necessary."""
+        work = self._measure_accidents
+        if name == INTERACTIONS:
+            work = self._measure_interactions
         return self._jobs.ask(name, _TITLES[name], work)
 
-    def job_of(self, column: str) -> Job | None:
-        """Return the job that computes a column; None for a column that is ready at once."""
+    def find_job(self, column: str) -> Job | None:
+        """Return the job that computes a column; None for a fast column."""
         if column in _JOB_BY_COLUMN:
             return self.job(_JOB_BY_COLUMN[column])
         return None
 
     def late(self, column: str) -> Job | None:
-        """Return the job that a column waits for; None for a column that is ready."""
-        job = self.job_of(column)
+        """Return the unfinished job that computes a column; None if the column is ready."""
+        job = self.find_job(column)
         if job is not None and job.result is None:
             return job
         return None
 
     def values(self, column: str) -> Sequence[Any] | None:
-        """Return a column's values, None for unknown ones, or several in a tuple.
+        """Return the values of a column, one per scenario, or None until the column is ready.
 
-        Return None until the column is ready.
+        An unknown value is None; several values of one scenario are a tuple.
         """
-        job = self.job_of(column)
+        job = self.find_job(column)
         if job is not None:
             return None if job.result is None else job.result[column]
         if column not in self._values:
@@ -127,7 +131,7 @@ class Scenarios:
         return self._values[column]
 
     def numbers(self, column: str) -> FloatArray | None:
-        """Return a column's values as numbers to sort by, shape (N,), NaN for unknown ones.
+        """Return the values of a column as numbers to sort by, shape (N,), NaN if unknown.
 
         Return None until the column is ready.
         """
@@ -143,42 +147,53 @@ class Scenarios:
         facets = dict(self._facets)
         if self.values("accident_visibility") is not None:
             facets["accident_visibility"] = self._visibility
-        order = [*_TOP_FACETS, *(name for name in facets if name not in _TOP_FACETS)]
-        return [facets[name] for name in order if name in facets and len(facets[name].values) > 1]
+        ordered_facets = []
+        for name in dict.fromkeys([*_TOP_FACETS, *facets]):
+            if name in facets and len(facets[name].values) > 1:
+                ordered_facets.append(facets[name])
+        return ordered_facets
 
     @cached_property
     def _visibility(self) -> Facet:
-        return _facet("accident_visibility", self.values("accident_visibility") or [])
+        texts = self.values("accident_visibility") or []
+        return _make_facet("accident_visibility", texts)
 
-    def _interactions(self) -> dict[str, list[Any]]:
+    def _measure_interactions(self) -> dict[str, list[Any]]:
         results = interactions_of(self.dataset, workers=self._workers)
-        return _columns(INTERACTIONS, [measures_of_moving_pairs(pairs) for pairs in results])
+        measures = list(map(measures_of_moving_pairs, results))
+        return _make_columns(INTERACTIONS, measures)
 
-    def _accidents(self) -> dict[str, list[Any]]:
-        results = each_scenario(
-            accident_fields, self.dataset, label="accidents", workers=self._workers
+    def _measure_accidents(self) -> dict[str, list[Any]]:
+        results = map_scenarios(
+            read_accident_fields, self.dataset, label="Reading accidents", workers=self._workers
         )
-        return _columns(ACCIDENTS, those_of(dict, results))
+        return _make_columns(ACCIDENTS, select_results(dict, results))
 
 
-def _columns(job_name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return the columns that a job computes, from its results for each scenario."""
-    names = [column for column, job in _JOB_BY_COLUMN.items() if job == job_name]
-    return {name: [row[name] for row in rows] for name in names}
+def _make_columns(job_name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return the columns of a job, from its results for each scenario."""
+    columns = {}
+    for column, job in _JOB_BY_COLUMN.items():
+        if job == job_name:
+            columns[column] = [row[column] for row in rows]
+    return columns
 
 
-def accident_fields(dataset: Dataset, record: ScenarioRecord) -> dict[str, Any]:
-    """Return the slow columns about an accident; None where unknown, and without a collision."""
-    try:
+def read_accident_fields(dataset: Dataset, record: ScenarioRecord) -> dict[str, Any]:
+    """Return the slow columns about an accident; None for unknown values, or without one."""
+    lead = None
+    lead_all = None
+    with suppress(NotAvailableError):
         leads = lead_times(dataset, record)
-    except NotAvailableError:
-        leads = None
-    fields: dict[str, Any] = {}
-    for name in ("closing_speed", "accident_visibility"):
-        fields[name] = FIELDS[name].read(dataset, record)
-    fields["lead"] = None if leads is None else _finite_or_none(leads.alone)
-    fields["lead_all"] = None if leads is None else _finite_or_none(leads.together)
-    return fields
+        if leads is not None:
+            lead = _finite_or_none(leads.alone)
+            lead_all = _finite_or_none(leads.together)
+    return {
+        "closing_speed": FIELDS["closing_speed"].read(dataset, record),
+        "accident_visibility": FIELDS["accident_visibility"].read(dataset, record),
+        "lead": lead,
+        "lead_all": lead_all,
+    }
 
 
 def _finite_or_none(value: float) -> float | None:
@@ -187,7 +202,7 @@ def _finite_or_none(value: float) -> float | None:
     return float(value)
 
 
-def _facet(name: str, texts: Sequence[str | None]) -> Facet:
+def _make_facet(name: str, texts: Sequence[str | None]) -> Facet:
     values = sorted({text for text in texts if text is not None}, key=natural_order)
     if None in texts:
         values.append(UNKNOWN_VALUE)

@@ -1,4 +1,4 @@
-"""Run the pages: a server on a port of this machine, in its own thread, behind a `Gate`."""
+"""The server of the pages, in its own thread on a port of this machine, behind a `Gate`."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ from deepaccident_devkit.errors import ConfigError, MissingExtraError
 from deepaccident_devkit.plugins.explore.access import Access, App, Gate, HostPort, RootPath
 
 LOOPBACK: Final = "127.0.0.1"
-_EXTRA_PACKAGES: Final = ("starlette", "uvicorn")
+_EXTRA_PACKAGES = ("starlette", "uvicorn")
 # Ports that are tried before the machine chooses one.
 PORTS: Final = range(8765, 8785)
-_MAX_PORT: Final = 0xFFFF
-# Time in which a connection must send a complete request.
-_REQUEST_SECONDS: Final = 10.0
-# Number of connections above which all that have sent no complete request by the next sweep are
-# closed.
-_MAX_CONNECTIONS: Final = 200
+_MAX_PORT = 0xFFFF
+# Time within which a connection must send a complete request.
+_REQUEST_SECONDS = 10.0
+# Number of connections above which the next sweep closes all without a complete request.
+_MAX_CONNECTIONS = 200
 # Time between two sweeps over all connections.
-_SWEEP_SECONDS: Final = 0.1
-# Time for unfinished answers when the server stops; after it they are left to their threads.
-_STOP_SECONDS: Final = 0.7
-_EXPOSURE_WARNING: Final = (
+_SWEEP_SECONDS = 0.1
+# Time for unfinished answers when the server stops; then they are left to their threads.
+_STOP_SECONDS = 0.7
+_EXPOSURE_WARNING = (
     "warning: anyone who can reach this machine can try to open the pages, and anyone who has the "
     "address with the token sees the release. Nothing is encrypted: prefer an SSH tunnel, which "
     "needs no --address."
@@ -45,7 +44,7 @@ def need_extra() -> None:
     missing = [name for name in _EXTRA_PACKAGES if find_spec(name) is None]
     if missing:
         raise MissingExtraError(
-            f"the explorer needs {', '.join(missing)}; in a checkout: pip install '.[explore]'"
+            f"the explorer needs {', '.join(missing)}; run pip install '.[explore]' in a checkout"
         )
 
 
@@ -59,22 +58,23 @@ def serve(
     open_browser: bool = True,
     say: Callable[[str], object],
 ) -> None:
-    """Show the pages on a host and port of this machine until an exception, such as of Ctrl-C.
+    """Serve the pages on a host and port of this machine until an exception, such as Ctrl-C.
 
     A browser is opened if there is a display and no proxy.
 
     Args:
         app: Application that answers requests.
         host: Host to listen on.
-        port: Port to listen on; by default the first free one from 8765 on.
+        port: Port to listen on; None for the first free one from 8765 on.
         root_path: Path or URL at which a proxy shows the pages.
-        page: Page that the addresses lead to; by default the first.
+        page: Page that the addresses lead to; empty for the first one.
         open_browser: Whether to open a browser.
-        say: Function that gets the addresses, line by line.
+        say: Function that is called with each line about the addresses.
 
     Raises:
-        MissingExtraError: The extra `explore` is not installed.
-        ConfigError: The server cannot listen there, or the root path is neither a path nor a URL.
+        MissingExtraError: If the extra `explore` is not installed.
+        ConfigError: If the server cannot listen there, or the root path is neither a path nor a
+            URL.
     """
     with serving(app, host=host, port=port, root_path=root_path, page=page) as served:
         for line in served.lines():
@@ -88,7 +88,7 @@ def serve(
 def serving(
     app: App, *, host: str = LOOPBACK, port: int | None = None, root_path: str = "", page: str = ""
 ) -> Iterator[Served]:
-    """Show the pages as `serve` does, but only while the block runs; port 0 is any free one."""
+    """Serve the pages as `serve` does, but only within the block; port 0 means any free port."""
     need_extra()
     host = host.removeprefix("[").removesuffix("]")
     root = RootPath.parse(root_path)
@@ -96,7 +96,10 @@ def serving(
     address, port_number = listener.getsockname()[:2]
     bound = ip_address(address)
     access = Access(
-        port=port_number, root=root, names=_names(host, bound), any_address=bound.is_unspecified
+        port=port_number,
+        root=root,
+        names=_find_host_names(host, bound),
+        any_address=bound.is_unspecified,
     )
     gate = Gate(app, access)
     running = _Running(gate, listener)
@@ -114,7 +117,7 @@ class Served:
     Attributes:
         host: Name or address that was requested.
         bound: Address on which the server listens.
-        access: What is let in.
+        access: Requests that are let in.
         page: Page that the addresses lead to.
     """
 
@@ -137,38 +140,51 @@ class Served:
 
     @property
     def origin(self) -> str:
-        """Address of the server, as this machine sees it, without a path."""
+        """Address of the server without a path, as this machine sees it."""
         if self.bound.is_unspecified:
-            return _origin(LOOPBACK if self.bound.version == 4 else "::1", self.port)
-        return _origin(str(self.bound) if self.bound.is_loopback else self.host, self.port)
+            host = LOOPBACK if self.bound.version == 4 else "::1"
+        elif self.bound.is_loopback:
+            host = str(self.bound)
+        else:
+            host = self.host
+        return _format_origin(host, self.port)
 
     @property
     def url(self) -> str:
         """Address that opens the pages."""
-        return f"{self.origin}/{self.page}?token={self.token}"
+        return self._format_url(self.token)
 
     def lines(self) -> list[str]:
         """Return all addresses for the reader, and notes about them."""
-        machine, query = socket.gethostname(), f"/{self.page}?token={self.token}"
-        lines = [] if self.bound.is_loopback else [_EXPOSURE_WARNING]
+        machine = socket.gethostname()
+        query = f"/{self.page}?token={self.token}"
+        lines = []
+        if not self.bound.is_loopback:
+            lines.append(_EXPOSURE_WARNING)
         lines.append(f"the explorer runs until Ctrl-C; open {self.url}")
         if self.bound.is_unspecified:
-            lines.append(f"on other machines: {_origin(machine, self.port)}{query}")
+            lines.append(f"on other machines: {_format_origin(machine, self.port)}{query}")
         root = self.access.root
         if root.location is not None:
             lines.append(f"behind the proxy: {root}{query}")
         elif root.path:
             lines.append(f"on your notebook server or portal: {root}{query}")
-        inner = "localhost" if self.bound.is_loopback or self.bound.is_unspecified else self.host
-        tunnel = f"ssh -L {self.port}:{HostPort(inner, None)}:{self.port} {machine}"
-        local_address = f"{_origin('localhost', self.port)}{query}"
-        lines.append(f"from another machine: {tunnel}, and there {local_address}")
+        inner_host = self.host
+        if self.bound.is_loopback or self.bound.is_unspecified:
+            inner_host = "localhost"
+        tunnel = f"ssh -L {self.port}:{HostPort(inner_host, None)}:{self.port} {machine}"
+        local_address = f"{_format_origin('localhost', self.port)}{query}"
+        lines.append(f"from another machine: run {tunnel} there, and open {local_address}")
         return lines
 
     def open_browser(self) -> None:
-        """Open the pages in a browser, if there is one; its command line lacks the token."""
-        url = f"{self.origin}/{self.page}?token={self._gate.ticket()}"
-        threading.Thread(target=_open, args=(url,), name="browser", daemon=True).start()
+        """Open the pages in a browser, if there is one, by a command line without the token."""
+        url = self._format_url(self._gate.ticket())
+        thread = threading.Thread(target=_open_in_browser, args=(url,), name="browser", daemon=True)
+        thread.start()
+
+    def _format_url(self, token: str) -> str:
+        return f"{self.origin}/{self.page}?token={token}"
 
     def wait(self) -> None:
         """Wait until the server ends, which it does not do by itself."""
@@ -176,9 +192,9 @@ class Served:
 
 
 class _Running:
-    """A server in a thread.
+    """A server in a thread, which does not keep the process alive.
 
-    Neither it nor the threads that it starts keep the process alive.
+    The same holds for all threads that it starts.
     """
 
     def __init__(self, app: App, listener: socket.socket) -> None:
@@ -187,7 +203,7 @@ class _Running:
         self._listener = listener
         self._ended = threading.Event()
         self._failure: BaseException | None = None
-        # Everything is named explicitly: by default uvicorn uses whatever is installed.
+        # Everything is named explicitly, since uvicorn otherwise uses whatever is installed.
         self._server = uvicorn.Server(
             uvicorn.Config(
                 app,
@@ -196,17 +212,17 @@ class _Running:
                 ws="none",
                 lifespan="on",
                 log_config=None,
-                # The gate logs failures; bad requests, which anyone may send, are no news.
+                # The gate logs failures, and bad requests, which anyone may send, are no news.
                 log_level="critical",
                 access_log=False,
                 proxy_headers=False,
                 server_header=False,
-                timeout_graceful_shutdown=1,  # a whole number; nobody waits for its end
+                timeout_graceful_shutdown=1,  # It must be a whole number; nothing waits for it.
             )
         )
 
     def start(self) -> None:
-        """Start the server, and return when it answers."""
+        """Start the server, and return as soon as it answers."""
         threading.Thread(target=self._run, name="explorer", daemon=True).start()
         while not self._server.started:
             if self._ended.wait(0.005):
@@ -219,7 +235,7 @@ class _Running:
             raise RuntimeError("the explorer's server failed") from self._failure
 
     def stop(self) -> None:
-        """End the server, and free its port, within a second."""
+        """End the server and free its port, within a second."""
         self._server.should_exit = True
         self._ended.wait(_STOP_SECONDS)
         self._listener.close()
@@ -236,13 +252,14 @@ class _Running:
         closing = asyncio.create_task(self._close_idle_connections())
         await self._server.serve(sockets=[self._listener])
         closing.cancel()
-        for connection in [*self._server.server_state.connections]:  # readers that read nothing
+        # The other ends of the remaining connections do not read their answers.
+        for connection in [*self._server.server_state.connections]:
             connection.transport.abort()
 
     async def _close_idle_connections(self) -> None:
         """Close each connection that sends no complete request in time.
 
-        Of too many connections, close all that wait for a request.
+        If there are too many connections, close all that wait for a request.
         """
         from h11 import IDLE, SEND_BODY
 
@@ -250,11 +267,10 @@ class _Running:
         sweeps: dict[Any, int] = {}
         while True:
             await asyncio.sleep(_SWEEP_SECONDS)
-            waiting = [
-                (connection, connection.cycle)
-                for connection in connections
-                if connection.conn.their_state in (IDLE, SEND_BODY)
-            ]
+            waiting = []
+            for connection in connections:
+                if connection.conn.their_state in (IDLE, SEND_BODY):
+                    waiting.append((connection, connection.cycle))
             sweeps = {key: sweeps.get(key, 0) + 1 for key in waiting}
             max_sweeps = _REQUEST_SECONDS / _SWEEP_SECONDS
             if len(connections) > _MAX_CONNECTIONS:
@@ -269,39 +285,42 @@ class _PortInUseError(ConfigError):
 
 
 def _listen(host: str, port: int | None) -> socket.socket:
-    """Return a socket that listens; raise ConfigError."""
+    """Return a socket that listens; raise ConfigError if it cannot."""
     if not host:
         raise ConfigError("host: expected a name or an address of this machine, found nothing")
     if port is not None and not 0 <= port <= _MAX_PORT:
         raise ConfigError(f"port: expected a number up to {_MAX_PORT}, found {port}")
-    for candidate in PORTS if port is None else ():
-        with suppress(_PortInUseError):
-            return _listener(host, candidate)
-    return _listener(host, port or 0)
+    if port is None:
+        for candidate in PORTS:
+            with suppress(_PortInUseError):
+                return _open_listener(host, candidate)
+    return _open_listener(host, port or 0)
 
 
-def _listener(host: str, port: int) -> socket.socket:
+def _open_listener(host: str, port: int) -> socket.socket:
     try:
         candidates = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         family, _, _, _, address = min(candidates, key=lambda info: info[0] != socket.AF_INET)
         is_ipv6 = family == socket.AF_INET6
         return socket.create_server(address, family=family, dualstack_ipv6=is_ipv6)
     except PermissionError as error:
-        raise ConfigError(f"port {port}: not allowed here; choose a port from 1024 on") from error
+        raise ConfigError(
+            f"port {port}: you are not allowed to use this port; choose a port from 1024"
+        ) from error
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise _PortInUseError(
-                f"port {port}: another program listens there; choose another port (--address), or "
-                "leave it out"
+                f"port {port}: another program listens on this port; choose another port, or "
+                "omit --address"
             ) from error
         raise ConfigError(
-            f"host {host}: cannot listen there ({error}); give a name or an address of this "
-            "machine (--address), or leave it out"
+            f"host {host}: cannot listen on this host ({error}); give a name or an address of "
+            "this machine, or omit --address"
         ) from error
 
 
-def _names(host: str, bound: IPv4Address | IPv6Address) -> frozenset[str]:
-    """Return the hosts that a request may name: all of this machine if others can reach it."""
+def _find_host_names(host: str, bound: IPv4Address | IPv6Address) -> frozenset[str]:
+    """Return the hosts that a request may name; there are several if other machines can connect."""
     names = {host, str(bound)}
     if not bound.is_loopback:
         name = socket.gethostname()
@@ -309,22 +328,23 @@ def _names(host: str, bound: IPv4Address | IPv6Address) -> frozenset[str]:
     return frozenset(name.lower() for name in names)
 
 
-def _origin(host: str, port: int) -> str:
+def _format_origin(host: str, port: int) -> str:
     return f"http://{HostPort(host, port)}"
 
 
 def _is_display_likely(environment: Mapping[str, str]) -> bool:
-    """Return whether a browser would open where the reader sits.
+    """Return whether a browser would probably open on the reader's own screen.
 
-    It would not at the far end of SSH, unless a browser is named.
+    Over an SSH connection it would not, unless the environment names a browser.
     """
     if "BROWSER" in environment:
         return True
     if "SSH_CONNECTION" in environment:
         return False
-    return sys.platform == "darwin" or "DISPLAY" in environment or "WAYLAND_DISPLAY" in environment
+    has_display = "DISPLAY" in environment or "WAYLAND_DISPLAY" in environment
+    return sys.platform == "darwin" or has_display
 
 
-def _open(url: str) -> None:
+def _open_in_browser(url: str) -> None:
     with suppress(webbrowser.Error, OSError, ValueError):
         webbrowser.open(url)

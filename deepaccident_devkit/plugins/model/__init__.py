@@ -9,10 +9,10 @@
     tokens = da.evaluation_samples("val")
     predict_results(load_model("runs/all"), da, tokens, "results", PredictConfig(agents="all"))
 
-The preset `released` is equal to the released modules, with their quirks as fields of its
-configuration; a laptop can train `tiny` (docs/training.md), and its weights come with the devkit
-(docs/model.md). `network` describes the modules on the way from images to predictions.
-Importing a name from it without torch raises MissingExtraError.
+The preset `released` reproduces the released modules, with their quirks as fields of its
+configuration. `tiny` can be trained on a laptop (docs/training.md), and its weights come with the
+devkit (docs/model.md). `network` lists the modules from images to predictions. Importing a name
+from it without torch raises MissingExtraError.
 """
 
 from importlib import import_module
@@ -88,9 +88,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name's module when the name is used.
+    """Import a public name's module when the name is first used.
 
-    So the help of the command `train` needs no torch.
+    Thanks to this, the help of the command `train` works without torch.
     """
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -99,8 +99,8 @@ def __getattr__(name: str) -> Any:
         import torch  # noqa: F401 - nothing here works without it
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"the model needs PyTorch and safetensors, and {error.name} is not there: in a "
-            "checkout, pip install '.[torch]' (for PyTorch's CPU build alone: pip install torch "
+            f"the model needs PyTorch and safetensors, and {error.name} is not installed; run pip "
+            "install '.[torch]' in a checkout (for PyTorch's CPU build, first pip install torch "
             "--index-url https://download.pytorch.org/whl/cpu)"
         ) from error
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -37,110 +37,117 @@ Examples:
     type=WordChoice(get_args(ModelPreset)),
     default="tiny",
     show_default=True,
-    help="The model: the released one, or one that a laptop trains.",
+    help="Model to train: the released one, or a small one that a laptop can train.",
 )
 @click.option(
     "--fusion",
     type=WordChoice(get_args(ModelFusion)),
-    help="How the agents' maps are joined.  [default: the preset's]",
+    help="How to fuse the agents' maps.  [default: that of the preset]",
 )
 @click.option(
-    "--horizon", type=float, help="How many seconds to predict, in steps of 0.5.  [default: 2]"
+    "--horizon", type=float, help="How many seconds to predict, a multiple of 0.5.  [default: 2]"
 )
 @advanced(
     "--focal",
     type=float,
-    help="Focal length in pixels of the virtual camera that all images look as if taken by.  "
-    "[default: their own]",
+    help="Warp all images to a virtual camera with this focal length in pixels.  [default: no "
+    "warp]",
 )
 @advanced(
     "--labels",
     type=WordChoice(["fiery"]),
-    help="Motion labels by FIERY's rules, as nuScenes is evaluated with.  [default: the preset's]",
+    help="Use FIERY's motion labels, as in nuScenes evaluations.  [default: those of the preset]",
 )
 @cooperating_parameter("Agents that cooperate with each ego", "all")
 @click.option(
-    "--split", default="train", show_default=True, help="Name of a split, or a split file (.txt)."
+    "--split",
+    default="train",
+    show_default=True,
+    help="Split to train on: its name, or a split file (.txt).",
 )
 @click.option(
     "--validation",
     default="val",
     show_default=True,
-    help="Split whose score chooses the best weights; none for none.",
+    help="Split to choose the best weights on, or none.",
 )
 @click.option(
     "--samples",
     type=WordChoice(["train", "all", "every"]),
     default="all",
     show_default=True,
-    help="train: one a second, as released. all: two a second. every: ten a second.",
+    help="Training samples per second. train: one, as released. all: two. every: ten.",
 )
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
     default=1500,
     show_default=True,
-    help="Steps of the optimizer.",
+    help="Number of optimizer steps.",
 )
 @advanced(
     "--moments",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="Moments a step, each with all agents.",
+    help="Number of moments per step, each with all agents.",
 )
 @advanced(
     "--egos",
     type=click.IntRange(min=1),
-    help="Agents of a moment that are the ego in turn.  [default: all]",
+    help="Number of agents of a moment that become the ego in turn.  [default: all]",
 )
 @advanced(
     "--learning-rate",
     type=float,
     default=2e-3,
     show_default=True,
-    help="The highest learning rate.",
+    help="Peak learning rate.",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help="Seed of all that is drawn.",
+    help="Seed of all random numbers.",
 )
 @click.option(
     "--from",
     "weights",
     type=PATH,
-    help="Run or file of weights to begin from, `tiny`, `tiny_lidar`, or a checkpoint of the "
-    "release, BEVerse or Swin.",
+    help="Weights to start from: a run, a file of weights, `tiny`, `tiny_lidar`, or a checkpoint "
+    "of the release, BEVerse or Swin.",
 )
 @click.option(
-    "--also", type=PATH, metavar="DATAROOT", help="Another release, or nuScenes, to learn from too."
+    "--also", type=PATH, metavar="DATAROOT", help="Also train on this release, or on nuScenes."
 )
 @click.option(
     "--mix",
     type=float,
     default=0.5,
     show_default=True,
-    help="Share of the moments that are from --also.",
+    help="Share of the training moments from --also.",
 )
 @advanced(
     "--freeze",
     multiple=True,
     metavar="NAME",
-    help="Do not train parameters whose names begin so; you can repeat this.",
+    help="Do not train parameters with this prefix. You can repeat this option.",
 )
 @model_parameters
-@advanced("--bf16", is_flag=True, help="Compute in bfloat16, on GPUs.")
+@advanced("--bf16", is_flag=True, help="Compute in bfloat16 on GPUs.")
 @figure_style_parameter
 @click.option(
-    "--out", required=True, type=PATH, metavar="RUN", help="Folder of weights, log and curves."
+    "--out",
+    required=True,
+    type=PATH,
+    metavar="RUN",
+    help="Folder to write weights, log and curves into.",
 )
 def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -> None:
     """Train the model on the release in DATAROOT, or on nuScenes.
 
-    If the command is interrupted or killed, the same command goes on from the last checkpoint.
+    If the command is interrupted or killed, run it again to continue from the last checkpoint.
     """
     if also is None:
         refuse_unused("without --also", "mix")
@@ -182,9 +189,9 @@ def train(weights: Path | None, also: Path | None, mix: float, **options: Any) -
         also=second_source,
         say=click.echo,
     )
-    click.echo(f"weights: {weights_path}")
+    click.echo(f"wrote {weights_path}")
     click.echo(
         f"next: deepaccident predict {options['out']} {options['dataroot']} --split val --out "
-        "results\n"
-        "Numbers on the split that chose the weights (--validation, by default val) flatter them."
+        "results\nnote: numbers on the validation split (--validation, by default val) are too "
+        "good, as this split was used to choose the weights"
     )

@@ -1,14 +1,14 @@
-"""`LiftSplat`: image features → a map seen from above, by a distribution over depths.
+"""`LiftSplat`: image features → a BEV map, by a distribution over depths.
 
-Philion and Fidler, ECCV 2020. Each pixel of a feature map represents a ray. The points of the ray
-at fixed depths receive its features, weighted by the probability of the depth, and each cell of the
-map is the sum or the mean of its points.
+Philion and Fidler, ECCV 2020. Each pixel of a feature map represents a ray. Points at fixed depths
+along the ray get its features, weighted by the probability of the depth, and each map cell is the
+sum or the mean of its points.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Final, Literal, get_args
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -23,12 +23,13 @@ from deepaccident_devkit.taxonomy import POLE_HEIGHT
 Frustum = Literal["corners", "centres"]
 Rounding = Literal["trunc", "floor"]
 Pooling = Literal["sum", "mean"]
-# Height above its origin from which on a camera belongs to a vehicle: the release's cameras are
+# Smallest height above the origin of a camera that belongs to a vehicle: the release's cameras are
 # about 1.6 m above the origin, or at it.
-_MIN_VEHICLE_CAMERA_HEIGHT_M: Final = 1.0
-# Added to a cell's sum of probabilities, so that a cell that hardly any point reaches stays near 0.
-_MASS_OFFSET: Final = 0.01
-# Share of a step by which a range may deviate from an integer number of steps, as in
+_MIN_VEHICLE_CAMERA_HEIGHT_M = 1.0
+# Added to a cell's sum of probabilities, so that a cell that gets almost no probability stays
+# near 0.
+_MASS_OFFSET = 0.01
+# Fraction of a step by which a range may deviate from an integer number of steps, as in
 # `geometry.BevGrid`.
 _STEP_TOLERANCE = 1e-6
 
@@ -43,17 +44,18 @@ class LiftConfig:
         depth: Depths along the optical axis, without the end.
         x: Columns of the map, ascending.
         y: Rows of the map, ascending.
-        z: Height of the points that count: one step.
+        z: Heights of the points that are pooled, as a range of one step.
         image_size: Height and width of the images, pixels.
         stride: Pixels of the image per cell of the features.
-        frustum: Where a feature's ray passes through the image: `centres` of its cells; `corners`
-            spreads the rays from the first to the last pixel, the release's rule.
-        voxel_rounding: `floor`, or the release's `trunc`: rounding to zero, with which points up to
-            a step below a range fall into its first cell.
-        band: Heights above the road of the points that count, so that depths need not be learned
-            from scratch; None for all heights in `z`, as in the release. The road is at the height
-            of the origin, or 4 m below it for cameras that are not above the origin, but on a pole
-            (docs/format.md).
+        frustum: Points at which the features' rays pass through the image: `centres` of the cells,
+            or, by the release's rule, `corners`, which spreads the rays from the first to the last
+            pixel.
+        voxel_rounding: `floor`, or the release's `trunc`: rounding to zero, so that points up to a
+            step below a range fall into its first cell.
+        band: Heights above the road of the points that are pooled, so that depths need not be
+            learned from scratch; None for all heights in `z`, as in the release. The road is at the
+            height of the origin, or 4 m below it for cameras that are not above the origin, but on
+            a pole (docs/format.md).
         pooling: Pooling of the points in a cell: their `sum`, the release's rule, or their `mean`
             weighted by their probabilities, which does not grow with the number of pixels that see
             a cell.
@@ -77,7 +79,10 @@ class LiftConfig:
     pooling: Pooling = "sum"
 
     def __post_init__(self) -> None:
-        """Check the ranges and words; raises ConfigError, or ChoiceError for an unknown word."""
+        """Check the values.
+
+        Raise ConfigError for a wrong range, and ChoiceError for an unknown choice.
+        """
         words = {
             "frustum": get_args(Frustum),
             "voxel_rounding": get_args(Rounding),
@@ -87,34 +92,38 @@ class LiftConfig:
         grid = BevGrid(x=self.x, y=self.y)
         object.__setattr__(self, "x", grid.x)
         object.__setattr__(self, "y", grid.y)
-        _step_count("depth", self.depth)
-        if _step_count("z", self.z) != 1:
-            raise ConfigError(
-                f"z: expected one step, as in ({self.z[0]}, {self.z[1]}, {self.z[1] - self.z[0]})"
-            )
+        _count_steps("depth", self.depth)
+        if _count_steps("z", self.z) != 1:
+            low, high, _ = self.z
+            raise ConfigError(f"z: expected one step, as in ({low}, {high}, {high - low})")
         if self.band is not None and not self.band[0] < self.band[1]:
-            raise ConfigError(f"band: expected a lower and a higher end, found {self.band}")
-        if any(size < self.stride or size % self.stride for size in self.image_size):
             raise ConfigError(
-                "image_size: expected height and width in multiples of the stride "
-                f"{self.stride}, found {self.image_size}; resize, crop or fill the images"
+                f"band: expected the lower end, then the higher end, found {self.band}"
             )
+        for pixels in self.image_size:
+            if pixels < self.stride or pixels % self.stride:
+                raise ConfigError(
+                    "image_size: expected height and width in multiples of the stride "
+                    f"{self.stride}, found {self.image_size}; resize, crop or fill the images"
+                )
 
     @property
     def grid_shape(self) -> tuple[int, int]:
         """Rows and columns of the map."""
-        return BevGrid(x=self.x, y=self.y).shape
+        grid = BevGrid(x=self.x, y=self.y)
+        return grid.shape
 
     @property
     def frustum_shape(self) -> tuple[int, int, int]:
         """Depths of a ray, rows and columns of the features."""
         height, width = self.image_size
-        return _step_count("depth", self.depth), height // self.stride, width // self.stride
+        depths = _count_steps("depth", self.depth)
+        return depths, height // self.stride, width // self.stride
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraGeometry:
-    """The cameras of B samples, P frames, N cameras: from the network's pixels to the ego frame.
+    """Geometry of N cameras in P frames of B samples: from the network's pixels to the ego frame.
 
     Attributes:
         rotation: Rotation of `ego_from_camera`, shape (B, P, N, 3, 3); camera axes are x right, y
@@ -128,15 +137,21 @@ class CameraGeometry:
     intrinsics: Tensor
 
     def flattened(self) -> CameraGeometry:
-        """Return the cameras of (B, A, P, N, …) tensors, with A agents, as of B · A samples."""
-        tensors = {field.name: getattr(self, field.name).flatten(0, 1) for field in fields(self)}
-        return CameraGeometry(**tensors)
+        """Merge the agent axis into the sample axis: B samples of A agents become B · A samples.
+
+        The tensors of this object have shape (B, A, P, N, …).
+        """
+        return CameraGeometry(
+            rotation=self.rotation.flatten(0, 1),
+            translation=self.translation.flatten(0, 1),
+            intrinsics=self.intrinsics.flatten(0, 1),
+        )
 
 
 class LiftSplat(nn.Module):
-    """Lifts features of all cameras into one map (the released TransformerLSS).
+    """Layer that lifts the features of all cameras into one map (the released TransformerLSS).
 
-    A state dict has the released names. `frustum`, pixels u, v of the image and depth in metres,
+    State-dict keys are the released names. `frustum`, pixels u, v of the image and depth in metres,
     shape (D, h', w', 3), is part of the state dict as in the release.
     """
 
@@ -145,13 +160,15 @@ class LiftSplat(nn.Module):
     def __init__(self, config: LiftConfig) -> None:
         super().__init__()
         self.config = config
-        self.depthnet = nn.Conv2d(config.in_channels, config.frustum_shape[0] + config.channels, 1)
-        self.register_buffer("frustum", _frustum(config))
+        depths = config.frustum_shape[0]
+        out_channels = depths + config.channels
+        self.depthnet = nn.Conv2d(config.in_channels, out_channels, 1)
+        self.register_buffer("frustum", _make_frustum(config))
 
     def forward(self, features: Tensor, cameras: CameraGeometry) -> Tensor:
-        """Lift features (B, P, N, C, h', w') to one map a frame, (B, P, `channels`, Y, X).
+        """Lift features (B, P, N, C, h', w') to one map per frame, (B, P, `channels`, Y, X).
 
-        The map is float32, under autocast too. Rows are ordered by ascending y, columns by
+        The map is float32, even under autocast. Rows are ordered by ascending y, columns by
         ascending x. Raises GeometryError if features or cells do not have the configured shape.
         """
         depths, rows, columns = self.config.frustum_shape
@@ -167,31 +184,39 @@ class LiftSplat(nn.Module):
                 f"cameras: expected cells {expected} for these features, found {tuple(cells.shape)}"
             )
         # Sums of thousands of points need more than half precision.
-        logits = precise(self.depthnet(features.flatten(0, 2)))
-        return self._splat(logits[:, :depths].softmax(1), logits[:, depths:], cells)
+        output = precise(self.depthnet(features.flatten(0, 2)))
+        depth = output[:, :depths].softmax(1)
+        return self._pool_points(depth, output[:, depths:], cells)
 
     @torch.no_grad()
     def cells(self, cameras: CameraGeometry) -> Tensor:
         """Return the cell of each frustum point, (B, P, N, D, h', w') int64.
 
-        A cell is row · X + column; −1 if the point does not count.
+        A cell is row · X + column; −1 if the point is not pooled.
         """
         config = self.config
         points = self.points(cameras)
         axes = (config.x, config.y, config.z)
         step = points.new_tensor([size for _, _, size in axes])
         # In this order, rounding puts points on a border into the same cells as the release does.
-        lower = points.new_tensor([low + size / 2 for low, _, size in axes]) - step / 2
+        first_centers = points.new_tensor([low + size / 2 for low, _, size in axes])
+        lower = first_centers - step / 2
         steps = (points - lower) / step
-        steps = steps.trunc() if config.voxel_rounding == "trunc" else steps.floor()
+        if config.voxel_rounding == "trunc":
+            steps = steps.trunc()
+        else:
+            steps = steps.floor()
         rows, columns = config.grid_shape
-        is_counted = ((steps >= 0) & (steps < steps.new_tensor([columns, rows, 1]))).all(-1)
+        step_counts = steps.new_tensor([columns, rows, 1])
+        is_counted = ((steps >= 0) & (steps < step_counts)).all(-1)
         if config.band is not None:
+            lowest, highest = config.band
             is_vehicle = cameras.translation[..., 2] > _MIN_VEHICLE_CAMERA_HEIGHT_M
             road = torch.where(is_vehicle, 0.0, -POLE_HEIGHT)[..., None, None, None]
             height = points[..., 2] - road
-            is_counted &= (height >= config.band[0]) & (height < config.band[1])
-        column, row, _ = torch.where(is_counted[..., None], steps, 0).long().unbind(-1)
+            is_counted &= (height >= lowest) & (height < highest)
+        counted_steps = torch.where(is_counted[..., None], steps, 0).long()
+        column, row, _ = counted_steps.unbind(-1)
         return torch.where(is_counted, row * columns + column, -1)
 
     @torch.no_grad()
@@ -199,57 +224,77 @@ class LiftSplat(nn.Module):
         """Return the frustum's points in the ego frame in metres, (B, P, N, D, h', w', 3)."""
         dtype = torch.promote_types(cameras.rotation.dtype, torch.float32)
         with torch.autocast(self.frustum.device.type, enabled=False):
-            rotation, shift = cameras.rotation.to(dtype), cameras.translation.to(dtype)
-            pixels = self.frustum.to(dtype).flatten(0, 2)
-            rays = torch.cat([pixels[..., :2] * pixels[..., 2:], pixels[..., 2:]], -1)
-            ego_from_ray = rotation @ torch.linalg.inv(cameras.intrinsics.to(dtype))
+            rotation = cameras.rotation.to(dtype)
+            shift = cameras.translation.to(dtype)
+            frustum = self.frustum.to(dtype).flatten(0, 2)
+            depth = frustum[..., 2:]
+            rays = torch.cat([frustum[..., :2] * depth, depth], -1)
+            camera_from_ray = torch.linalg.inv(cameras.intrinsics.to(dtype))
+            ego_from_ray = rotation @ camera_from_ray
             points = rays @ ego_from_ray.transpose(-1, -2) + shift[..., None, :]
         return points.unflatten(-2, self.config.frustum_shape)
 
-    def _splat(self, depth: Tensor, context: Tensor, cells: Tensor) -> Tensor:
-        """Pool (M, D, h', w') · (M, C, h', w') of M = B · P · N cameras in the cells."""
+    def _pool_points(self, depth: Tensor, context: Tensor, cells: Tensor) -> Tensor:
+        """Return the pooled features of each cell, (B, P, C, Y, X).
+
+        Args:
+            depth: Probabilities of the depths of M = B · P · N cameras, shape (M, D, h', w').
+            context: Features of the cameras' pixels, shape (M, C, h', w').
+            cells: Cell of each frustum point, as `cells` returns it.
+        """
         samples, frames = cells.shape[:2]
         rows, columns = self.config.grid_shape
         camera_points = cells.shape[3:].numel()
         camera_pixels = cells.shape[4:].numel()
-        # The product is only computed for points that count: it takes most of this model's memory.
+        # Compute the product only for points that are pooled: it takes most of this model's
+        # memory.
         flat_cells = cells.flatten()
         point = (flat_cells >= 0).nonzero().squeeze(1)
-        pixel = point.div(camera_points, rounding_mode="floor") * camera_pixels
+        pixel = point // camera_points * camera_pixels
         pixel += point % camera_pixels
-        frame = point.div(camera_points * cells.shape[2], rounding_mode="floor")
+        frame = point // (camera_points * cells.shape[2])
         probabilities = depth.flatten().index_select(0, point)[:, None]
-        features = context.flatten(2).transpose(1, 2).flatten(0, 1).index_select(0, pixel)
-        features = features * probabilities
+        pixel_features = context.flatten(2).transpose(1, 2).flatten(0, 1)
+        features = pixel_features.index_select(0, pixel) * probabilities
         cell = flat_cells[point] + frame * (rows * columns)
         maps = features.new_zeros(samples * frames * rows * columns, context.shape[1])
         maps = maps.index_add_(0, cell, features)
         if self.config.pooling == "mean":
-            mass = probabilities.new_zeros(len(maps), 1).index_add_(0, cell, probabilities)
+            mass = probabilities.new_zeros(len(maps), 1)
+            mass = mass.index_add_(0, cell, probabilities)
             maps = maps / (mass + _MASS_OFFSET)
-        return maps.view(samples, frames, rows, columns, -1).permute(0, 1, 4, 2, 3).contiguous()
+        maps = maps.view(samples, frames, rows, columns, -1)
+        return maps.permute(0, 1, 4, 2, 3).contiguous()
 
 
-def _frustum(config: LiftConfig) -> Tensor:
+def _make_frustum(config: LiftConfig) -> Tensor:
     """Return u, v in pixels of the image and depth in metres, (D, h', w', 3)."""
     height, width = config.image_size
     depths, rows, columns = config.frustum_shape
     if config.frustum == "corners":
-        u, v = torch.linspace(0, width - 1, columns), torch.linspace(0, height - 1, rows)
+        u = torch.linspace(0, width - 1, columns)
+        v = torch.linspace(0, height - 1, rows)
     else:
-        u, v = ((torch.arange(count) + 0.5) * config.stride for count in (columns, rows))
+        u = (torch.arange(columns) + 0.5) * config.stride
+        v = (torch.arange(rows) + 0.5) * config.stride
     start, _, step = config.depth
     depth = start + step * torch.arange(depths, dtype=u.dtype)
-    return torch.stack(torch.meshgrid(depth, v, u, indexing="ij")[::-1], -1)
+    depth_v_u = torch.meshgrid(depth, v, u, indexing="ij")
+    return torch.stack(depth_v_u[::-1], -1)
 
 
-def _step_count(name: str, axis: Axis) -> int:
-    """Return the number of steps of a range; raises ConfigError if it is no positive integer."""
+def _count_steps(name: str, axis: Axis) -> int:
+    """Return a range's number of steps; raise ConfigError unless it is a positive integer."""
     start, end, step = axis
-    count = (end - start) / step if step > 0 else 0.0
-    if round(count) < 1 or abs(count - round(count)) > _STEP_TOLERANCE:
+    count = 0
+    deviation = 0.0
+    if step > 0:
+        steps = (end - start) / step
+        count = round(steps)
+        deviation = abs(steps - count)
+    if count < 1 or deviation > _STEP_TOLERANCE:
         raise ConfigError(
-            f"{name}: expected start, end and step with a whole number of steps between, found "
-            f"{axis}"
+            f"{name}: expected start, end and step with a whole number of steps from start to "
+            f"end, found {axis}"
         )
-    return round(count)
+    return count

@@ -3,14 +3,12 @@
 A worker that fails ends the run with an error; otherwise the run would wait forever.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.queues import Queue
-from typing import Any, Final
+from typing import Any
 
 from torch._utils import ExceptionWrapper
 from torch.utils.data import DataLoader
@@ -18,18 +16,18 @@ from torch.utils.data import DataLoader
 from deepaccident_devkit.errors import DeepAccidentError, WorkerError, shortened
 from deepaccident_devkit.support.parallel import FEWER_WORKERS, starting_workers
 
-# Torch's messages in this process if a worker failed, or if its data cannot be opened here.
-_WORKER_FAULTS: Final = re.compile(r"DataLoader worker|</torch_|ancdata")
+# Torch's messages in this process when a worker failed, or when its data cannot be opened here.
+_WORKER_FAULTS = re.compile(r"DataLoader worker|</torch_|ancdata")
 
 
 def read_batches(
     data: Any, collate: Callable[..., Any], workers: int, **options: Any
 ) -> Iterator[dict[str, Any]]:
-    """Start to read batches by worker processes, or by this one (0 workers).
+    """Start to read batches in worker processes, or in this process (0 workers).
 
     Args:
         data: A map-style dataset of torch.
-        collate: Function that makes a batch of items.
+        collate: Function that makes a batch from items.
         workers: Number of processes that read.
         **options: Further options of `DataLoader`.
 
@@ -39,23 +37,22 @@ def read_batches(
     with starting_workers():
         if workers:
             multiprocessing.Queue()  # torch would print tracebacks
-        return iter(
-            DataLoader(
-                data,
-                collate_fn=collate,
-                num_workers=workers,
-                worker_init_fn=_send_faults,
-                **options,
-            )
+        loader = DataLoader(
+            data,
+            collate_fn=collate,
+            num_workers=workers,
+            worker_init_fn=_send_faults,
+            **options,
         )
+        return iter(loader)
 
 
 @contextmanager
-def worker_faults_named() -> Iterator[None]:
-    """Raise WorkerError if a worker of `read_batches` is killed or fails otherwise.
+def name_worker_faults() -> Iterator[None]:
+    """Raise WorkerError if a worker of `read_batches` is killed or fails in another way.
 
-    The devkit's own errors pass. Torch may raise such an error at any time while the workers run,
-    so the block must contain everything that uses the batches.
+    The devkit's own errors are passed on. Torch may raise a worker's error at any time while the
+    workers run, so the block must contain everything that uses the batches.
     """
     try:
         yield
@@ -77,4 +74,7 @@ def _send_faults(_: int) -> None:
 
 
 def _send_reason(queue: Any, _: Exception, unsent: tuple[int, Any]) -> None:
-    queue.put((unsent[0], ExceptionWrapper(where="in DataLoader worker process")))
+    """Send the exception that is being handled instead of a batch that cannot be sent."""
+    batch_number, _batch = unsent
+    reason = ExceptionWrapper(where="in DataLoader worker process")
+    queue.put((batch_number, reason))

@@ -12,8 +12,6 @@
 | heads | crop, encoder, decoder of each task | `bev`, `motion`, `detection` |
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
@@ -42,7 +40,7 @@ from deepaccident_devkit.plugins.model.detection import (
     TaskMaps,
 )
 from deepaccident_devkit.plugins.model.fusion import FusionConfig, fusion
-from deepaccident_devkit.plugins.model.images import EncoderConfig, image_encoder, normalised
+from deepaccident_devkit.plugins.model.images import EncoderConfig, image_encoder, normalise_images
 from deepaccident_devkit.plugins.model.inputs import Handedness, ModelInputs
 from deepaccident_devkit.plugins.model.lift import LiftConfig, LiftSplat
 from deepaccident_devkit.plugins.model.motion import (
@@ -60,18 +58,24 @@ from deepaccident_devkit.training.torch import V2XConfig
 from deepaccident_devkit.v2x import Agents, Link
 
 # Keys of encoders and decoders; the first two are the release's.
-_DETECTION, _MOTION, _SHARED = "3dod", "motion", "shared"
+_DETECTION = "3dod"
+_MOTION = "motion"
+_SHARED = "shared"
+# Cells of the states along a cell of the latent.
+_LATENT_STRIDE = 4
+
+_Input = TypeVar("_Input")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """A model's processing of cameras.
+    """How a model processes cameras.
 
     Attributes:
         images: Preparation of images; uint8.
-        rows: Rows of the images after filling them with black at the bottom; None for no filling.
+        rows: Rows of the images after padding them with black at the bottom; None for no padding.
         encoder: Encoder of images.
-        lift: Lift from image features to a map seen from above.
+        lift: Lift from image features to a BEV map.
     """
 
     images: ImageConfig
@@ -82,18 +86,19 @@ class CameraConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelConfig:
-    """A V2XFormer; quirks of the release are fields of its parts.
+    """Sizes and rules of a V2XFormer; quirks of the release are fields of its parts.
 
     Attributes:
         cameras: Processing of cameras; None without cameras.
-        pillars: Processing of LiDARs; None without LiDARs. The maps of both are joined.
-        temporal: Join of an agent's own frames.
-        fusion: Join of the agents.
+        pillars: Processing of LiDARs; None without LiDARs. A model with both merges their maps.
+        temporal: Temporal model, which merges an agent's frames.
+        fusion: Fusion of the agents' maps.
         bev: Encoders before the heads.
-        one_bev: Whether both heads share one encoder of the complete map; the release has one each.
+        one_bev: Whether both heads share one encoder of the complete map; in the release, each head
+            has its own encoder.
         motion: The motion head.
         detection: The detection head.
-        labels: Motion labels that it learns; their grid is the motion grid.
+        labels: Motion labels that the model learns; their grid is the motion grid.
         handedness: Handedness of the model's frame, `left` in the release (`inputs`).
         motion_loss: Weights of the motion losses.
         detection_loss: Weights of the detection losses.
@@ -104,7 +109,7 @@ class ModelConfig:
     # Sensors.
     cameras: CameraConfig | None = None
     pillars: PillarConfig | None = None
-    # Joins of frames and agents.
+    # Merging of frames and agents.
     temporal: TemporalConfig
     fusion: FusionConfig
     # Encoders and heads.
@@ -122,48 +127,40 @@ class ModelConfig:
     decoding: DecodingConfig = field(default_factory=DecodingConfig)
 
     def __post_init__(self) -> None:
-        """Check that the parts fit together; raises ConfigError."""
-        cameras, pillars = self.cameras, self.pillars
+        """Raise ConfigError unless the parts fit together."""
+        cameras = self.cameras
+        pillars = self.pillars
         if cameras is None and pillars is None:
             raise ConfigError(
-                "cameras, pillars: expected one of them or both; without, a model sees nothing"
+                "cameras, pillars: expected cameras, pillars or both, as a model "
+                "without inputs sees nothing"
             )
-        channels = self.temporal.channels
-        bev_channels = self.bev.out_channels
-        future_frames = self.labels.future_frames
-        frames = self.labels.receptive_field
-        # Name, value, name of the value that it must equal, and this value.
-        pairs: list[tuple[str, Any, str, Any]] = [
-            ("bev.in_channels", self.bev.in_channels, "temporal.channels", channels),
-            ("motion.in_channels", self.motion.in_channels, "bev.out_channels", bev_channels),
-            ("detection.in_channels", self.detection.in_channels, "bev.out_channels", bev_channels),
-            (
-                "motion.future_frames",
-                self.motion.future_frames,
-                "labels.future_frames",
-                future_frames,
-            ),
-            ("temporal.frames", self.temporal.frames, "labels.receptive_field", frames),
-        ]
+        temporal = self.temporal
+        labels = self.labels
+        detection_channels = self.detection.in_channels
+        future_frames = self.motion.future_frames
+        bev_channels = ("bev.out_channels", self.bev.out_channels)
+        temporal_channels = ("temporal.channels", temporal.channels)
+        _check_equal("bev.in_channels", self.bev.in_channels, *temporal_channels)
+        _check_equal("motion.in_channels", self.motion.in_channels, *bev_channels)
+        _check_equal("detection.in_channels", detection_channels, *bev_channels)
+        _check_equal(
+            "motion.future_frames", future_frames, "labels.future_frames", labels.future_frames
+        )
+        _check_equal(
+            "temporal.frames", temporal.frames, "labels.receptive_field", labels.receptive_field
+        )
         if cameras is not None:
             dtype = cameras.images.dtype
-            pairs += [
-                ("images.dtype", dtype, "uint8, which the model scales itself", "uint8"),
-                ("lift.channels", cameras.lift.channels, "temporal.channels", channels),
-            ]
+            _check_equal("images.dtype", dtype, "uint8, which the model scales itself", "uint8")
+            _check_equal("lift.channels", cameras.lift.channels, *temporal_channels)
         if self.one_bev:
-            extent, labels_extent = _extent(self.temporal.grid), _extent(self.labels.grid)
-            pairs.append(("temporal.grid", extent, "the extent of labels.grid", labels_extent))
+            extent = _measure_extent(temporal.grid)
+            labels_extent = _measure_extent(labels.grid)
+            _check_equal("temporal.grid", extent, "the extent of labels.grid", labels_extent)
         if pillars is not None:
-            pairs += [
-                ("pillars.channels", pillars.channels, "temporal.channels", channels),
-                ("pillars.grid", pillars.grid, "temporal.grid", self.temporal.grid),
-            ]
-        for name, value, expected_name, expected in pairs:
-            if value != expected:
-                raise ConfigError(
-                    f"{name}: expected {expected!r}, as {expected_name}, found {value!r}"
-                )
+            _check_equal("pillars.channels", pillars.channels, *temporal_channels)
+            _check_equal("pillars.grid", pillars.grid, "temporal.grid", temporal.grid)
 
     @property
     def grid(self) -> BevGrid:
@@ -172,16 +169,20 @@ class ModelConfig:
 
     @property
     def horizon(self) -> float:
-        """Seconds of motion that are predicted."""
-        return self.labels.future_frames * self.labels.step * FRAME_PERIOD
+        """Time over which motion is predicted, seconds."""
+        labels = self.labels
+        return labels.future_frames * labels.step * FRAME_PERIOD
 
     @property
     def labels_protocol(self) -> str | None:
         """The name of the labels' protocol, for results and evaluators; None for a custom one."""
-        return self.labels.protocol if isinstance(self.labels.protocol, str) else None
+        protocol = self.labels.protocol
+        if isinstance(protocol, str):
+            return protocol
+        return None
 
     def inputs(self, agents: Agents, *, link: Link | None = None, **changes: Any) -> V2XConfig:
-        """Return the config of a dataset with the model's inputs and nothing else.
+        """Return the config of a dataset that yields exactly the model's inputs.
 
         Args:
             agents: The cooperating agents.
@@ -189,17 +190,17 @@ class ModelConfig:
             **changes: Other fields of `V2XConfig`, such as fields of targets.
         """
         options: dict[str, Any] = {
-            "images": None if self.cameras is None else self.cameras.images,
+            "images": None,
             "points": self.pillars is not None,
             "boxes": None,
             "on_missing": "skip",
-            **changes,
         }
-        past, step = self.labels.receptive_field, self.labels.step
+        if self.cameras is not None:
+            options["images"] = self.cameras.images
+        options.update(changes)
+        past = self.labels.receptive_field
+        step = self.labels.step
         return V2XConfig(agents=agents, link=link, past=past, step=step, **options)
-
-
-_Input = TypeVar("_Input")
 
 
 class ModelPredictions(NamedTuple):
@@ -215,7 +216,7 @@ class ModelPredictions(NamedTuple):
 
 
 class V2XFormer(nn.Module):
-    """The model that a configuration describes; its state dict has the release's names.
+    """The model that a configuration describes; its state-dict keys are the release's names.
 
     Attributes:
         config: The configuration.
@@ -234,7 +235,8 @@ class V2XFormer(nn.Module):
         if config.pillars is not None:
             self.pillars = PillarEncoder(config.pillars)
         if config.cameras is not None and config.pillars is not None:
-            self.join = nn.Conv2d(2 * config.temporal.channels, config.temporal.channels, 1)
+            channels = config.temporal.channels
+            self.join = nn.Conv2d(2 * channels, channels, 1)
         self.temporal_model = temporal_model(config.temporal)
         self.v2x_fusion = fusion(config.fusion)
         self.pts_bbox_head = TaskHeads(config)
@@ -247,7 +249,7 @@ class V2XFormer(nn.Module):
         noise: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> ModelPredictions:
-        """Predict for each ego.
+        """Predict motion and boxes for each ego.
 
         Args:
             inputs: Inputs of B moments with A agents, G egos.
@@ -259,67 +261,70 @@ class V2XFormer(nn.Module):
         return self.pts_bbox_head(maps, targets, noise=noise, generator=generator)
 
     def encoded(self, inputs: ModelInputs) -> Tensor:
-        """Return each agent's own map of the present, which it would send, (B, A, C, H, W).
+        """Return each agent's map of the present, which it would send, (B, A, C, H, W).
 
-        It is in the agent's own frame.
+        Each map is in its agent's frame.
         """
-        agents = inputs.frame_valid.shape[:2]
-        maps = self.temporal_model(
-            self._frame_maps(inputs),
-            inputs.egomotion.flatten(0, 1),
-            inputs.frame_valid.flatten(0, 1),
-            inputs.bev_transform.repeat_interleave(agents[1], 0),
-        )
-        return maps.unflatten(0, agents)
+        moments, agents, _ = inputs.frame_valid.shape
+        frame_maps = self._map_frames(inputs)
+        egomotion = inputs.egomotion.flatten(0, 1)
+        frame_valid = inputs.frame_valid.flatten(0, 1)
+        bev_transform = inputs.bev_transform.repeat_interleave(agents, 0)
+        maps = self.temporal_model(frame_maps, egomotion, frame_valid, bev_transform)
+        return maps.unflatten(0, (moments, agents))
 
-    def _frame_maps(self, inputs: ModelInputs) -> Tensor:
+    def _map_frames(self, inputs: ModelInputs) -> Tensor:
         """Return the maps of all frames, each in its own frame, (B · A, P, C, H, W).
 
-        Raises ConfigError if inputs are missing.
+        Raise ConfigError if the inputs lack images or points that the model needs.
         """
-        samples, frames = inputs.frame_valid.flatten(0, 1).shape
-        maps: list[Tensor] = []
+        frame_shape = inputs.frame_valid.flatten(0, 1).shape
+        maps = []
         cameras = self.config.cameras
         if cameras is not None:
-            images = _required("images", inputs.images).flatten(0, 3)
+            images = _require("images", inputs.images).flatten(0, 3)
             if not images.is_floating_point():
-                images = normalised(images)
+                images = normalise_images(images)
             if cameras.rows is not None:
-                images = functional.pad(images, (0, 0, 0, cameras.rows - images.shape[-2]))
-            features = self.img_neck(self.img_backbone(images)).unflatten(0, (samples, frames, -1))
-            geometry = _required("images", inputs.cameras).flattened()
+                black_rows = cameras.rows - images.shape[-2]
+                images = functional.pad(images, (0, 0, 0, black_rows))
+            features = self.img_neck(self.img_backbone(images))
+            features = features.unflatten(0, (*frame_shape, -1))
+            geometry = _require("images", inputs.cameras).flattened()
             maps.append(self.transformer(features, geometry))
         if self.config.pillars is not None:
-            points = _required("points", inputs.points)
-            point_frames = _required("points", inputs.point_frames)
-            point_maps = self.pillars(points, point_frames, samples * frames)
-            maps.append(point_maps.unflatten(0, (samples, frames)))
+            points = _require("points", inputs.points)
+            point_frames = _require("points", inputs.point_frames)
+            point_maps = self.pillars(points, point_frames, frame_shape.numel())
+            maps.append(point_maps.unflatten(0, frame_shape))
         if len(maps) == 1:
             return maps[0]
-        return self.join(torch.cat(maps, 2).flatten(0, 1)).unflatten(0, (samples, frames))
+        sensor_maps = torch.cat(maps, 2).flatten(0, 1)
+        return self.join(sensor_maps).unflatten(0, frame_shape)
 
     def fused(self, maps: Tensor, inputs: ModelInputs) -> Tensor:
         """Return one map of each ego, in its own frame, (G, C, H, W).
 
         Args:
-            maps: Maps of `encoded`, shape (B, A, C, H, W).
-            inputs: The same inputs, which have the egos' partners and poses.
+            maps: Maps from `encoded`, shape (B, A, C, H, W).
+            inputs: Inputs that `encoded` had; they contain the egos' partners and poses.
         """
-        moment, agent = inputs.ego_rows.unbind(1)
-        order = _ego_first(inputs.partners, agent)
-        rows, egos = moment[:, None], torch.arange(len(order), device=order.device)[:, None]
-        heard, ego_from_agent = inputs.partners[egos, order], inputs.ego_from_agent[egos, order]
-        grid, warp = self.config.temporal.grid, self.config.temporal.warp
+        moment, ego_agent = inputs.ego_rows.unbind(1)
+        moment = moment[:, None]
+        agents = _order_agents(inputs.partners, ego_agent)
+        ego = torch.arange(len(agents), device=agents.device)[:, None]
+        is_partner = inputs.partners[ego, agents]
+        ego_from_agent = inputs.ego_from_agent[ego, agents]
+        grid = self.config.temporal.grid
+        warp = self.config.temporal.warp
         if self.v2x_fusion.hides_outside:
-            mask = agents_mask(heard, ego_from_agent, grid, warp=warp)
+            mask = agents_mask(is_partner, ego_from_agent, grid, warp=warp)
         else:
-            mask = heard[:, :, None, None].expand(*heard.shape, *maps.shape[-2:])
-        return self.v2x_fusion(
-            features_to_ego(maps[rows, order], ego_from_agent, grid, warp=warp),
-            mask,
-            inputs.is_infrastructure[rows, order],
-            inputs.delay[rows, order],
-        )
+            mask = is_partner[:, :, None, None].expand(-1, -1, *maps.shape[-2:])
+        agent_maps = features_to_ego(maps[moment, agents], ego_from_agent, grid, warp=warp)
+        is_infrastructure = inputs.is_infrastructure[moment, agents]
+        delay = inputs.delay[moment, agents]
+        return self.v2x_fusion(agent_maps, mask, is_infrastructure, delay)
 
     def noise(self, egos: int, generator: torch.Generator) -> Tensor:
         """Draw the noise of a prediction, (draws, egos, latent, rows, columns).
@@ -327,15 +332,12 @@ class V2XFormer(nn.Module):
         It is on the generator's device.
         """
         motion = self.config.motion
-        cells = [-(-size // motion.upsample // 4) for size in self.config.labels.grid.shape]
-        return torch.randn(
-            motion.samples,
-            egos,
-            motion.latent,
-            *cells,
-            generator=generator,
-            device=generator.device,
-        )
+        latent_shape = []
+        for label_cells in self.config.labels.grid.shape:
+            # Both divisions together are rounded up.
+            latent_shape.append(-(-label_cells // motion.upsample // _LATENT_STRIDE))
+        shape = (motion.samples, egos, motion.latent, *latent_shape)
+        return torch.randn(shape, generator=generator, device=generator.device)
 
 
 class TaskHeads(nn.Module):
@@ -343,13 +345,17 @@ class TaskHeads(nn.Module):
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
-        kind = BevEncode if isinstance(config.bev, BevEncodeConfig) else BevUNet
-        names = (_SHARED,) if config.one_bev else (_DETECTION, _MOTION)
         self.config = config
-        self.taskfeat_encoders = nn.ModuleDict({name: kind(config.bev) for name in names})  # type: ignore[arg-type]
-        self.task_decoders = nn.ModuleDict(
-            {_DETECTION: CenterHead(config.detection), _MOTION: MotionHead(config.motion)}
-        )
+        self.taskfeat_encoders = nn.ModuleDict()
+        names = (_SHARED,) if config.one_bev else (_DETECTION, _MOTION)
+        for name in names:
+            if isinstance(config.bev, BevEncodeConfig):
+                self.taskfeat_encoders[name] = BevEncode(config.bev)
+            else:
+                self.taskfeat_encoders[name] = BevUNet(config.bev)
+        detection_head = CenterHead(config.detection)
+        motion_head = MotionHead(config.motion)
+        self.task_decoders = nn.ModuleDict({_DETECTION: detection_head, _MOTION: motion_head})
 
     def forward(
         self,
@@ -360,13 +366,13 @@ class TaskHeads(nn.Module):
         generator: torch.Generator | None = None,
     ) -> ModelPredictions:
         """Predict from fused maps (G, C, H, W); other arguments as in `V2XFormer.forward`."""
-        detection, motion = self._features(fused)
-        return ModelPredictions(
-            motion=self.task_decoders[_MOTION](motion, targets, noise=noise, generator=generator),
-            detection=self.task_decoders[_DETECTION](detection),
-        )
+        detection_features, motion_features = self._encode_tasks(fused)
+        motion_head = self.task_decoders[_MOTION]
+        motion = motion_head(motion_features, targets, noise=noise, generator=generator)
+        detection = self.task_decoders[_DETECTION](detection_features)
+        return ModelPredictions(motion, detection)
 
-    def _features(self, fused: Tensor) -> tuple[Tensor, Tensor]:
+    def _encode_tasks(self, fused: Tensor) -> tuple[Tensor, Tensor]:
         """Return the features for detection and for motion."""
         config = self.config
         if config.one_bev:
@@ -378,27 +384,41 @@ class TaskHeads(nn.Module):
         return detection_features, self.taskfeat_encoders[_MOTION](motion_map)
 
 
-def _extent(grid: BevGrid) -> tuple[float, ...]:
-    """Return the start and the end of a grid along x and y."""
-    return (*grid.x[:2], *grid.y[:2])
+def _check_equal(name: str, value: Any, expected_name: str, expected: Any) -> None:
+    """Raise ConfigError unless a value equals the one that another part of the config expects."""
+    if value != expected:
+        raise ConfigError(f"{name}: expected {expected!r}, as {expected_name}, found {value!r}")
 
 
-def _required(name: str, value: _Input | None) -> _Input:
-    """Return an input that the model needs; raises ConfigError if there is none."""
+def _measure_extent(grid: BevGrid) -> tuple[float, ...]:
+    """Return the start and the end of a grid along x and along y."""
+    x_start, x_end, _ = grid.x
+    y_start, y_end, _ = grid.y
+    return x_start, x_end, y_start, y_end
+
+
+def _require(name: str, value: _Input | None) -> _Input:
+    """Return an input that the model needs; raise ConfigError if it is None."""
     if value is None:
         raise ConfigError(
-            f"inputs: have no {name}, which this model sees with; make items by its "
-            "config.inputs(…)"
+            f"inputs: have no {name}, which this model needs; make items with its config.inputs(…)"
         )
     return value
 
 
-def _ego_first(partners: Tensor, agent: Tensor) -> Tensor:
-    """Return columns of agents for each ego, (G, A'): itself, heard agents, and others.
+def _order_agents(partners: Tensor, ego_agent: Tensor) -> Tensor:
+    """Order the agents of each ego, (G, A'): itself, the ones that it hears, and then others.
 
-    The others fill rows up to the largest number of heard agents.
+    The others fill the rows up to the largest number of agents that an ego hears.
+
+    Args:
+        partners: Whether each ego hears each agent, shape (G, A).
+        ego_agent: Agent that each ego is, shape (G,).
     """
-    is_ego = torch.nn.functional.one_hot(agent, partners.shape[1])
-    order = (2 * is_ego + partners.long()).argsort(dim=1, descending=True, stable=True)
-    max_count = int((partners | is_ego.bool()).sum(1).max()) if len(partners) else 1
-    return order[:, :max_count]
+    is_ego = functional.one_hot(ego_agent, partners.shape[1])
+    priority = 2 * is_ego + partners.long()
+    agents = priority.argsort(dim=1, descending=True, stable=True)
+    max_count = 1
+    if len(partners):
+        max_count = int((priority > 0).sum(1).max())
+    return agents[:, :max_count]

@@ -1,11 +1,9 @@
-"""`PillarEncoder`: an agent's LiDAR points → features of a map seen from above (PointPillars).
+"""`PillarEncoder`: an agent's LiDAR points → a BEV feature map (PointPillars).
 
 Lang et al., CVPR 2019. Each point is encoded independently, in the frame of its vertical pillar; a
-pillar has the largest of its points' features, and an empty pillar has zeros. Two convolutions
-bring the pillars to the cells of the maps that agents share.
+pillar's features are the maxima over its points, and an empty pillar's are zeros. Two convolutions
+reduce the pillars to the cells of the maps that agents share.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -14,7 +12,7 @@ from torch import Tensor, nn
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.support.arrays import check_least
+from deepaccident_devkit.support.arrays import check_minima
 
 # Inputs of a point: offset in its pillar (2), height, intensity, position (2) and distance.
 _POINT_INPUTS = 7
@@ -22,13 +20,14 @@ _POINT_INPUTS = 7
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PillarConfig:
-    """Sizes of the encoder of points.
+    """Sizes of the point encoder.
 
     Attributes:
         channels: Channels of the map.
         grid: Cells of the map.
-        split: Pillars along a side of a cell: finer pillars retain more of the shape of objects.
-        height: Range of heights above the road of the points that count, in metres.
+        split: Number of pillars along a side of a cell; finer pillars retain more of the shape of
+            objects.
+        height: Range of heights above the road, metres; points outside it are ignored.
         width: Number of features of a point and of a pillar.
     """
 
@@ -39,14 +38,16 @@ class PillarConfig:
     width: int = 16
 
     def __post_init__(self) -> None:
-        """Check the sizes; raises ConfigError."""
-        check_least(self, channels=1, split=1, width=1)
+        """Check the sizes; raise ConfigError if one is not valid."""
+        check_minima(self, channels=1, split=1, width=1)
         if not self.height[0] < self.height[1]:
-            raise ConfigError(f"height: expected a lower and a higher end, found {self.height}")
+            raise ConfigError(
+                f"height: expected the lower end, then the higher end, found {self.height}"
+            )
 
 
 class PillarEncoder(nn.Module):
-    """Encoder of points as one map a frame."""
+    """Encoder that turns each frame's points into one map."""
 
     def __init__(self, config: PillarConfig) -> None:
         super().__init__()
@@ -62,32 +63,40 @@ class PillarEncoder(nn.Module):
         )
 
     def forward(self, points: Tensor, frame: Tensor, frames: int) -> Tensor:
-        """Encode the points of some frames as maps, shape (frames, channels, Y, X).
+        """Encode the points of all frames as maps, shape (frames, channels, Y, X).
 
         Rows are ordered by ascending y, columns by ascending x.
 
         Args:
-            points: x y z in metres, z above the road, and the intensity, shape (K, 4).
+            points: x, y, z (metres, z above the road) and intensity, shape (K, 4).
             frame: Index of each point's frame, int64, shape (K,).
             frames: Number of frames.
         """
         config = self.config
         low, high, size = points.new_tensor([config.grid.x, config.grid.y]).unbind(1)
-        rows, columns = (config.split * cells for cells in config.grid.shape)
+        rows = config.split * config.grid.shape[0]
+        columns = config.split * config.grid.shape[1]
         position = (points[:, :2] - low) / size * config.split
         index = position.floor().long()
-        in_range = ((index >= 0) & (index < index.new_tensor([columns, rows]))).all(1)
-        in_range &= (points[:, 2] >= config.height[0]) & (points[:, 2] < config.height[1])
-        points, position, index = points[in_range], position[in_range], index[in_range]
-        pillar = (frame[in_range] * rows + index[:, 1]) * columns + index[:, 0]
+        counts = index.new_tensor([columns, rows])
+        in_range = ((index >= 0) & (index < counts)).all(1)
+        lowest, highest = config.height
+        height = points[:, 2]
+        in_range &= (height >= lowest) & (height < highest)
+        points = points[in_range]
+        position = position[in_range]
+        index = index[in_range]
+        column, row = index.unbind(1)
+        pillar = (frame[in_range] * rows + row) * columns + column
         scaled_xy = points[:, :2] / (high - low)
         distance = scaled_xy.norm(dim=1, keepdim=True)
         offset = position - index - 0.5
         inputs = torch.cat([offset, points[:, 2:], scaled_xy, distance], 1)
         features = self.point(inputs).relu()
-        # The initial zeros also take part in the maximum of pillars with points, which is at least
+        # The initial zeros also take part in the maximum of non-empty pillars, which is at least
         # 0.
         pillars = features.new_zeros(frames * rows * columns, config.width)
-        pillars = pillars.scatter_reduce(0, pillar[:, None].expand_as(features), features, "amax")
+        target = pillar[:, None].expand_as(features)
+        pillars = pillars.scatter_reduce(0, target, features, "amax")
         maps = pillars.view(frames, rows, columns, -1).permute(0, 3, 1, 2)
         return self.cells(maps.contiguous())

@@ -1,4 +1,4 @@
-"""What the plug-in `model` offers."""
+"""Registration of the plug-in `model`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import click
 
 
-def _train() -> click.Command:
+def _load_train() -> click.Command:
     from deepaccident_devkit.plugins.model.cli import train
 
     return train
@@ -20,6 +20,6 @@ PLUGIN: Final = Plugin(
     name="model",
     protocol_version=PROTOCOL_VERSION,
     verbs={
-        "train": LazyVerb("Train the model.", _train),
+        "train": LazyVerb("Train a model of motion, accidents and detections.", _load_train),
     },
 )

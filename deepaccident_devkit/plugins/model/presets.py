@@ -1,8 +1,7 @@
-"""The presets: `released`, the model of the release with its quirks, and models for laptops."""
+"""The presets: `released`, the release's model with its quirks, and models for laptops."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,13 +39,19 @@ from deepaccident_devkit.plugins.model.network import CameraConfig, ModelConfig,
 from deepaccident_devkit.plugins.model.pillars import PillarConfig
 from deepaccident_devkit.plugins.model.temporal import TemporalConfig
 from deepaccident_devkit.support.json_text import as_record
+from deepaccident_devkit.support.text import PathType, settle_choices
 from deepaccident_devkit.support.text import choice as checked_choice
-from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, ModelFusion, ModelPreset
+
+# Exclusive limit of a horizon in frames, and its tolerated deviation from an integer.
+_MAX_HORIZON_FRAMES = 100
+_FRAME_TOLERANCE = 1e-6
+# Maps with fewer channels than this get small fusions.
+_MIN_CHANNELS_OF_LARGE_FUSION = 64
 
 
 class _ChoiceNotes(msgspec.Struct):
-    """A `ModelChoice` in the notes of weights; all of it must be present."""
+    """A `ModelChoice` as stored in the notes of weights; all fields must be present."""
 
     preset: ModelPreset
     fusion: ModelFusion | None
@@ -57,16 +62,16 @@ class _ChoiceNotes(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelChoice:
-    """A preset and its changes: everything that is needed to build a model again.
+    """A preset and its changes: everything that is needed to rebuild a model.
 
     Attributes:
         preset: `released`, `tiny`, `tiny_lidar` or `tiny_both`.
         fusion: Fusion of the agents; None for the preset's.
         horizon: Seconds of motion that are predicted; None for 2.
-        focal: Focal length, in pixels, of the virtual camera that images are converted to; None for
-            their own camera.
-        labels: `fiery` for motion labels by FIERY's rules, which nuScenes is evaluated with; None
-            for the preset's.
+        focal: Focal length in pixels of the virtual camera that images are converted to; None to
+            keep the images' own cameras.
+        labels: `fiery` for motion labels by FIERY's rules, which are used to evaluate on nuScenes;
+            None for the preset's.
     """
 
     preset: ModelPreset = "tiny"
@@ -76,57 +81,61 @@ class ModelChoice:
     labels: Literal["fiery"] | None = None
 
     def __post_init__(self) -> None:
-        """Check the choice; raises ChoiceError or ConfigError."""
-        settle_choices(
-            self, {"preset": get_args(ModelPreset), "fusion": (None, *get_args(ModelFusion))}
-        )
-        settle_choices(self, {"labels": (None, "fiery")})
-        self.config  # noqa: B018 - refuses settings that do not go together
+        """Check the choice; raise ChoiceError or ConfigError if it is not valid."""
+        words = {
+            "preset": get_args(ModelPreset),
+            "fusion": (None, *get_args(ModelFusion)),
+            "labels": (None, "fiery"),
+        }
+        settle_choices(self, words)
+        self.config  # noqa: B018 - raises if settings do not fit together
 
     @property
     def config(self) -> ModelConfig:
         """The complete configuration."""
         config = MODEL_PRESETS[self.preset]()
         if self.fusion is not None:
-            config = replace(config, fusion=fusion_config(self.fusion, config.temporal.channels))
+            fusion = fusion_config(self.fusion, config.temporal.channels)
+            config = replace(config, fusion=fusion)
         if self.horizon is not None:
-            frames = self._horizon_frames(config)
-            config = replace(
-                config,
-                motion=replace(config.motion, future_frames=frames),
-                labels=replace(config.labels, future_frames=frames),
-            )
+            frames = self._count_horizon_frames(config)
+            motion = replace(config.motion, future_frames=frames)
+            labels = replace(config.labels, future_frames=frames)
+            config = replace(config, motion=motion, labels=labels)
         if self.labels is not None:
-            config = replace(config, labels=self._fiery_labels(config))
+            config = replace(config, labels=self._make_fiery_labels(config))
         if self.focal is not None:
-            config = replace(config, cameras=self._virtual_cameras(config.cameras))
+            config = replace(config, cameras=self._make_virtual_cameras(config.cameras))
         return config
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the choice as JSON holds it."""
+        """Return the choice in JSON types."""
         choice = {"preset": self.preset, "fusion": self.fusion, "horizon": self.horizon}
-        for name in ("focal", "labels"):  # notes of older runs lack these
+        for name in ("focal", "labels"):  # older runs' notes lack these
             value = getattr(self, name)
             if value is not None:
                 choice[name] = value
         return choice
 
     @classmethod
-    def from_dict(cls, described: Mapping[str, Any], path: Path) -> ModelChoice:
-        """Return the choice that the notes of a file's weights describe.
+    def from_dict(cls, notes: Mapping[str, Any], path: Path) -> ModelChoice:
+        """Read the choice from the notes that are stored with weights.
 
         Raises:
-            ConfigError: The notes describe no choice.
+            ConfigError: The notes do not describe a choice.
         """
         try:
-            return cls(**msgspec.structs.asdict(as_record(described, _ChoiceNotes)))
+            choice = as_record(notes, _ChoiceNotes)
+            return cls(**msgspec.structs.asdict(choice))
         except ValueError as error:
             raise ConfigError(
-                f"{path}: does not say which model its weights are of ({error}); give weights of "
-                "deepaccident train, or begin a training from these: deepaccident train --from"
+                f"{path}: does not say which model its weights are for ({error}); give weights "
+                "that deepaccident train wrote, or train from these weights with deepaccident "
+                "train --from"
             ) from error
 
-    def _fiery_labels(self, config: ModelConfig) -> MotionLabelConfig:
+    def _make_fiery_labels(self, config: ModelConfig) -> MotionLabelConfig:
+        """Return the configuration of FIERY's labels for the model's grid and frames."""
         labels = config.labels
         return MotionLabelConfig.preset(
             "fiery",
@@ -136,33 +145,37 @@ class ModelChoice:
             future_frames=labels.future_frames,
         )
 
-    def _virtual_cameras(self, cameras: CameraConfig | None) -> CameraConfig:
+    def _make_virtual_cameras(self, cameras: CameraConfig | None) -> CameraConfig:
+        """Use the virtual camera for all images; raise ConfigError if the model has no cameras."""
         if cameras is None:
-            raise ConfigError("focal: the model has no cameras; leave it out")
+            raise ConfigError("focal: the model has no cameras; remove this option")
         images = cameras.images
-        size = images.crop[2:] if images.crop is not None else images.resize or (0, 0)
-        virtual = VirtualCamera(self.focal or 0, *size)
-        return replace(
-            cameras, images=replace(images, resize=None, crop=None, virtual_camera=virtual)
-        )
+        size = images.resize or (0, 0)
+        if images.crop is not None:
+            size = images.crop[2:]
+        virtual_camera = VirtualCamera(self.focal or 0, *size)
+        images = replace(images, resize=None, crop=None, virtual_camera=virtual_camera)
+        return replace(cameras, images=images)
 
-    def _horizon_frames(self, config: ModelConfig) -> int:
+    def _count_horizon_frames(self, config: ModelConfig) -> int:
+        """Return the number of frames in the horizon; raise ConfigError if it is not an integer."""
         step = config.labels.step * FRAME_PERIOD
         frames = (self.horizon or 0.0) / step
-        if not (1 <= frames < 100 and abs(frames - round(frames)) < 1e-6):
+        is_in_range = 1 <= frames < _MAX_HORIZON_FRAMES
+        if not is_in_range or abs(frames - round(frames)) >= _FRAME_TOLERANCE:
             raise ConfigError(
-                f"horizon: {self.horizon!r} s is no number of steps of {step:g} s; choose 0.5, 1, "
+                f"horizon: {self.horizon!r} s is not a multiple of {step:g} s; choose 0.5, 1, "
                 "1.5, …"
             )
         return round(frames)
 
 
-def load_model(path: str | os.PathLike[str]) -> V2XFormer:
-    """Load the model of a run's folder, or of a file of our own weights, on the CPU.
+def load_model(path: PathType) -> V2XFormer:
+    """Load a model from a run's folder, or from a file of the devkit's weights, onto the CPU.
 
     Raises:
-        ConfigError: There are no weights, they are not the devkit's, or they do not fit their
-            notes.
+        ConfigError: There are no weights, they were not written by the devkit, or they do not match
+            their notes.
     """
     weights = read_weights(path)
     model = V2XFormer(ModelChoice.from_dict(weights.meta, weights.path).config)
@@ -172,39 +185,39 @@ def load_model(path: str | os.PathLike[str]) -> V2XFormer:
 
 
 def fusion_config(name: str, channels: int) -> FusionConfig:
-    """Return the config of a fusion, in a size that suits the number of channels.
+    """Return a fusion's config, sized for the number of channels.
 
-    The release's own fusion is `released`. `disconet`, `cobevt` and `v2xvit` are written from the
-    papers of these models: the paper's table names them, and the release has none of them. Raises
-    ChoiceError.
+    `released` is the fusion in the released code. `disconet`, `cobevt` and `v2xvit` appear in the
+    DeepAccident paper's table, but not in the released code; they are implemented from their
+    original papers. Raise ChoiceError if there is no such fusion.
     """
-    is_small = channels < 64
-    constructors: Mapping[str, Callable[[], FusionConfig]] = {
-        "mean": PoolFusionConfig,
-        "max": lambda: PoolFusionConfig(by="max"),
-        "released": lambda: ReleasedFusionConfig(channels=channels),
-        "disconet": lambda: DiscoNetConfig(channels=channels),
-        "cobevt": lambda: (
-            CobevtConfig(channels=channels, depth=1, window=5)
-            if is_small
-            else CobevtConfig(channels=channels)
-        ),
-        "v2xvit": lambda: (
-            V2XViTConfig(channels=channels, depth=1, windows=(5, 10, 20))
-            if is_small
-            else V2XViTConfig(channels=channels)
-        ),
-    }
-    return constructors[checked_choice("fusion", name, get_args(ModelFusion))]()
+    name = checked_choice("fusion", name, get_args(ModelFusion))
+    is_small = channels < _MIN_CHANNELS_OF_LARGE_FUSION
+    config: FusionConfig = PoolFusionConfig()
+    if name == "max":
+        config = PoolFusionConfig(by="max")
+    elif name == "released":
+        config = ReleasedFusionConfig(channels=channels)
+    elif name == "disconet":
+        config = DiscoNetConfig(channels=channels)
+    elif name == "cobevt" and is_small:
+        config = CobevtConfig(channels=channels, depth=1, window=5)
+    elif name == "cobevt":
+        config = CobevtConfig(channels=channels)
+    elif name == "v2xvit" and is_small:
+        config = V2XViTConfig(channels=channels, depth=1, windows=(5, 10, 20))
+    elif name == "v2xvit":
+        config = V2XViTConfig(channels=channels)
+    return config
 
 
 def released() -> ModelConfig:
-    """Return BEVerse-tiny with the released fusion.
+    """Return the config of BEVerse-tiny with the released fusion.
 
     It has 83 million parameters, images of 704 × 256 pixels and 200 × 200 cells of 0.5 m. Images
-    are cut as in the released tests, in training too: the release's random scales, flips and
-    rotations of images are left out, and so are its separate augmentation for each agent and its
-    mixed order of agents in batches, which are mistakes.
+    are cropped as in the released tests, even in training: the release's random scales, flips and
+    rotations of images are left out. So are two of its mistakes: a separate augmentation for each
+    agent, and a mixed order of agents in batches.
     """
     axis = (-51.2, 51.2, 0.8)
     return ModelConfig(
@@ -244,12 +257,12 @@ def released() -> ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """Return the config of images of 160 × 90 pixels, features in cells of 1 m, labels of 0.5 m.
+    """Return the config for 160 × 90 pixel images, feature cells of 1 m and label cells of 0.5 m.
 
-    The labels are `clean`; the model has none of the quirks. Only points near the road count, and a
-    cell has their mean, so that depths need not be learned from scratch. The decoders have more
-    channels instead of finer maps, because the cells of the labels are finer. docs/model.md has its
-    numbers.
+    The labels are `clean`, and the model has none of the quirks. Only points near the road are
+    pooled, by their mean, so that depths need not be learned from scratch. The label cells are
+    finer than the feature cells, so the decoders output more channels instead of finer maps.
+    docs/model.md lists its scores.
     """
     axis = (-50.0, 50.0, 1.0)
     return ModelConfig(
@@ -283,7 +296,7 @@ def tiny() -> ModelConfig:
             samples=0,
             detach=False,
         ),
-        motion_loss=MotionLossConfig(offset=0.5, flow=0.5),  # vectors count cells of half a metre
+        motion_loss=MotionLossConfig(offset=0.5, flow=0.5),  # vectors are in cells of half a metre
         detection=DetectionConfig(
             in_channels=32,
             shared_channels=24,
@@ -300,9 +313,8 @@ def tiny() -> ModelConfig:
 def tiny_both() -> ModelConfig:
     """Return `tiny` with LiDARs in addition to cameras."""
     config = tiny()
-    return replace(
-        config, pillars=PillarConfig(channels=config.temporal.channels, grid=config.grid)
-    )
+    pillars = PillarConfig(channels=config.temporal.channels, grid=config.grid)
+    return replace(config, pillars=pillars)
 
 
 def tiny_lidar() -> ModelConfig:

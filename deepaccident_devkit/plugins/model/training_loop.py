@@ -1,6 +1,4 @@
-"""`train`: from a release to a folder with weights, log and curves; a killed run resumes."""
-
-from __future__ import annotations
+"""`train`: from a release to a folder with weights, log and curves; a killed run can be resumed."""
 
 import json
 import logging
@@ -26,7 +24,7 @@ from deepaccident_devkit.plugins.model.checkpoint import (
     read_weights,
     write_weights,
 )
-from deepaccident_devkit.plugins.model.loading import worker_faults_named
+from deepaccident_devkit.plugins.model.loading import name_worker_faults
 from deepaccident_devkit.plugins.model.network import V2XFormer
 from deepaccident_devkit.plugins.model.presets import ModelChoice
 from deepaccident_devkit.plugins.model.results import PredictConfig, check_sensor_files
@@ -48,20 +46,20 @@ from deepaccident_devkit.plugins.model.training_step import (
     Moments,
     TrainingStep,
     batches,
+    drop_partners,
     freeze,
-    generator_of,
     learning_rate,
-    optimizer_of,
+    make_generator,
+    make_optimizer,
     training_batch,
-    validated,
+    validate_model,
     validation_samples,
-    with_dropped_partners,
 )
 from deepaccident_devkit.render.training import save_training
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import differing_text
+from deepaccident_devkit.support.reading import read_bytes, reason_text
+from deepaccident_devkit.support.text import PathType, differing_text
 from deepaccident_devkit.support.version import __version__
 
 logger = logging.getLogger(__name__)
@@ -72,21 +70,21 @@ Say = Callable[[str], None]
 
 def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on which machine
     dataset: Dataset,
-    out: str | os.PathLike[str],
+    out: PathType,
     choice: ModelChoice,
     config: TrainConfig | None = None,
     *,
-    weights: str | os.PathLike[str] | None = None,
+    weights: PathType | None = None,
     device: str = "auto",
     workers: int = 0,
-    images_cache: str | os.PathLike[str] | None = None,
+    images_cache: PathType | None = None,
     also: SecondSource | None = None,
     say: Say | None = None,
 ) -> Path:
     """Train a model; the same call resumes a run that was stopped or killed.
 
-    On one CPU, with the same number of threads, a resumed run has the same bits as an uninterrupted
-    one. `torchrun` starts it on several GPUs.
+    On one CPU, with the same number of threads, a resumed run gives bit-identical weights to an
+    uninterrupted one. `torchrun` starts it on several GPUs.
 
     Args:
         dataset: The release.
@@ -94,37 +92,40 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
             `last.safetensors`.
         choice: The preset and its changes.
         config: Rules of the training; None for the defaults.
-        weights: Weights to begin from (`checkpoint.read_weights`); missing parts begin at random.
+        weights: Weights to start from (`checkpoint.read_weights`); missing parts start with random
+            weights.
         device: `auto`, `cpu`, `cuda`, …
         workers: Number of processes that read; 0 for this process.
         images_cache: Cache of images, as in `V2XConfig`.
-        also: Another source to learn from; its moments come between the moments of `dataset`, and
-            it is not validated.
-        say: Function that is called with a text after each validation; None for silence, and no
+        also: Another source to train on; its moments are interleaved with `dataset`'s, and
+            it is not used for validation.
+        say: Function that is called with a text after each validation; None for no messages and no
             progress bar.
 
     Returns:
         The path of the best weights; the last ones if nothing was validated.
 
     Raises:
-        ConfigError: Another run is in the folder, there is no such device, or weights do not fit.
+        ConfigError: The folder contains another run, there is no such device, or the weights do not
+            fit.
         NotAvailableError: The split has no labelled samples, or the release lacks the sensors of
             the model.
         WorkerError: A worker process was killed, or cannot send the data that it has read.
         DeepAccidentError: As in `AllEgosDataset`.
     """
-    config = TrainConfig() if config is None else config
+    config = config or TrainConfig()
     with processes(device) as process:
-        say = say if process.is_first else None
+        if not process.is_first:
+            say = None
         folder = writable_folder(out)
-        own_moments = _moments(dataset, choice, config, images_cache)
+        own_moments = _find_moments(dataset, choice, config, images_cache)
         moments: Moments | MixedMoments = own_moments
         if also is not None:
             # nuScenes has no partners.
             also_config = replace(config, split=also.split, agents="available")
-            also_moments = _moments(also.dataset, choice, also_config, None)
+            also_moments = _find_moments(also.dataset, choice, also_config, None)
             moments = MixedMoments((own_moments, also_moments), also.mix)
-        notes = _notes(dataset, choice, config, weights)
+        notes = _make_notes(dataset, choice, config, weights)
         if also:
             notes["also"] = also.as_dict()
         run = _Run(
@@ -141,45 +142,51 @@ def train(  # noqa: PLR0913 - on what, to where, what, how, from what, and on wh
                 workers=workers,
                 images_cache=images_cache,
             ),
-            say=say or (lambda _text: None),
+            say=say or _keep_silent,
             shows_progress=say is not None,
         )
-        # Refused settings or weights leave no run behind, so the model comes before the notes.
+        # Build the model before writing notes, so that wrong settings or weights leave no run
+        # behind.
         model = new_model(choice, config, weights, run.say)
         if process.is_first:
-            _claim(folder, run.notes)
-        with worker_faults_named():
+            _claim_folder(folder, run.notes)
+        with name_worker_faults():
             return run.train_model(model.to(process.device))
 
 
-def _moments(
+def _keep_silent(_text: str) -> None:
+    """Ignore a message, for runs without output."""
+
+
+def _find_moments(
     dataset: Dataset, choice: ModelChoice, config: TrainConfig, images_cache: Any
 ) -> Moments:
-    """Return the moments of a source that has the model's sensors; raises NotAvailableError."""
+    """Return a source's moments; raise NotAvailableError if it lacks the model's sensors."""
     moments = Moments(dataset, choice.config, config, images_cache=images_cache)
     check_sensor_files(choice.config, dataset, moments.data.egos[0])
     return moments
 
 
 def new_model(
-    choice: ModelChoice, config: TrainConfig, weights: str | os.PathLike[str] | None, say: Say
+    choice: ModelChoice, config: TrainConfig, weights: PathType | None, say: Say
 ) -> V2XFormer:
     """Return the model before the first step."""
     torch.manual_seed(config.seed)
     model = V2XFormer(choice.config)
     if weights is not None:
-        say(f"{weights}: {load_weights(model, read_weights(weights)).to_text()}")
+        loaded = load_weights(model, read_weights(weights))
+        say(f"{weights}: {loaded.to_text()}")
     freeze(model, config.freeze)
     return model
 
 
-def _notes(
+def _make_notes(
     dataset: Dataset,
     choice: ModelChoice,
     config: TrainConfig,
-    weights: str | os.PathLike[str] | None,
+    weights: PathType | None,
 ) -> dict[str, Any]:
-    """Return a run's notes on itself, which must be equal to resume it."""
+    """Return the notes that describe a run; a run is resumed only if they are equal."""
     return {
         **choice.as_dict(),
         "training": config.as_dict(),
@@ -189,8 +196,8 @@ def _notes(
     }
 
 
-def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
-    """Write a run's notes, or raise ConfigError if existing ones differ."""
+def _claim_folder(folder: Path, notes: Mapping[str, Any]) -> None:
+    """Write a run's notes; raise ConfigError if the folder has different ones."""
     path = folder / RUN_FILE
     if not path.is_file():
         write_bytes(path, json.dumps(notes, indent=1).encode())
@@ -199,13 +206,15 @@ def _claim(folder: Path, notes: Mapping[str, Any]) -> None:
         stored_notes = parsed_json(read_bytes(path, "bundle"))
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"{path}: cannot be read ({fault_text(error)}); remove it, or train elsewhere"
+            f"{path}: cannot be read ({reason_text(error)}); remove it, or choose another folder"
         ) from error
-    difference = differing_text(stored_notes if isinstance(stored_notes, dict) else {}, notes)
+    if not isinstance(stored_notes, dict):
+        stored_notes = {}
+    difference = differing_text(stored_notes, notes)
     if difference:
         raise ConfigError(
-            f"{path}: is of another run ({difference}); give the same options to go on with it, or "
-            "another folder"
+            f"{path}: belongs to another run ({difference}); use the same options to continue that "
+            "run, or choose another folder"
         )
 
 
@@ -229,11 +238,11 @@ class _Run:
     shows_progress: bool
 
     def train_model(self, model: V2XFormer) -> Path:
-        """Take all remaining steps; return the path of the weights."""
+        """Take all remaining steps, and return the path of the weights."""
         config = self.config
-        optimizer = optimizer_of(model, config)
+        optimizer = make_optimizer(model, config)
         progress = load_state(self.folder, model, optimizer, config.steps)
-        training_step = self._training_step(model)
+        training_step = self._make_training_step(model)
         if self.process.is_first:
             cut_log(self.folder, progress.step)
         numbers = self.moments.numbers(
@@ -248,6 +257,7 @@ class _Run:
             initial=progress.step,
             total=config.steps,
             unit="step",
+            desc="Training",
             disable=not self.shows_progress,
         ) as bar:
             for number in bar:
@@ -255,9 +265,11 @@ class _Run:
                 bar.set_postfix(loss=f"{row['loss']:.3g}")
                 progress = self._finish_step(number + 1, row, model, optimizer, progress)
         best_path = self.folder / BEST_FILE
-        return best_path if best_path.is_file() else self._write_weights(model, progress)
+        if best_path.is_file():
+            return best_path
+        return self._write_weights(model, progress)
 
-    def _training_step(self, model: V2XFormer) -> nn.Module:
+    def _make_training_step(self, model: V2XFormer) -> nn.Module:
         """Return the model with its losses, connected to the other processes."""
         if self.process.ranks == 1:
             return TrainingStep(model)
@@ -270,44 +282,46 @@ class _Run:
     ) -> dict[str, Any]:
         """Take a step of the optimizer; return its row of the log.
 
-        All random draws depend on its number.
+        All random draws depend on the number of the step.
         """
         start_time = time.perf_counter()
         training_step.train()
+        rate = learning_rate(number, self.config)
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate(number, self.config)
+            group["lr"] = rate
         optimizer.zero_grad(set_to_none=True)
         request_time = time.perf_counter()
         batch = next(moment_batches)
         waiting_seconds = time.perf_counter() - request_time
-        losses = self._losses(training_step, batch, number)
-        torch.stack(list(losses.values())).sum().backward()
-        parameters = [
-            parameter for group in optimizer.param_groups for parameter in group["params"]
-        ]
-        norm = float(nn.utils.clip_grad_norm_(parameters, self.config.clip))
+        losses = self._compute_losses(training_step, batch, number)
+        total_loss = torch.stack(list(losses.values())).sum()
+        total_loss.backward()
+        parameters = []
+        for group in optimizer.param_groups:
+            parameters += group["params"]
+        norm = nn.utils.clip_grad_norm_(parameters, self.config.clip)
         optimizer.step()
-        values = {name: float(loss.detach()) for name, loss in losses.items()}
+        loss_values = {name: float(loss.detach()) for name, loss in losses.items()}
         return {
             "step": number + 1,
-            "loss": sum(values.values()),
-            "losses": values,
-            "rate": learning_rate(number, self.config),
-            "norm": norm,
+            "loss": sum(loss_values.values()),
+            "losses": loss_values,
+            "rate": rate,
+            "norm": float(norm),
             "seconds": time.perf_counter() - start_time,
             "waiting": waiting_seconds,
         }
 
-    def _losses(
+    def _compute_losses(
         self, training_step: nn.Module, batch: Mapping[str, Any], number: int
     ) -> dict[str, Tensor]:
         """Return the losses of a batch by name."""
-        # The 0 preserves the random draws of published runs.
+        # The 0 keeps the random draws of published runs.
         seeds = (self.config.seed, number, 0, self.process.rank)
-        generator = generator_of(*seeds)
-        torch.manual_seed(generator_of(*seeds).initial_seed())  # dropout, and the latents' noise
+        generator = make_generator(*seeds)
+        torch.manual_seed(generator.initial_seed())  # dropout, and the latents' noise
         inputs, targets = training_batch(batch, self.moments.model, self.config, generator)
-        inputs = with_dropped_partners(inputs, self.config, generator)
+        inputs = drop_partners(inputs, self.config, generator)
         device = self.process.device
         device_type = torch.device(device).type
         with torch.autocast(device_type, dtype=torch.bfloat16, enabled=self.config.bf16):
@@ -325,10 +339,11 @@ class _Run:
         """Log a step, and at regular intervals validate and save; return the progress."""
         config = self.config
         is_last = step_count == config.steps
+        is_validated = is_last or step_count % config.validate_every == 0
         progress = replace(progress, step=step_count)
-        if self.validation_tokens and (step_count % config.validate_every == 0 or is_last):
+        if self.validation_tokens and is_validated:
             tokens = self.validation_tokens[self.process.rank :: self.process.ranks]
-            scores = validated(model, self.dataset, tokens, self.predict)
+            scores = validate_model(model, self.dataset, tokens, self.predict)
             row["validation"] = scores
             scores_text = ", ".join(f"{name} {value:.3f}" for name, value in scores.items())
             self.say(f"step {step_count:,}: {scores_text}")

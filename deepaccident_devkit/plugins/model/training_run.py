@@ -1,6 +1,4 @@
-"""The config of a training, the device of a run, and its state on disk for resuming."""
-
-from __future__ import annotations
+"""The config of a training run, its device, and its state on disk, from which it resumes."""
 
 import json
 import math
@@ -10,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, get_args
+from typing import Annotated, Any, get_args
 
 import msgspec
 import torch
@@ -23,7 +21,7 @@ from deepaccident_devkit.plugins.model.checkpoint import (
     OPTIMIZER_PREFIX,
     STATE_FILE,
     read_weights,
-    reason_of,
+    short_reason,
     write_weights,
 )
 from deepaccident_devkit.selection.samples import Purpose
@@ -35,8 +33,8 @@ from deepaccident_devkit.support.text import members_of, settle_choices
 from deepaccident_devkit.v2x import Agents
 from deepaccident_devkit.v2x.agents import agents_note
 
-# Fields that are integers → lowest value.
-_MIN_INTEGERS: Final = {
+# Integer field → lowest valid value.
+_MIN_INTEGERS = {
     "steps": 1,
     "moments": 1,
     "validate_every": 1,
@@ -44,46 +42,50 @@ _MIN_INTEGERS: Final = {
     "save_every": 1,
     "seed": 0,
 }
-# Fields that are numbers → lowest and highest value, and the expectation in words.
-_NUMBER_RANGES: Final = {
-    **dict.fromkeys(("warm_up", "partner_dropout", "alone"), (0, 1, "a share from 0 to 1")),
-    **dict.fromkeys(
-        ("learning_rate", "clip"), (math.ulp(0), sys.float_info.max, "a number above 0")
-    ),
-    "weight_decay": (0, sys.float_info.max, "a number from 0"),
+_LARGEST_FLOAT = sys.float_info.max
+_SHARE_RANGE = (0, 1, "a share from 0 to 1")
+_POSITIVE_RANGE = (math.ulp(0), _LARGEST_FLOAT, "a number above 0")
+# Number field → lowest and highest valid value, and what is expected, in words.
+_NUMBER_RANGES = {
+    "warm_up": _SHARE_RANGE,
+    "partner_dropout": _SHARE_RANGE,
+    "alone": _SHARE_RANGE,
+    "learning_rate": _POSITIVE_RANGE,
+    "clip": _POSITIVE_RANGE,
+    "weight_decay": (0, _LARGEST_FLOAT, "a number from 0"),
 }
 _LOG_FILE = "log.jsonl"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainConfig:
-    """Rules of a training; checked on construction, raises ConfigError or ChoiceError.
+    """Rules of a training run; raises ConfigError or ChoiceError if a value is not valid.
 
     The optimizer is AdamW; the learning rate rises linearly and falls along a cosine to 0.
 
     Attributes:
-        steps: Steps of the optimizer.
-        moments: Moments of a step, on each process; all agents of a moment are encoded once.
-        egos: Number of a moment's agents that are the ego in turn, drawn in each step; None for all
+        steps: Number of optimizer steps.
+        moments: Number of moments per step and process; all agents of a moment are encoded once.
+        egos: Number of a moment's agents that serve as the ego, drawn in each step; None for all
             agents.
         agents: The agents that cooperate with each ego (`v2x.cooperating_agents`); None for all
             agents.
-        partner_dropout: Probability that a partner is not heard in a step.
-        alone: Probability that the ego hears no partner.
+        partner_dropout: Probability that a partner's data is dropped in a step.
+        alone: Probability that all partners' data is dropped in a step.
         learning_rate: The highest learning rate.
         weight_decay: Weight decay of AdamW.
-        warm_up: Share of the steps in which the rate rises.
-        clip: The largest norm of all gradients together.
+        warm_up: Fraction of the steps during which the rate rises.
+        clip: Maximum norm of all gradients together.
         augment: Whether the ground is rotated, scaled and mirrored at random
             (`training.torch.RandomAugmentation`).
-        split: Split to learn from: `train`, `val`, … or a split file.
-        validation: Split for the score that selects the best checkpoint; None for none.
-        samples: Samples of `split` (`motion.samples`).
+        split: Split to train on: `train`, `val`, … or a split file.
+        validation: Split whose score selects the best checkpoint; None for no validation.
+        samples: Which samples of `split` are used (`motion.samples`).
         validate_every: Steps between two validations.
         validation_samples: Number of the split's samples, evenly spaced; 0 for all.
-        save_every: Steps between two checkpoints, which a killed run can lose.
+        save_every: Steps between two checkpoints; a killed run loses at most that many.
         seed: Seed of the first weights, the order, and all random draws.
-        bf16: Whether to compute in bfloat16 where autocast does, on GPUs.
+        bf16: Whether to compute in bfloat16 where autocast allows it; GPUs only.
         freeze: Prefixes of the names of parameters that are not trained.
     """
 
@@ -128,18 +130,20 @@ class TrainConfig:
         object.__setattr__(self, "freeze", tuple(prefixes))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all fields as JSON holds them."""
-        return {**asdict(self), "agents": agents_note(self.agents)}
+        """Return all fields in JSON types."""
+        values = asdict(self)
+        values["agents"] = agents_note(self.agents)
+        return values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SecondSource:
-    """Another release, or nuScenes, to learn from in addition to the first.
+    """Another release, or nuScenes, to train on in addition to the first.
 
     Attributes:
         dataset: The release.
         split: Split of the release.
-        mix: Share of all moments that come from it.
+        mix: Fraction of all moments that come from this source.
     """
 
     dataset: Dataset
@@ -147,18 +151,22 @@ class SecondSource:
     mix: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the share; raises ConfigError."""
-        if not 0 < checked_number("mix", self.mix, "a number", ConfigError) < 1:
+        """Check the fraction; raise ConfigError unless it lies between 0 and 1."""
+        share = checked_number("mix", self.mix, "a number", ConfigError)
+        if not 0 < share < 1:
             raise ConfigError(f"mix: expected a share between 0 and 1, found {self.mix!r}")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return a run's notes on the source."""
-        return {"index": self.dataset.tables_folder.name, "split": self.split, "mix": self.mix}
+        """Return what a run's notes say about the source."""
+        index = self.dataset.tables_folder.name
+        return {"index": index, "split": self.split, "mix": self.mix}
 
 
 def _check_integer(name: str, value: object, lowest: int) -> None:
-    if checked_whole(name, value, f"a whole number from {lowest}", ConfigError) < lowest:
-        raise ConfigError(f"{name}: expected a whole number from {lowest}, found {value!r}")
+    """Raise ConfigError unless a value is an integer that is at least `lowest`."""
+    expected = f"a whole number from {lowest}"
+    if checked_whole(name, value, expected, ConfigError) < lowest:
+        raise ConfigError(f"{name}: expected {expected}, found {value!r}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,12 +185,12 @@ class RunProcess:
 
     @property
     def is_first(self) -> bool:
-        """Whether it writes the files."""
+        """Whether this is the first process, which writes the files."""
         return self.rank == 0
 
 
 def checked_device(device: str) -> str:
-    """Return a device that exists; `auto` is the first GPU, or otherwise the CPU.
+    """Return a device that exists; `auto` is the first GPU if there is one, otherwise the CPU.
 
     Raises:
         ConfigError: There is no such device.
@@ -200,12 +208,13 @@ def checked_device(device: str) -> str:
 
 @contextmanager
 def processes(device: str) -> Iterator[RunProcess]:
-    """Yield this process of a run; raises ConfigError.
+    """Yield this process of a run; raise ConfigError if the device or `torchrun` is unusable.
 
-    With `torchrun` it is connected to the other processes until the block ends.
+    Under `torchrun`, it is connected to the other processes until the block ends.
     """
     process_device = checked_device(device)
-    ranks, rank = os.environ.get("WORLD_SIZE", "1"), os.environ.get("RANK", "0")
+    ranks = os.environ.get("WORLD_SIZE", "1")
+    rank = os.environ.get("RANK", "0")
     if ranks == "1":
         yield RunProcess(device=process_device)
         return
@@ -219,8 +228,8 @@ def processes(device: str) -> Iterator[RunProcess]:
     except (RuntimeError, ValueError, TypeError) as error:
         raise ConfigError(
             f"WORLD_SIZE={shortened(ranks)}, RANK={shortened(rank)}: the processes cannot train "
-            f"together ({shortened(str(error))}); start all of them by torchrun, or unset "
-            "WORLD_SIZE to train in this one"
+            f"together ({shortened(str(error))}); start all of them with torchrun, or unset "
+            "WORLD_SIZE to train in one process"
         ) from error
     try:
         yield RunProcess(
@@ -232,9 +241,9 @@ def processes(device: str) -> Iterator[RunProcess]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch compute on one thread in the block.
+    """Let torch use only one thread inside the block.
 
-    The bits of sums depend on the number of threads.
+    The last bits of sums depend on the number of threads.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -253,10 +262,10 @@ class _Row(msgspec.Struct):
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's log, in order; none if it has no log.
+    """Return the rows of a run's log in order; an empty list if it has no log.
 
-    An incomplete last line is left out. Raises ConfigError: the log cannot be read, or a line is no
-    JSON object of a step.
+    An incomplete last line is left out. Raise ConfigError if the log cannot be read, or if a line
+    is not a JSON object that describes a step.
     """
     path = folder / _LOG_FILE
     if not path.is_file():
@@ -265,13 +274,18 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
         lines = read_bytes(path, "bundle").split(b"\n")[:-1]
     except OSError as error:
         raise ConfigError(f"{path}: {fault_text(error)}; remove the file") from error
-    return [_row(f"{path}:{number}", line) for number, line in enumerate(lines, 1)]
+    rows = []
+    for number, line in enumerate(lines, 1):
+        rows.append(_parse_row(f"{path}:{number}", line))
+    return rows
 
 
 def cut_log(folder: Path, step: int) -> None:
-    """Remove the rows after a step."""
-    rows = [row for row in read_log(folder) if row["step"] <= step]
-    text = "".join(f"{json.dumps(row)}\n" for row in rows)
+    """Remove the log's rows after a step."""
+    text = ""
+    for row in read_log(folder):
+        if row["step"] <= step:
+            text += f"{json.dumps(row)}\n"
     write_bytes(folder / _LOG_FILE, text.encode())
 
 
@@ -281,8 +295,8 @@ def add_to_log(folder: Path, row: Mapping[str, Any]) -> None:
         file.write(f"{json.dumps(row)}\n")
 
 
-def _row(location: str, line: bytes) -> dict[str, Any]:
-    """Return a row of the log; raises ConfigError with the location."""
+def _parse_row(location: str, line: bytes) -> dict[str, Any]:
+    """Parse a line of the log; raise a ConfigError that names its location if it is not valid."""
     try:
         # A log may have a million lines, and msgspec is ten times as fast as other readers.
         row: dict[str, Any] = msgspec.json.decode(line)
@@ -327,8 +341,8 @@ def save_state(
 def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> TrainingProgress:
     """Load a run's state into model and optimizer; return its progress.
 
-    Without a state the progress is 0, and nothing is loaded. Raises ConfigError: the state cannot
-    be read, or is of another model or of a run with another number of steps.
+    If there is no state, nothing is loaded and the progress is 0. Raise ConfigError if the state
+    cannot be read, or belongs to another model or to a run with another number of steps.
     """
     path = folder / STATE_FILE
     if not path.exists():
@@ -337,56 +351,62 @@ def load_state(folder: Path, model: nn.Module, optimizer: AdamW, steps: int) -> 
     try:
         progress = as_record(weights.meta, TrainingProgress)
         if progress.step > steps:
-            raise ValueError(f"it has {progress.step} steps, and the run {steps}")
-        states = _optimizer_states(weights.tensors, model, optimizer)
+            raise ValueError(f"it has {progress.step} steps, but the run has {steps}")
+        states = _find_optimizer_states(weights.tensors, model, optimizer)
         for state in states.values():
             optimizer_steps = float(state["step"])
             if not 1 <= optimizer_steps <= progress.step:
-                raise ValueError(f"its optimizer has {optimizer_steps} steps of {progress.step}")
+                raise ValueError(
+                    f"its optimizer has made {optimizer_steps} steps, but the run has made "
+                    f"{progress.step}"
+                )
     except ValueError as error:
         raise ConfigError(
-            f"{path}: is no checkpoint of this run ({reason_of(error)}); remove it, or train "
-            "elsewhere"
+            f"{path}: is not a checkpoint of this run ({short_reason(error)}); remove it, or "
+            "choose another folder"
         ) from error
     model.load_state_dict({name: weights.tensors[name] for name in model.state_dict()})
-    optimizer.load_state_dict(
-        {"state": states, "param_groups": optimizer.state_dict()["param_groups"]}
-    )
+    optimizer_state = optimizer.state_dict()
+    optimizer_state["state"] = states
+    optimizer.load_state_dict(optimizer_state)
     return progress
 
 
-def _optimizer_states(
+def _find_optimizer_states(
     tensors: Mapping[str, Tensor], model: nn.Module, optimizer: AdamW
 ) -> dict[int, dict[str, Tensor]]:
     """Return the optimizer's state of each parameter.
 
-    Raises ValueError if there are tensors of neither the model nor the optimizer, or some are
+    Raise ValueError if a tensor belongs to neither the model nor the optimizer, or if one is
     missing.
     """
-    expected, names_of_states = dict(model.state_dict()), {}
+    expected = dict(model.state_dict())
+    states: dict[int, dict[str, Tensor]] = {}
     parameters: list[Tensor] = []
     for group in optimizer.param_groups:
         parameters += group["params"]
     for number, parameter in enumerate(parameters):
         templates = {"step": torch.zeros(()), "exp_avg": parameter, "exp_avg_sq": parameter}
-        names = {part: f"{OPTIMIZER_PREFIX}{number}.{part}" for part in templates}
-        # A parameter without any gradient has no state.
+        names = {key: f"{OPTIMIZER_PREFIX}{number}.{key}" for key in templates}
+        # A parameter that never had a gradient has no state.
         if not tensors.keys().isdisjoint(names.values()):
-            for part, template in templates.items():
-                expected[names[part]] = template
-            names_of_states[number] = names
+            states[number] = {}
+            for key, name in names.items():
+                expected[name] = templates[key]
+                if name in tensors:
+                    states[number][key] = tensors[name]
     differing_names = sorted(tensors.keys() ^ expected.keys())
     if differing_names:
-        raise ValueError(f"{shortened(differing_names[0])!r} is missing, or should not be there")
+        raise ValueError(f"{shortened(differing_names[0])!r} is missing or unexpected")
     for name, template in expected.items():
-        if _form(tensors[name]) != _form(template):
-            raise ValueError(f"{name} is {_form(tensors[name])}, not {_form(template)}")
-    states = {}
-    for number, names in names_of_states.items():
-        states[number] = {part: tensors[name] for part, name in names.items()}
+        found_form = _describe_form(tensors[name])
+        expected_form = _describe_form(template)
+        if found_form != expected_form:
+            raise ValueError(f"{name} is {found_form}, not {expected_form}")
     return states
 
 
-def _form(tensor: Tensor) -> str:
+def _describe_form(tensor: Tensor) -> str:
     """Return the shape and the dtype of a tensor as text."""
-    return f"{shortened(str(tuple(tensor.shape)))} of {tensor.dtype}"
+    shape = str(tuple(tensor.shape))
+    return f"{shortened(shape)} of {tensor.dtype}"

@@ -1,14 +1,11 @@
-"""Transforms between frames of moments and agents, and warps of BEV feature maps, with gradients.
+"""Differentiable transforms between moments and agents, and warps of BEV feature maps.
 
-The sibling of `geometry.conventions` and `motion.warping`, for complete batches. Maps are ordered
-[row = y ascending, column = x ascending], and transforms have the maps' handedness; nothing here
-depends on the handedness. Products are written as sums, because `autocast` would round a matrix
-product to bfloat16, and metres need more digits than that.
+The counterpart of `geometry.conventions` and `motion.warping` for whole batches. Maps are ordered
+[row = y ascending, column = x ascending], and transforms have the maps' handedness; no function
+here depends on which one it is. Products are written as sums, because `autocast` would round a
+matrix product to bfloat16, which is too coarse for metres.
 """
 
-from __future__ import annotations
-
-from itertools import accumulate
 from typing import Literal
 
 import torch
@@ -20,36 +17,47 @@ from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion.warping import WarpMode
 
 Chain = Literal["released", "exact"]
+FeatureWarpRule = Literal["stretched", "exact"]
+# Nearest sampling gives 1 within the source's grid and 0 outside.
+_INSIDE_THRESHOLD = 0.5
 
 
 def matrices_from_six(six: Tensor) -> Tensor:
-    """Return rigid matrices (…, 4, 4) of 6-vectors (…, 6) in metres and radians.
+    """Convert 6-vectors (…, 6; metres, radians) to rigid matrices (…, 4, 4).
 
-    The convention is that of `geometry.conventions.matrices_of_six`.
+    The convention is the same as in `geometry.conventions.matrices_of_six`.
     """
     cx, cy, cz = torch.cos(six[..., 3:]).unbind(-1)
     sx, sy, sz = torch.sin(six[..., 3:]).unbind(-1)
     tx, ty, tz = six[..., :3].unbind(-1)
-    zero, one = torch.zeros_like(tx), torch.ones_like(tx)
+    zeros = torch.zeros_like(tx)
+    ones = torch.ones_like(tx)
+    sx_sy = sx * sy
+    cx_sy = cx * sy
     rows = (
         (cy * cz, -cy * sz, sy, tx),
-        (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, ty),
-        (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy, tz),
-        (zero, zero, zero, one),
+        (cx * sz + sx_sy * cz, cx * cz - sx_sy * sz, -sx * cy, ty),
+        (sx * sz - cx_sy * cz, sx * cz + cx_sy * sz, cx * cy, tz),
+        (zeros, zeros, zeros, ones),
     )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    stacked_rows = [torch.stack(row, -1) for row in rows]
+    return torch.stack(stacked_rows, -2)
 
 
 def six_from_matrices(matrix: Tensor) -> Tensor:
-    """Return 6-vectors (…, 6) in metres and radians of rigid matrices (…, 4, 4).
+    """Convert rigid matrices (…, 4, 4) to 6-vectors (…, 6) in metres and radians.
 
-    It is the inverse of `matrices_from_six`.
+    This is the inverse of `matrices_from_six`.
     """
-    m12, m22 = matrix[..., 1, 2], matrix[..., 2, 2]
-    rx = torch.atan2(-m12, m22)
-    ry = torch.atan2(matrix[..., 0, 2], torch.hypot(m12, m22))
-    rz = torch.atan2(-matrix[..., 0, 1], matrix[..., 0, 0])
-    return torch.cat([matrix[..., :3, 3], torch.stack([rx, ry, rz], -1)], -1)
+    first_row = matrix[..., 0, :]
+    minus_sx_cy = matrix[..., 1, 2]
+    cx_cy = matrix[..., 2, 2]
+    rx = torch.atan2(-minus_sx_cy, cx_cy)
+    ry = torch.atan2(first_row[..., 2], torch.hypot(minus_sx_cy, cx_cy))
+    rz = torch.atan2(-first_row[..., 1], first_row[..., 0])
+    angles = torch.stack([rx, ry, rz], -1)
+    translation = matrix[..., :3, 3]
+    return torch.cat([translation, angles], -1)
 
 
 def between_augmented(
@@ -57,54 +65,57 @@ def between_augmented(
 ) -> Tensor:
     """Return the transform between two frames' augmented maps, (…, 4, 4).
 
-    It is A_target · transform · A_source⁻¹.
+    The result is A_target · transform · A_source⁻¹.
     """
     if target_bev is not None:
-        target_from_source = _product(target_bev, target_from_source)
+        target_from_source = _multiply(target_bev, target_from_source)
     if source_bev is not None:
-        target_from_source = _product(target_from_source, torch.linalg.inv(source_bev))
+        source_from_bev = torch.linalg.inv(source_bev)
+        target_from_source = _multiply(target_from_source, source_from_bev)
     return target_from_source
 
 
 def present_from_past_batch(
     egomotion: Tensor, *, chain: Chain = "exact", bev_transform: Tensor | None = None
 ) -> Tensor:
-    """Return transforms of the past frames to the present, oldest first, (N, P − 1, 4, 4).
+    """Return the transforms from past frames to the present, oldest first, (N, P − 1, 4, 4).
 
-    The egomotion's rows are `next_from_this` in the same order, (N, P − 1, 6). Their product is
-    E_{P−2} … E_t (`exact`), or in the `released` chain E_t … E_{P−2}, which is wrong from the
-    second frame before the present on. With a BEV augmentation A (N, 4, 4) it becomes A · product ·
-    A⁻¹.
+    The egomotion's rows are `next_from_this` in the same order, (N, P − 1, 6). The transform of
+    frame t is E_{P−2} … E_t with the chain `exact`. With the chain `released` it is E_t … E_{P−2},
+    which is wrong for all but the latest past frame. A BEV augmentation A (N, 4, 4) turns it into A
+    · product · A⁻¹.
     """
-    multiply = _product if chain == "exact" else lambda later, earlier: _product(earlier, later)
-    latest_first = matrices_from_six(egomotion).unbind(1)[::-1]
-    products = list(accumulate(latest_first, multiply))
-    if products:
-        transforms = torch.stack(products[::-1], 1)
-    else:
-        transforms = egomotion.new_zeros(len(egomotion), 0, 4, 4)
-    return _augmented(transforms, bev_transform)
-
-
-def _product(matrix: Tensor, factor: Tensor) -> Tensor:
-    return (matrix[..., :, :, None] * factor[..., None, :, :]).sum(-2)
-
-
-def _augmented(transforms: Tensor, bev_transform: Tensor | None) -> Tensor:
-    """Return A · transforms · A⁻¹ of transforms (N, T, 4, 4) and A (N, 4, 4)."""
-    matrix = None if bev_transform is None else bev_transform[:, None]
+    steps = matrices_from_six(egomotion)
+    if not steps.shape[1]:
+        return steps
+    product = steps[:, -1]
+    products = [product]
+    for step in reversed(steps[:, :-1].unbind(1)):
+        if chain == "exact":
+            product = _multiply(product, step)
+        else:
+            product = _multiply(step, product)
+        products.append(product)
+    transforms = torch.stack(products[::-1], 1)
+    if bev_transform is None:
+        return transforms
+    matrix = bev_transform[:, None]
     return between_augmented(transforms, matrix, matrix)
 
 
+def _multiply(left: Tensor, right: Tensor) -> Tensor:
+    """Return products of matrices (…, 4, 4), written as sums so that they stay precise."""
+    terms = left[..., :, :, None] * right[..., None, :, :]
+    return terms.sum(-2)
+
+
 def precise(values: Tensor) -> Tensor:
-    """Return values in at least float32, if mixed precision reduced them.
+    """Convert values to at least float32, in case mixed precision reduced them.
 
     Sums over maps overflow half precision.
     """
-    return values.to(torch.promote_types(values.dtype, torch.float32))
-
-
-FeatureWarpRule = Literal["stretched", "exact"]
+    dtype = torch.promote_types(values.dtype, torch.float32)
+    return values.to(dtype)
 
 
 def warp_features(
@@ -115,19 +126,19 @@ def warp_features(
     warp: FeatureWarpRule = "exact",
     mode: WarpMode = "bilinear",
 ) -> Tensor:
-    """Return feature maps (N, C, H, W) in the target's frame; zero outside the source's grid.
+    """Warp feature maps (N, C, H, W) to the target's frame; zero outside the source's grid.
 
-    `exact` samples at the centres of the target's cells. `stretched` is the released
-    FeatureWarper's rule, which blurs by up to half a cell even without motion (`motion.warping`).
-    Points lie on the plane z = 0; only rows x, y and columns x, y and translation of the inverse
-    transform (N, 4, 4), metres, count. The result has the features' dtype; sampling is in at least
-    float32.
+    `exact` samples at the centres of the target's cells. `stretched` is the rule of the released
+    FeatureWarper, which blurs by up to half a cell even without motion (`motion.warping`). Points
+    lie on the plane z = 0, so only the x and y rows of the inverse transform (N, 4, 4), in metres,
+    are used, with their x, y and translation columns. The result has the features' dtype; sampling
+    is in at least float32.
     """
-    points = _sample_points(target_from_source, grid, warp)
-    working = features if features.dtype == torch.float64 else features.float()
+    points = _find_sample_points(target_from_source, grid, warp)
+    precise_features = precise(features)
     sampled = functional.grid_sample(
-        working,
-        points.to(working.dtype),
+        precise_features,
+        points.to(precise_features.dtype),
         mode=mode,
         padding_mode="zeros",
         align_corners=warp == "stretched",
@@ -138,18 +149,19 @@ def warp_features(
 def inside_mask(
     target_from_source: Tensor, grid: BevGrid, *, warp: FeatureWarpRule = "exact"
 ) -> Tensor:
-    """Return the cells that the source's grid covers, (N, H, W) bool, by nearest sampling.
+    """Return whether the source's grid covers each cell, (N, H, W) bool, by nearest sampling.
 
     Transforms have shape (N, 4, 4), metres.
     """
-    filled = target_from_source.new_ones(len(target_from_source), 1, *grid.shape)
-    return warp_features(filled, target_from_source, grid, warp=warp, mode="nearest")[:, 0] > 0.5
+    source_maps = target_from_source.new_ones(len(target_from_source), 1, *grid.shape)
+    covered = warp_features(source_maps, target_from_source, grid, warp=warp, mode="nearest")
+    return covered[:, 0] > _INSIDE_THRESHOLD
 
 
 def features_to_ego(
     features: Tensor, ego_from_agent: Tensor, grid: BevGrid, *, warp: FeatureWarpRule = "exact"
 ) -> Tensor:
-    """Return all agents' maps of one moment in the ego's frame, bilinear.
+    """Warp all agents' maps of one moment to the ego's frame, with bilinear sampling.
 
     The ego's own map, slot 0, is unchanged.
 
@@ -164,16 +176,15 @@ def features_to_ego(
         Maps, shape (B, A, C, H, W).
     """
     partners = features[:, 1:]
-    warped = warp_features(
-        partners.flatten(0, 1), ego_from_agent[:, 1:].flatten(0, 1), grid, warp=warp
-    )
+    ego_from_partner = ego_from_agent[:, 1:].flatten(0, 1)
+    warped = warp_features(partners.flatten(0, 1), ego_from_partner, grid, warp=warp)
     return torch.cat([features[:, :1], warped.view_as(partners)], 1)
 
 
 def agents_mask(
     agent_valid: Tensor, ego_from_agent: Tensor, grid: BevGrid, *, warp: FeatureWarpRule = "exact"
 ) -> Tensor:
-    """Return the cells of the ego's frame that each agent covers, (B, A, H, W) bool.
+    """Return whether each agent covers each cell of the ego's frame, (B, A, H, W) bool.
 
     The ego, slot 0, covers all cells. Transforms (B, A, 4, 4), metres, are the identity if an agent
     is missing.
@@ -184,31 +195,37 @@ def agents_mask(
     return mask
 
 
-def _sample_points(target_from_source: Tensor, grid: BevGrid, warp: FeatureWarpRule) -> Tensor:
-    """Return the source's point x, y that each cell samples, (N, H, W, 2).
+def _find_sample_points(target_from_source: Tensor, grid: BevGrid, warp: FeatureWarpRule) -> Tensor:
+    """Return the point (x, y) of the source that each cell samples, (N, H, W, 2).
 
-    −1 and 1 are the ends of the grid.
+    Coordinates are normalised so that −1 and 1 are the ends of the grid.
     """
     source_from_target = torch.linalg.inv(target_from_source)
-    columns, rows = (_coordinates(axis, warp, source_from_target) for axis in (grid.x, grid.y))
+    x = _space_centers(grid.x, warp, source_from_target)
+    y = _space_centers(grid.y, warp, source_from_target)[:, None]
     points = []
-    for number, (low, high, _) in enumerate((grid.x, grid.y)):
-        x_factor, y_factor, shift = (
-            source_from_target[:, number, column, None, None] for column in (0, 1, 3)
-        )
-        metres = x_factor * columns[None, None, :] + y_factor * rows[None, :, None] + shift
-        points.append((metres - (low + high) / 2) / ((high - low) / 2))
+    for row, axis in enumerate((grid.x, grid.y)):
+        factors = source_from_target[:, row, :, None, None]
+        x_factor = factors[:, 0]
+        y_factor = factors[:, 1]
+        shift = factors[:, 3]
+        metres = x_factor * x + y_factor * y + shift
+        low, high, _ = axis
+        middle = (low + high) / 2
+        half_extent = (high - low) / 2
+        points.append((metres - middle) / half_extent)
     return torch.stack(points, -1)
 
 
-def _coordinates(axis: Axis, warp: FeatureWarpRule, source_from_target: Tensor) -> Tensor:
-    """Return the centres of an axis' cells in metres, (n,), in the dtype of the transforms.
+def _space_centers(axis: Axis, warp: FeatureWarpRule, like: Tensor) -> Tensor:
+    """Return the centres of an axis' cells in metres, (n,), with the dtype and device of `like`.
 
-    If stretched, they are evenly spaced from the first centre to the *end*.
+    With `stretched`, they are evenly spaced from the first centre to the *end* of the axis.
     """
     low, high, size = axis
-    end = high if warp == "stretched" else high - size / 2
+    first_center = low + size / 2
+    last_center = high
+    if warp == "exact":
+        last_center -= size / 2
     count = round((high - low) / size)
-    return torch.linspace(
-        low + size / 2, end, count, dtype=source_from_target.dtype, device=source_from_target.device
-    )
+    return torch.linspace(first_center, last_center, count, dtype=like.dtype, device=like.device)

@@ -1,4 +1,4 @@
-"""nuScenes beside DeepAccident: its scenes as a release, usable as any other.
+"""nuScenes next to DeepAccident: its scenes as a release that can be used like any other.
 
 It needs the extra `nuscenes`:
 

@@ -1,11 +1,9 @@
 """nuScenes' categories and ours.
 
-Six of ours stand for five of its ten detection classes; all others are ignored. An ignored actor is
-no background: it is neither learned nor counted, and in motion labels a vehicle is a vehicle, as in
-FIERY's rules.
+Our six categories map to five of nuScenes' ten detection classes; all its other classes are
+ignored. An ignored actor is not background: it is neither learned nor counted. In motion labels, a
+vehicle of any class counts as a vehicle, as in FIERY's rules.
 """
-
-from __future__ import annotations
 
 from types import MappingProxyType
 from typing import Final
@@ -24,14 +22,17 @@ CLASSES: Final = MappingProxyType(
         "human.pedestrian.police_officer": "pedestrian",
     }
 )
-"""nuScenes' category → ours; it has no vans."""
+"""Our category for each of nuScenes'; nuScenes has no vans."""
 DETECTION_NAMES: Final = MappingProxyType(
     {**{name: name for name in CATEGORIES}, "van": "car", "cyclist": "bicycle"}
 )
-"""Our category → nuScenes' detection class."""
+"""nuScenes' detection class for each of our categories."""
 
 
-def category_of(category: str) -> int:
-    """Return the index of our category for one of nuScenes'; the most similar if ignored."""
-    similar = "truck" if category.startswith("vehicle.") else "pedestrian"
+def find_category(category: str) -> int:
+    """Return the index of our category that equals, or is most similar to, one of nuScenes'."""
+    if category.startswith("vehicle."):
+        similar = "truck"
+    else:
+        similar = "pedestrian"
     return CATEGORIES.index(CLASSES.get(category, similar))

@@ -1,4 +1,4 @@
-"""The offers of the plug-in `nuscenes`."""
+"""The subcommand and the opener that the plug-in `nuscenes` provides."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PLUGIN: Final = Plugin(
     protocol_version=PROTOCOL_VERSION,
     verbs={
         "sensor-setups": LazyVerb(
-            "Compare what the vehicles of two sources carry.", _sensor_setups
+            "Compare the sensors and labels of two data sources.", _sensor_setups
         ),
     },
     openers={"nuScenes": Opener(recognizes=_is_dataroot, open_release=_open)},

@@ -1,6 +1,4 @@
-"""Detections in the format of nuScenes' own evaluation: one JSON file, boxes in the world frame."""
-
-from __future__ import annotations
+"""Detections in the format of nuScenes' own evaluation: a JSON file of boxes in the world frame."""
 
 import json
 import math
@@ -16,11 +14,12 @@ from deepaccident_devkit.plugins.nuscenes.source import NuScenesRelease
 from deepaccident_devkit.support.files import write_bytes
 
 NUSCENES_RESULTS_FILE: Final = "nuscenes_detections.json"
-# Largest number of boxes of a sample that nuScenes accepts.
-_MAX_BOXES: Final = 500
-# Speed in m/s above which an attribute calls an actor moving.
-_MIN_MOVING_SPEED: Final = 0.2
-_ATTRIBUTES: Final = {
+# Largest number of boxes for a sample that nuScenes accepts.
+_MAX_BOXES = 500
+# Speed above which the attribute of an actor says that it moves.
+_MIN_MOVING_SPEED_MPS = 0.2
+# Attributes of standing and of moving actors, by nuScenes' detection class.
+_ATTRIBUTES = {
     "pedestrian": ("pedestrian.standing", "pedestrian.moving"),
     **dict.fromkeys(("bicycle", "motorcycle"), ("cycle.without_rider", "cycle.with_rider")),
     **dict.fromkeys(("car", "truck"), ("vehicle.parked", "vehicle.moving")),
@@ -28,18 +27,25 @@ _ATTRIBUTES: Final = {
 
 
 def write_detections(release: DeepAccident, results: Path) -> Path:
-    """Write our detection results of keyframes to `nuscenes_detections.json` beside them.
+    """Write our detections at keyframes to `nuscenes_detections.json` next to the results file.
 
-    Returns the path. nuScenes' evaluation requires all samples of its split: predict all of them.
+    nuScenes' evaluation requires results for all samples of its split, so predict all of them.
+
+    Args:
+        release: The nuScenes release, from `open_nuscenes`.
+        results: Path of our results file.
+
+    Returns:
+        The path of the new file.
 
     Raises:
-        ResultsError: The results are of another task.
-        ConfigError: The release is not of nuScenes, or a sample is no keyframe.
-        DeepAccidentError: `read_results` raises it.
+        ResultsError: If the results belong to another task.
+        ConfigError: If the release is not from nuScenes, or a sample is not a keyframe.
+        DeepAccidentError: If `read_results` raises it.
     """
     if not isinstance(release, NuScenesRelease):
         raise ConfigError(
-            f"{release.dataroot}: is no dataroot of nuScenes; open one with open_nuscenes"
+            f"{release.dataroot}: is not a nuScenes dataroot; open one with open_nuscenes"
         )
     content = read_results(results)
     if content.task != "detection":
@@ -56,22 +62,24 @@ def write_detections(release: DeepAccident, results: Path) -> Path:
             "use_lidar": preset in ("tiny_lidar", "tiny_both"),
             **dict.fromkeys(("use_radar", "use_map", "use_external"), False),
         },
-        "results": {token: _entries(token, boxes) for token, boxes in detections.items()},
+        "results": {token: _make_entries(token, boxes) for token, boxes in detections.items()},
     }
     path = results.parent / NUSCENES_RESULTS_FILE
     write_bytes(path, json.dumps(document).encode())
     return path
 
 
-def _entries(token: str, detections: DetectedBoxes) -> list[dict[str, Any]]:
-    """Return the best boxes of a sample, with nuScenes' classes and attributes."""
-    best = (-detections.scores).argsort(kind="stable")[:_MAX_BOXES]
-    best_boxes = DetectedBoxes(boxes=detections.boxes.select(best), scores=detections.scores[best])
+def _make_entries(token: str, detections: DetectedBoxes) -> list[dict[str, Any]]:
+    """Return a sample's highest-scoring boxes, with nuScenes' classes and attributes."""
+    best_rows = (-detections.scores).argsort(kind="stable")[:_MAX_BOXES]
+    best_boxes = DetectedBoxes(
+        boxes=detections.boxes.select(best_rows), scores=detections.scores[best_rows]
+    )
     entries = detection_entries(token, best_boxes)
     for entry in entries:
         name = DETECTION_NAMES[entry["detection_name"]]
         velocity = entry["velocity"] or [math.nan, math.nan]
-        is_moving = math.hypot(*velocity) > _MIN_MOVING_SPEED
+        is_moving = math.hypot(*velocity) > _MIN_MOVING_SPEED_MPS
         entry["detection_name"] = name
         entry["velocity"] = velocity
         entry["attribute_name"] = _ATTRIBUTES[name][is_moving]

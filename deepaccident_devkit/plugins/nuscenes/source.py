@@ -1,14 +1,15 @@
 """A nuScenes dataroot as a release: each scene is a recording of one agent at 10 Hz.
 
-A keyframe is every fifth frame, and the last one, as in our export; its time is its own. Only
-keyframes are labelled. Frames between them have poses and times, interpolated, and neither labels
-nor files. The tables are made once from nuScenes', and stored like an index: one set with the boxes
-of our classes, for all code that learns and counts, and one with all boxes.
+As in our export, the last frame and every fifth one are keyframes; a keyframe has its original
+time. Only keyframes are labelled. Frames between them have interpolated poses and times, but
+neither labels nor files. The tables are made once from nuScenes' tables and stored like an index:
+one set with the boxes of our classes, for all code that learns and counts, and one with all boxes.
 
-The frames are the release's: x forward, y left, the ego's origin on the road. The LiDAR frame is
-the sensor's, turned about its z axis until x is forward; where all boxes of a scene stand upright
-in the world, as nuScenes' do, it is upright too, so that a yaw describes a box completely. A
-camera's pose is at its own time, seen from the ego at the LiDAR's.
+Coordinate frames are as in the release: x forward, y left, and the ego's origin on the road. The
+LiDAR frame is the frame of the sensor, rotated about its z axis until x is forward. If all boxes of
+a scene are upright in the world, as nuScenes' are, the LiDAR frame is upright too, so that only yaw
+gives a box's orientation. A camera's pose is its pose at the camera's own time, relative to the ego
+pose at the time of the LiDAR.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from collections.abc import Mapping
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Final, TypedDict
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
@@ -42,7 +43,7 @@ from deepaccident_devkit.release.layout import NUSCENES_TABLE, nuscenes_tables
 from deepaccident_devkit.release.store import ReleasePath, index_places
 from deepaccident_devkit.support.files import is_writable_folder, replacing_folder
 from deepaccident_devkit.support.reading import read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import PathType, path_of
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.arrow_files import StoredTable, write_table
 from deepaccident_devkit.tables.columns import Number, TableSpec, Vector, Word
@@ -53,10 +54,12 @@ from deepaccident_devkit.tables.tokens import ColumnViews, Resolver
 from deepaccident_devkit.taxonomy import CHANNELS, LIDAR, SPLITS
 
 # Version of the stored tables, besides the version of their columns.
-_FORMAT: Final = 3
-# Folders of the tables with the boxes of our classes, and with all boxes.
-_COUNTED_FOLDER, _ALL_FOLDER = "counted", "all"
-_LIDAR: Final = CHANNELS.index(LIDAR)
+_FORMAT = 3
+# Folder of the tables with the boxes of our classes.
+_COUNTED_FOLDER = "counted"
+# Folder of the tables with all boxes.
+_ALL_FOLDER = "all"
+_LIDAR = CHANNELS.index(LIDAR)
 
 
 class _File(TypedDict):
@@ -70,11 +73,11 @@ class _File(TypedDict):
     ]
 
 
-_FILES: Final = TableSpec("files", "Files of keyframes.", record_columns(_File))
+_FILES = TableSpec("files", "Files of keyframes.", record_columns(_File))
 
 
 class _KeyframeResolver(Resolver):
-    """A resolver of the file names in nuScenes' tables."""
+    """A resolver of tokens and paths that takes file names from nuScenes' tables."""
 
     def __init__(self, views: ColumnViews, files: Mapping[str, Any]) -> None:
         """Store the columns of `_FILES`."""
@@ -83,13 +86,13 @@ class _KeyframeResolver(Resolver):
 
     def filename(self, sample_data_row: int) -> str:
         """Return the path of a file below the dataroot; between keyframes no such file exists."""
-        row = _file_row(self._files, sample_data_row)
+        row = _find_file_row(self._files, sample_data_row)
         if row is None:
             return super().filename(sample_data_row)
         return str(self._files["filename"][row])
 
 
-def _file_row(files: Mapping[str, Any], sample_data_row: int) -> int | None:
+def _find_file_row(files: Mapping[str, Any], sample_data_row: int) -> int | None:
     """Return the row of `_FILES` for a row of `sample_data`; None between keyframes."""
     rows = files["row"]
     row = int(rows.searchsorted(sample_data_row))
@@ -99,7 +102,7 @@ def _file_row(files: Mapping[str, Any], sample_data_row: int) -> int | None:
 
 
 class NuScenesRelease(DeepAccident):
-    """The scenes of a nuScenes dataroot, opened by `open_nuscenes` and used as any release."""
+    """The scenes of a nuScenes dataroot, opened by `open_nuscenes` and used like any release."""
 
     def __init__(self, dataroot: ReleasePath, version: str, tables_folder: Path) -> None:
         """Open existing tables; raise IndexStoreError if they cannot be read."""
@@ -116,96 +119,102 @@ class NuScenesRelease(DeepAccident):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return a constructor that opens the same files again."""
-        return type(self), (self.dataroot, self.version, self.tables_folder)
+        arguments = (self.dataroot, self.version, self.tables_folder)
+        return type(self), arguments
 
     @cached_property
     def with_ignored(self) -> NuScenesRelease:
-        """The release with the boxes of classes that are not ours, as in `Dataset`."""
-        return type(self)(self.dataroot, self.version, self.tables_folder.with_name(_ALL_FOLDER))
+        """The same release with all boxes, including ignored classes, as in `Dataset`."""
+        folder = self.tables_folder.with_name(_ALL_FOLDER)
+        return type(self)(self.dataroot, self.version, folder)
 
     def nuscenes_token(self, sample: RowArgument) -> str:
         """Return nuScenes' token of a sample that is a keyframe.
 
-        Raises TokenError, and ConfigError for a sample that is no keyframe.
+        Raises TokenError if there is no such sample, and ConfigError if it is not a keyframe.
         """
-        row = _file_row(self._files, self.getind("sample", sample) * len(CHANNELS) + _LIDAR)
+        row = _find_file_row(self._files, self.getind("sample", sample) * len(CHANNELS) + _LIDAR)
         if row is None:
             raise ConfigError(
-                f"{sample}: is between two keyframes, of which alone nuScenes has samples"
+                f"{sample}: is between two keyframes; nuScenes has samples only at keyframes"
             )
         return str(self._files["token"][row])
 
     def sensor_frames(self, scenario: RowArgument) -> dict[tuple[str, str], tuple[int, ...]]:
-        """Return the keyframes, which have files in nuScenes' tables, as in `Dataset`."""
-        keyframes = tuple(range(1, len(self._samples(scenario)) + 1, KEY_STEP))
+        """Return the keyframes, at which nuScenes' tables have files, as in `Dataset`."""
+        keyframes = tuple(range(1, len(self._find_sample_rows(scenario)) + 1, KEY_STEP))
         return {
             (AGENT, channel): keyframes if channel in CHANNEL_NAMES else () for channel in CHANNELS
         }
 
     def truth_hashes(self, scenario: str) -> ScenarioHashes:
-        """Return hashes of a scenario's boxes, instead of label files, and of its poses."""
-        rows, boxes = self._samples(scenario), self.columns("annotation")
-        box_rows = slice(*boxes["sample_row"].searchsorted((rows.start, rows.stop)))
-        columns = ("actor_id", "category", "translation", "size", "yaw")
-        label = [boxes[name][box_rows].tolist() for name in columns]
-        calib = self.columns("ego_pose")["matrix"][rows.start : rows.stop].tolist()
-        return ScenarioHashes(label=digest_of(label), meta=None, calib=digest_of(calib))
+        """Return the hashes of a scenario's boxes, instead of its label files, and of its poses."""
+        rows = self._find_sample_rows(scenario)
+        boxes = self.columns("annotation")
+        first, end = boxes["sample_row"].searchsorted((rows.start, rows.stop))
+        names = ("actor_id", "category", "translation", "size", "yaw")
+        label = [boxes[name][first:end].tolist() for name in names]
+        poses = self.columns("ego_pose")["matrix"][rows.start : rows.stop].tolist()
+        return ScenarioHashes(label=digest_of(label), meta=None, calib=digest_of(poses))
 
     def _lidar_cloud(self, row: int) -> LidarPointCloud:
         """Return a cloud as in `Dataset`.
 
-        Intensities beyond 1 are nuScenes', from 0 to 255, and are scaled to the range from 0 to 1.
+        If intensities exceed 1, they are nuScenes' from 0 to 255, and are scaled to 0 to 1.
         """
         path = self._channel_path(row, LIDAR)
-        file_row = _file_row(self._files, row * len(CHANNELS) + _LIDAR)
+        file_row = _find_file_row(self._files, row * len(CHANNELS) + _LIDAR)
         if file_row is None:
-            return super()._lidar_cloud(row)  # raises, since there is no file
+            return super()._lidar_cloud(row)  # This raises an error, since there is no file.
         content = np.frombuffer(read_bytes(path, "lidar"), dtype="<f4")
         if len(content) % 5:
             raise SensorFileError(
                 f"{path}: expected points of five numbers each, found {len(content)} numbers"
             )
         points = content.reshape(-1, 5)
-        intensity = points[:, 3] / (255 if points[:, 3].max(initial=0) > 1 else 1)
+        intensity = points[:, 3]
+        if intensity.max(initial=0) > 1:
+            intensity = intensity / 255
         cloud = LidarPointCloud(points[:, :3].astype(np.float64), intensity, "lidar")
         lidar_from_sensor = SE3(self._files["matrix"][file_row].reshape(4, 4))
         return cloud.transform(lidar_from_sensor, "lidar")
 
-    def _samples(self, scenario: RowArgument) -> range:
+    def _find_sample_rows(self, scenario: RowArgument) -> range:
         """Return the rows of a scenario's samples."""
         row = self.getind("scenario", scenario)
-        return range(*self.columns("sample")["scenario_row"].searchsorted((row, row + 1)).tolist())
+        scenario_rows = self.columns("sample")["scenario_row"]
+        first, end = scenario_rows.searchsorted((row, row + 1)).tolist()
+        return range(first, end)
 
 
-def open_nuscenes(
-    dataroot: str | os.PathLike[str], index_dir: Path | None = None
-) -> NuScenesRelease:
-    """Open a nuScenes dataroot as a release, and make its tables if they are not stored yet.
+def open_nuscenes(dataroot: PathType, index_dir: Path | None = None) -> NuScenesRelease:
+    """Open a nuScenes dataroot as a release, after making its tables if they are not stored yet.
 
     Args:
-        dataroot: Folder that holds the tables of one version (`v1.0-mini`, …); if it holds several,
-            the folder of one version.
-        index_dir: Where to store the tables; by default in the dataroot, or in the user's cache.
+        dataroot: Folder with the tables of one version (`v1.0-mini`, …), or, if it has several
+            versions, the folder of one of them.
+        index_dir: Folder in which the tables are stored; by default in the dataroot, or in the
+            user's cache.
 
     Raises:
-        DatarootError: There are no tables of nuScenes, or one of them is damaged; the message names
+        DatarootError: If there are no nuScenes tables, or one of them is damaged; the message names
             its file, the row and the field.
-        VersionError: The folder holds several versions.
-        MissingExtraError: The scenes of the splits are needed, and the nuScenes devkit, which lists
-            them, is not installed.
+        VersionError: If the folder holds several versions.
+        MissingExtraError: If the scenes of the splits are needed, but the nuScenes devkit, which
+            lists them, is not installed.
     """
     tables = nuscenes_tables(path_of(dataroot))
     if tables is None:
         raise DatarootError(
             f"{dataroot}: has no tables of nuScenes, such as v1.0-mini/{NUSCENES_TABLE}"
         )
-    folder = _tables_folder(tables, index_dir)
+    folder = _choose_tables_folder(tables, index_dir)
     try:
         if not folder.is_dir():
             with replacing_folder(folder) as new_folder:
                 _write_tables(tables, new_folder)
     except OSError:
-        if not folder.is_dir():  # otherwise another process has just made the same tables
+        if not folder.is_dir():  # Otherwise another process has just made the same tables.
             raise
     return NuScenesRelease(tables.parent, tables.name, folder / _COUNTED_FOLDER)
 
@@ -215,14 +224,17 @@ def release_of(nusc: Any, index_dir: Path | None = None) -> NuScenesRelease:
     return open_nuscenes(nusc.table_root, index_dir)
 
 
-def _tables_folder(tables: Path, index_dir: Path | None) -> Path:
-    """Return the folder of the tables made from these: another one for each content."""
-    key = hashlib.blake2b(f"{__version__} {SCHEMA_VERSION} {_FORMAT}".encode(), digest_size=8)
+def _choose_tables_folder(tables: Path, index_dir: Path | None) -> Path:
+    """Return the folder of the tables, which depends on the content of nuScenes' tables."""
+    version = f"{__version__} {SCHEMA_VERSION} {_FORMAT}"
+    digest = hashlib.blake2b(version.encode(), digest_size=8)
     for path in sorted(tables.glob("*.json")):
         state = path.lstat()
-        key.update(repr((path.name, state.st_size, state.st_mtime_ns, state.st_ctime_ns)).encode())
+        identity = (path.name, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+        digest.update(repr(identity).encode())
+    name = digest.hexdigest()
     roots = index_places(tables.parent, index_dir)
-    folders = [root / tables.name / key.hexdigest() for root in roots]
+    folders = [root / tables.name / name for root in roots]
     for folder in folders:
         if folder.is_dir() or is_writable_folder(folder.parent):
             return folder
@@ -230,21 +242,22 @@ def _tables_folder(tables: Path, index_dir: Path | None) -> Path:
 
 
 def _write_tables(folder: Path, new_folder: Path) -> None:
-    """Write the tables of all scenes."""
-    tables, splits = NuScenesTables(folder), _splits(folder)
+    """Write the tables of all scenes into a new folder."""
+    tables = NuScenesTables(folder)
+    splits = _read_splits(folder)
     split_by_scene: dict[str, str | None] = {}
     part_paths: dict[str, list[Path]] = {_COUNTED_FOLDER: [], _ALL_FOLDER: []}
     files: list[tuple[Any, ...]] = []
     first_row = 0
     for row in tables.rows["scene"].values():
         if row.name in split_by_scene:
-            raise tables.error(row, "name: another scene has it, too")
+            raise tables.make_error(row, "name: another scene has the same name")
         scene = NuScenesScene(tables, row)
         for name, paths in part_paths.items():
             paths.append(new_folder / f"{len(paths)}.{name}")
-            rows = scene.rows(every_class=name == _ALL_FOLDER)
+            rows = scene.make_rows(every_class=name == _ALL_FOLDER)
             paths[-1].write_bytes(rows_to_keep(rows, ""))
-        files += scene.files(first_row)
+        files += scene.list_files(first_row)
         first_row += scene.frames
         split_by_scene[row.name] = splits.get(row.name)
     if not split_by_scene:
@@ -258,20 +271,20 @@ def _write_tables(folder: Path, new_folder: Path) -> None:
     write_table(new_folder, _FILES, dict(columns))
 
 
-def _splits(folder: Path) -> dict[str, str]:
-    """Return scene → split.
+def _read_splits(folder: Path) -> dict[str, str]:
+    """Return the split of each scene, by scene name.
 
-    The splits are nuScenes' own (the small version has two of its own), or come from the tables'
-    `splits.json`.
+    The splits are nuScenes' official ones (the small version has its own two), or the ones of
+    `splits.json` next to the tables.
     """
     path = folder / "splits.json"
-    has_file = os.path.lexists(path)  # a link to nothing is refused, too
-    scenes_by_split = (
-        read_table(path, dict[str, list[str]]) if has_file else _official_splits(folder)
-    )
-    own_names = ("mini_" if "mini" in folder.name else "", "deepaccident_")
+    if os.path.lexists(path):  # A link to nothing exists too, and is refused.
+        scenes_by_split = read_table(path, dict[str, list[str]])
+    else:
+        scenes_by_split = _read_official_splits(folder)
+    prefixes = ("mini_" if "mini" in folder.name else "", "deepaccident_")
     splits: dict[str, str] = {}
-    for split, prefix in product(SPLITS, own_names):
+    for split, prefix in product(SPLITS, prefixes):
         for scene in scenes_by_split.get(f"{prefix}{split}", ()):
             known_split = splits.setdefault(scene, split)
             if known_split != split:
@@ -282,14 +295,15 @@ def _splits(folder: Path) -> dict[str, str]:
     return splits
 
 
-def _official_splits(folder: Path) -> dict[str, list[str]]:
+def _read_official_splits(folder: Path) -> dict[str, list[str]]:
     try:
         from nuscenes.utils.splits import create_splits_scenes
     except ImportError as error:
         raise MissingExtraError(
-            f"{folder}: the nuScenes devkit knows the scenes of its splits, and needs Python 3.10 "
-            "to 3.12 and numpy 1.26; there: pip install 'deepaccident_devkit[nuscenes]'; or write "
-            "them into splits.json beside the tables"
+            f"{folder}: the splits come from the nuScenes devkit, which needs Python 3.10 to "
+            "3.12 and numpy 1.26; in such an environment, run pip install "
+            "'deepaccident_devkit[nuscenes]'; or write the splits into splits.json in the "
+            "folder of the tables"
         ) from error
     scenes_by_split: dict[str, list[str]] = create_splits_scenes()
     return scenes_by_split

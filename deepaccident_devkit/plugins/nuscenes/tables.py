@@ -1,9 +1,7 @@
-"""nuScenes' tables as records, read and checked at once; an error names the table and the row.
+"""nuScenes' tables as records, checked as they are read; an error names the table and the row.
 
-Only the fields that keyframes use are read, and other tables are not.
+Only the fields that keyframes need are read, and no other tables.
 """
-
-from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping
@@ -24,7 +22,7 @@ _QUATERNION_PART = Annotated[float, Meta(ge=-1.1, le=1.1)]
 _PIXELS = Annotated[int, Meta(ge=0, le=65535)]
 _NAME = Annotated[str, Meta(pattern=r"\A[^/\x00-\x1f\x7f]+\Z", max_length=200)]
 _VECTOR = tuple[_COORDINATE, _COORDINATE, _COORDINATE]
-_FIELD_TYPES: Final[Mapping[str, Any]] = {
+_FIELD_TYPES: Mapping[str, Any] = {
     "name": _NAME,
     "location": _NAME,
     "timestamp": Annotated[float, Meta(ge=0, le=1 << 53)],
@@ -40,13 +38,13 @@ _FIELD_TYPES: Final[Mapping[str, Any]] = {
     "height": _PIXELS,
     "num_lidar_pts": Annotated[int, Meta(ge=0, le=1 << 31)],
 }
-"""Field → type of its values; all other fields are texts.
+"""Type of the values of each field; all other fields are texts.
 
-Metres, microseconds, quaternions w, x, y, z, sizes width, length, height. A file name leads to
-nothing above the dataroot.
+Units are metres and microseconds. Quaternions are w, x, y, z; sizes are width, length, height. A
+file name may not lead out of the dataroot.
 """
-# Table → the fields that are read, besides the token.
-_FIELDS: Final = {
+# Fields that are read from each table, apart from the token.
+_FIELDS = {
     "scene": "name log_token first_sample_token",
     "log": "location",
     "sample": "scene_token timestamp next",
@@ -60,8 +58,8 @@ _FIELDS: Final = {
     "sample_annotation": "sample_token instance_token visibility_token translation rotation size "
     "num_lidar_pts",
 }
-# Table → the field with the owner of its rows.
-_OWNERS: Final = {
+# For each table, the field with the token of the row that owns a row.
+_OWNERS = {
     "sample": "scene_token",
     "sample_data": "sample_token",
     "sample_annotation": "sample_token",
@@ -73,13 +71,15 @@ class NuScenesTables:
 
     Attributes:
         folder: Folder of the tables.
-        rows: Table → token → row, in the order of the table.
+        rows: Rows of each table by token, in the table's order, by table.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Read the tables; raise DatarootError for a damaged row, and for one without an owner."""
+        """Read the tables; raise DatarootError if a row is damaged or its owner is missing."""
         self.folder = folder
-        self.rows = {table: self._read(table, fields.split()) for table, fields in _FIELDS.items()}
+        self.rows = {
+            table: self._read_rows(table, fields.split()) for table, fields in _FIELDS.items()
+        }
         self._rows_by_owner: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for table, field in _OWNERS.items():
             for row in self.rows[table].values():
@@ -87,40 +87,43 @@ class NuScenesTables:
                 self._rows_by_owner[table, owner.token].append(row)
 
     def follow(self, row: Any, field: str) -> Any:
-        """Return the row that a field such as `scene_token` leads to; raise DatarootError."""
-        token, table = getattr(row, field), field.removesuffix("_token")
+        """Return the row that a field such as `scene_token` refers to.
+
+        Raises DatarootError if there is no such row.
+        """
+        token = getattr(row, field)
+        table = field.removesuffix("_token")
         if token not in self.rows[table]:
-            raise self.error(row, f"{field}: {table}.json has no {shortened(token)!r}")
+            raise self.make_error(row, f"{field}: {table}.json has no {shortened(token)!r}")
         return self.rows[table][token]
 
-    def rows_of(self, table: str, owner: Any) -> list[Any]:
+    def find_rows(self, table: str, owner: Any) -> list[Any]:
         """Return the rows of a table that belong to a scene or sample, in the table's order."""
         return self._rows_by_owner[table, owner.token]
 
-    def error(self, row: Any, fault: str) -> DatarootError:
-        """Return the error of a row; the fault begins with a field."""
+    def make_error(self, row: Any, fault: str) -> DatarootError:
+        """Make the error for a faulty row; `fault` is a text that begins with a field name."""
         return DatarootError(
             f"{self.folder / type(row).__name__}.json: {shortened(row.token)}: {fault}; "
             f"{NUSCENES_REMEDY}"
         )
 
-    def _read(self, table: str, fields: list[str]) -> dict[str, Any]:
-        """Return the rows of a table by their tokens."""
-        kind = msgspec.defstruct(
-            table, [(field, _FIELD_TYPES.get(field, str)) for field in ("token", *fields)]
-        )
-        rows = read_table(self.folder / f"{table}.json", list[kind])  # type: ignore[valid-type]
+    def _read_rows(self, table: str, fields: list[str]) -> dict[str, Any]:
+        """Return the rows of a table by token."""
+        field_types = [(field, _FIELD_TYPES.get(field, str)) for field in ("token", *fields)]
+        row_type = msgspec.defstruct(table, field_types)
+        rows = read_table(self.folder / f"{table}.json", list[row_type])  # type: ignore[valid-type]
         by_token = {row.token: row for row in rows}
         if len(by_token) < len(rows):
             [(token, _)] = Counter(row.token for row in rows).most_common(1)
-            raise self.error(by_token[token], "token: two rows have it")
+            raise self.make_error(by_token[token], "token: two rows have it")
         return by_token
 
 
 def read_table(path: Path, kind: Any) -> Any:
-    """Return the content of a table's JSON.
+    """Read a table from a JSON file.
 
-    Raises DatarootError if it cannot be read, or is of another kind.
+    Raises DatarootError if the file cannot be read, or its content has another type.
     """
     try:
         content = read_bytes(path, "tables")

@@ -1,6 +1,7 @@
 """What braking would have changed in the accidents of a release.
 
-Has the shares of outcomes (`outcome_shares`), and `avoidability_report`.
+`outcome_shares` returns how often each outcome occurs; `avoidability_report` returns the full
+report.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit.collisions.outcomes import (
-    MOST_MARGIN,
+    MAX_END_GAP_M,
     OUTCOMES,
     Braking,
     Outcomes,
@@ -24,9 +25,9 @@ from deepaccident_devkit.collisions.recorded import (
     Skipped,
     accident_of,
     counted_text,
-    each_scenario,
+    map_scenarios,
     reasons_text,
-    those_of,
+    select_results,
 )
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.descriptions.avoidability import (
@@ -37,7 +38,7 @@ from deepaccident_devkit.descriptions.avoidability import (
 )
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, as_floats
 from deepaccident_devkit.support.reports import Report, Row
-from deepaccident_devkit.support.text import columns_text
+from deepaccident_devkit.support.text import columns_text, counted
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
@@ -48,16 +49,16 @@ if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
 
-# Kinds of accidents that are counted separately: with a pedestrian, which does not brake as a
-# vehicle does; of vehicles that meet head-on, where it matters most how the other goes on if one of
-# them brakes; and all others.
+# Groups of accidents that are counted separately: accidents with a pedestrian, who does not brake
+# like a vehicle; head-on collisions of vehicles, where the result depends most on how the other
+# vehicle continues when one brakes; and all other accidents between vehicles.
 ACCIDENT_GROUPS: Final = ("vehicles", "head-on", "pedestrians")
-# The drivers that are warned and brake; `ego` counts only the accidents of the ego.
+# Drivers who are warned and brake; `ego` only counts accidents in which the ego collides.
 WARNED: Final = (*BRAKERS, "ego")
-# Shares of accidents for which the text states the seconds of warning that they need.
-_TEXT_SHARES: Final = (0.5, 0.9)
-# Columns of the table of last moments.
-_LAST_MOMENT_COLUMNS: Final = (
+# Fractions of the accidents; for each, the text states how many seconds of warning it takes.
+_TEXT_SHARES = (0.5, 0.9)
+# Columns of the table with the last moment to brake for each accident.
+_LAST_MOMENT_COLUMNS = (
     "brakers",
     "deceleration",
     "avoidable",
@@ -66,29 +67,47 @@ _LAST_MOMENT_COLUMNS: Final = (
     "switches",
     "extrapolated",
 )
+# Columns of the table of the self-check.
+_CHECK_COLUMNS = (
+    "scenario",
+    "margin",
+    "time",
+    "end",
+    "speed_first",
+    "speed_second",
+    "delta_v_first",
+    "delta_v_first_least",
+    "delta_v_first_most",
+    "delta_v_second",
+    "delta_v_second_least",
+    "delta_v_second_most",
+)
 # Columns of the table of contacts with other actors.
-_SECONDARY_COLUMNS: Final = ("actor_id", "other_id", "category", "time", "extrapolated")
+_SECONDARY_COLUMNS = ("actor_id", "other_id", "category", "time", "extrapolated")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OutcomeShares(FrozenArrays):
-    """Shares of outcomes over a group of accidents, for L leads of the warning and K ways to brake.
+    """How often each outcome occurs in a group of accidents, for L leads and K ways to brake.
 
-    Accidents with a recording shorter than a lead do not count at it. Arrays are read-only; NaN
-    where no accident counts.
+    A lead is the time from the warning to the end of the recording.
+
+    At a given lead, only accidents whose recordings are at least that long are counted. Arrays are
+    read-only; values are NaN where no accident is counted.
 
     Attributes:
         group: One of `ACCIDENT_GROUPS`.
         warned: One of `WARNED`.
         brakings: The K ways to brake.
         leads: Seconds from the warning to the end of the recording, shape (L,): 0, 0.1, …
-        accidents: Number of accidents that count, shape (L,).
-        shares: Share of each of `OUTCOMES`, shape (L, K, 5).
-        extrapolated: Share in which they touch only after the end of the recording, shape (L, K).
-        relative_speed: Mean speed in m/s between the two at the contact over all of these
-            accidents, shape (L, K); 0 if avoided.
-        delta_v: Mean of the larger delta-v of the two in m/s, shape (L, K, 3): with the assumed
-            masses, and the smallest and the largest with masses that are wrong by up to
+        accidents: Number of accidents counted at each lead, shape (L,).
+        shares: Fraction of the accidents with each of `OUTCOMES`, shape (L, K, 5).
+        extrapolated: Fraction of the accidents with contact only after the end of the recording,
+            shape (L, K).
+        relative_speed: Mean relative speed of the two colliders at contact in m/s, shape (L, K);
+            avoided accidents count as 0.
+        delta_v: Mean of the larger of the two delta-v in m/s, shape (L, K, 3): for the assumed
+            masses, then the smallest and the largest value for masses that are off by up to
             `MASS_UNCERTAINTY`.
     """
 
@@ -104,7 +123,7 @@ class OutcomeShares(FrozenArrays):
 
 
 def group_of(accident: Avoidability) -> str:
-    """Return the one of `ACCIDENT_GROUPS` that an accident is counted in."""
+    """Return which of `ACCIDENT_GROUPS` an accident belongs to."""
     if accident.pedestrian:
         return "pedestrians"
     if accident.head_on:
@@ -113,7 +132,7 @@ def group_of(accident: Avoidability) -> str:
 
 
 def outcomes_if_warned(accident: Avoidability, warned: str) -> Outcomes | None:
-    """Return what warnings change, for one of `WARNED`; None for an ego that is not of the pair."""
+    """Return the outcomes if the `warned` driver brakes; None for an ego that does not collide."""
     if warned != "ego":
         return accident.outcomes[BRAKERS.index(warned)]
     agents = accident.accident.agents
@@ -123,37 +142,37 @@ def outcomes_if_warned(accident: Avoidability, warned: str) -> Outcomes | None:
 
 
 def outcome_shares(accidents: Sequence[Avoidability]) -> list[OutcomeShares]:
-    """Return the shares of outcomes by group of accidents and by warned drivers.
+    """Compute how often each outcome occurs, for each group of accidents and each of `WARNED`.
 
-    Groups without any accident are left out.
+    Groups without accidents are left out.
 
     Args:
-        accidents: Accidents computed for the same ways to brake.
+        accidents: Replayed accidents; all must use the same ways to brake.
     """
     shares = []
     for group, warned in product(ACCIDENT_GROUPS, WARNED):
         members = []
         for accident in accidents:
-            if group_of(accident) == group:
-                outcomes = outcomes_if_warned(accident, warned)
-                if outcomes is not None:
-                    members.append((accident, outcomes))
+            outcomes = outcomes_if_warned(accident, warned)
+            if outcomes is not None and group_of(accident) == group:
+                members.append((accident, outcomes))
         if members:
-            shares.append(_group_shares(group, warned, members))
+            shares.append(_average_outcomes(group, warned, members))
     return shares
 
 
-def _group_shares(
+def _average_outcomes(
     group: str, warned: str, members: Sequence[tuple[Avoidability, Outcomes]]
 ) -> OutcomeShares:
+    """Average the outcomes of a group's accidents; `members` pairs each accident with its own."""
     brakings = members[0][0].brakings
     num_leads = max(len(outcomes.outcome) for _, outcomes in members)
     sums = np.zeros((num_leads, len(brakings), len(OUTCOMES) + 5))
     accidents = np.zeros(num_leads, dtype=np.int64)
     for accident, outcomes in members:
-        rows = slice(0, len(outcomes.outcome))
-        accidents[rows] += 1
-        sums[rows] += _accident_figures(accident, outcomes)
+        num_recorded = len(outcomes.outcome)
+        accidents[:num_recorded] += 1
+        sums[:num_recorded] += _accident_figures(accident, outcomes)
     means = sums / accidents[:, None, None]
     shares, extrapolated, relative_speed, delta_v = np.split(
         means, np.cumsum([len(OUTCOMES), 1, 1]), axis=2
@@ -174,10 +193,10 @@ def _group_shares(
 def _accident_figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
     """Return the figures of one accident, shape (L, K, 10).
 
-    They are 0 or 1 for each outcome, 0 or 1 for extrapolated, the relative speed, and the delta-v
-    with its smallest and its largest value.
+    The columns are: 1 for its outcome and 0 for the other four, whether the contact is
+    extrapolated, the relative speed, and the delta-v (assumed masses, smallest, largest).
     """
-    # The shares of the two add up to 1, so their sum is the relative speed.
+    # The relative speed splits into the delta-v of the two.
     relative_speed = outcomes.delta_v.sum(axis=-1)
     ranges = delta_v_ranges(accident.accident.masses, relative_speed).max(axis=-2)
     is_outcome = outcomes.outcome[..., None] == np.arange(len(OUTCOMES))
@@ -187,16 +206,16 @@ def _accident_figures(accident: Avoidability, outcomes: Outcomes) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AvoidabilityReport(Report):
-    """When accidents could have been avoided by braking.
+    """Report on how late braking could still have avoided each accident.
 
     Attributes:
         dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        accidents: Accidents that their recordings show, in the release's order.
-        dropped: Accidents that their recordings do not show: the two are too far apart at the end.
+        accidents: Replayed accidents, in the release's order.
+        dropped: Accidents that cannot be replayed because the two are too far apart at the end.
         skipped: Scenarios without meta or labels.
-        margins: Scenario → metres between the two at the last frame, for all accidents, dropped
-            ones too.
+        margins: Scenario → metres between the two in the last frame; also contains the dropped
+            accidents.
     """
 
     dataroot: str
@@ -208,11 +227,11 @@ class AvoidabilityReport(Report):
 
     @property
     def shares(self) -> list[OutcomeShares]:
-        """Shares of outcomes by the seconds of warning, for each group and all warned drivers."""
+        """How often each outcome occurs by warning time, for each group and choice of drivers."""
         return outcome_shares(self.accidents)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values for JSON: counts, omissions with reasons, and the last moments."""
+        """Return the values for JSON: counts, left-out scenarios with reasons, and last moments."""
         accidents = [
             {"group": group_of(accident), **accident.to_dict(warnings=False)}
             for accident in self.accidents
@@ -227,7 +246,7 @@ class AvoidabilityReport(Report):
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
-        """Return last moments, other contacts, outcome shares, the self-check, and omissions."""
+        """Return the tables of last moments, other contacts, shares, self-check and omissions."""
         return {
             "avoidability_last_moments": self._last_moment_rows(),
             "avoidability_secondary_contacts": self._secondary_rows(),
@@ -237,12 +256,12 @@ class AvoidabilityReport(Report):
         }
 
     def to_text(self) -> str:
-        """Return some aligned blocks for a terminal."""
+        """Return the report as blocks of aligned lines."""
         left_out = {
-            "dropped, as the two are too far apart at the end": self.dropped,
+            "excluded, as the two are too far apart at the end": self.dropped,
             "skipped": self.skipped,
         }
-        counts = [f"{len(self.accidents)} accidents"]
+        counts = [counted(len(self.accidents), "accident")]
         for title, omissions in left_out.items():
             if omissions:
                 counts.append(f"{len(omissions)} {title}")
@@ -261,20 +280,21 @@ class AvoidabilityReport(Report):
 
     @property
     def margin_counts(self) -> dict[str, int]:
-        """Size in words → number of `margins` of that size."""
-        bounds = [0, 0.01, 0.1, 0.5, MOST_MARGIN]
-        counts = np.histogram(list(self.margins.values()), bins=[*bounds, np.inf])[0].tolist()
-        names = [f"below {bound:g} m" for bound in bounds[1:]] + [f"{MOST_MARGIN:g} m or more"]
-        return dict(zip(names, counts, strict=True))
+        """Number of accidents in each size class of `margins`; the keys describe the class."""
+        bounds = [0.01, 0.1, 0.5, MAX_END_GAP_M]
+        counts, _ = np.histogram(list(self.margins.values()), bins=[0, *bounds, np.inf])
+        names = [f"below {bound:g} m" for bound in bounds]
+        names.append(f"{MAX_END_GAP_M:g} m or more")
+        return dict(zip(names, counts.tolist(), strict=True))
 
     def members(self, group: str) -> list[Avoidability]:
         """Return the accidents of one of `ACCIDENT_GROUPS`."""
         return [accident for accident in self.accidents if group_of(accident) == group]
 
     def _group_text(self, group: str) -> str:
-        """Return how many accidents braking avoids, and how much warning they need.
+        """Return a table of how many accidents braking avoids, and how much warning that takes.
 
-        There is a line for each way to choose the braking drivers and the deceleration.
+        It has one row for each combination of braking drivers and deceleration.
         """
         members = self.members(group)
         reactions = sorted({braking.reaction for braking in members[0].brakings})
@@ -283,37 +303,36 @@ class AvoidabilityReport(Report):
         slack = np.stack([accident.slack for accident in members])
         extrapolated = np.stack([accident.last_moments.extrapolated for accident in members])
         extrapolated = extrapolated.reshape(slack.shape)
+        ranks = [int(np.ceil(share * len(members))) - 1 for share in _TEXT_SHARES]
         for row, brakers in enumerate(BRAKERS):
             for column, deceleration in enumerate(members[0].decelerations.tolist()):
-                seconds = np.sort(slack[:, row, column])  # accidents that nothing avoids come last
-                ranks = [int(np.ceil(share * len(seconds))) - 1 for share in _TEXT_SHARES]
-                avoidable = np.isfinite(seconds).sum()
-                later = extrapolated[:, row, column].sum()
-                cells = [brakers, f"{deceleration:g}", str(avoidable), str(later)]
+                seconds = np.sort(slack[:, row, column])  # unavoidable accidents come last
+                avoidable_count = np.isfinite(seconds).sum()
+                later_count = extrapolated[:, row, column].sum()
+                cells = [brakers, f"{deceleration:g}", str(avoidable_count), str(later_count)]
                 for reaction in reactions:
-                    texts = [_seconds_text(seconds[rank] + reaction) for rank in ranks]
+                    texts = map(_seconds_text, seconds[ranks] + reaction)
                     cells.append(" / ".join(texts))
                 rows.append(cells)
         share_text = " and ".join(f"{share:.0%}" for share in _TEXT_SHARES)
         return (
-            f"{group}: {len(members)} accidents; seconds of warning that {share_text} of them "
-            f"need\n{columns_text(rows)}\n"
+            f"{group}: {counted(len(members), 'accident')}; seconds of warning that {share_text} "
+            f"of them need\n{columns_text(rows)}\n"
             f"{_secondary_text(members)}"
         )
 
     def _margins_text(self) -> str:
-        """Return the number of margins of the self-check by size, and the largest one by name."""
-        lines = [f"  {name}: {count}" for name, count in self.margin_counts.items() if count]
+        """Return how many accidents are in each margin class, and the largest margin."""
+        lines = ["gaps at the last frame, which count as contact:"]
+        for name, count in self.margin_counts.items():
+            if count:
+                lines.append(f"  {name}: {count}")
         largest = max(self.margins, key=lambda name: self.margins[name])
-        return "\n".join(
-            [
-                "gaps at the last frame, which count as contact:",
-                *lines,
-                f"  the largest: {self.margins[largest]:.3f} m, {largest}",
-            ]
-        )
+        lines.append(f"  the largest: {self.margins[largest]:.3f} m, {largest}")
+        return "\n".join(lines)
 
     def _last_moment_rows(self) -> Iterator[Row]:
+        """Yield the rows of the table of last moments, one per accident and way to brake."""
         pair_columns = ("first_id", "first", "second_id", "second")
         yield ("scenario", "group", *pair_columns, *_LAST_MOMENT_COLUMNS, "secondary")
         for avoidability in self.accidents:
@@ -331,6 +350,7 @@ class AvoidabilityReport(Report):
                 )
 
     def _secondary_rows(self) -> Iterator[Row]:
+        """Yield the rows of the table of contacts with third actors in replays of last moments."""
         yield ("scenario", "brakers", "deceleration", *_SECONDARY_COLUMNS)
         for accident in self.accidents:
             for row in accident.last_moment_rows():
@@ -339,6 +359,7 @@ class AvoidabilityReport(Report):
                     yield (*key, *map(contact.get, _SECONDARY_COLUMNS))
 
     def _share_rows(self) -> Iterator[Row]:
+        """Yield the rows of the table of outcome shares (units: s, m/s², m/s)."""
         yield (
             *("group", "warned", "reaction", "deceleration", "lead", "accidents", *OUTCOMES),
             *("extrapolated", "relative_speed", "delta_v", "delta_v_least", "delta_v_most"),
@@ -363,11 +384,8 @@ class AvoidabilityReport(Report):
                     )
 
     def _check_rows(self) -> Iterator[Row]:
-        sides = ("first", "second")
-        yield (
-            *("scenario", "margin", "time", "end", *(f"speed_{side}" for side in sides)),
-            *(f"delta_v_{side}{end}" for side in sides for end in ("", "_least", "_most")),
-        )
+        """Yield the rows of the self-check, which describe each accident's recorded impact."""
+        yield _CHECK_COLUMNS
         for accident in self.accidents:
             recorded = accident.to_dict(warnings=False)["recorded"]
             delta_v: list[Any] = []
@@ -383,6 +401,7 @@ class AvoidabilityReport(Report):
             )
 
     def _left_out_rows(self) -> Iterator[Row]:
+        """Yield the rows of the table of accidents and scenarios that are left out."""
         yield ("scenario", "why", "reason", "margin")
         for title, omissions in (("dropped", self.dropped), ("skipped", self.skipped)):
             for skipped in omissions:
@@ -392,11 +411,11 @@ class AvoidabilityReport(Report):
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """An accident that its recording does not show.
+    """An accident that cannot be replayed because its recording does not show the impact.
 
     Attributes:
-        why: Reason in words.
-        margin: Metres between the two at the last frame.
+        why: The scenario, and the reason in words.
+        margin: Metres between the two colliders in the last frame.
     """
 
     why: Skipped
@@ -404,9 +423,9 @@ class Dropped:
 
 
 def replay_accident(dataset: Dataset, scenario: ScenarioRecord) -> Avoidability | Dropped | None:
-    """Return when a scenario's accident could have been avoided; None if it has no collision.
+    """Replay the accident of a scenario, and find out how braking could have avoided it.
 
-    Raises NotAvailableError.
+    Return None if no collision is recorded. Raise NotAvailableError if meta or labels are missing.
     """
     accident = accident_of(dataset, scenario)
     if accident is None:
@@ -423,28 +442,30 @@ def avoidability_report(
     scenarios: Iterable[RowArgument] | None = None,
     **engine: Unpack[Engine],
 ) -> AvoidabilityReport:
-    """Return when accidents could have been avoided by braking, in the nine ways of `BRAKINGS`.
+    """Report how late braking could still have avoided each accident, for all nine `BRAKINGS`.
 
     Args:
         dataset: The release.
-        scenarios: Tokens or records of scenarios; None for all. Scenarios with a meta file that
-            names no collision do not count.
+        scenarios: Tokens or records of scenarios; None for all. Scenarios whose meta file names no
+            collision are ignored.
         **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        TokenError: There is no such scenario.
+        TokenError: If the release has no such scenario.
     """
     work: Callable[[Dataset, Any], Avoidability | Dropped | None] = replay_accident
     return report_of(
-        dataset, each_scenario(work, dataset, scenarios, label="replaying", at_once=1, **engine)
+        dataset,
+        map_scenarios(work, dataset, scenarios, label="Replaying accidents", at_once=1, **engine),
     )
 
 
 def report_of(
     dataset: Dataset, replays: Sequence[Avoidability | Dropped | Skipped | None]
 ) -> AvoidabilityReport:
-    """Return the report of the results of `replay_accident` for scenarios, in their order."""
-    accidents, dropped = those_of(Avoidability, replays), those_of(Dropped, replays)
+    """Build the report from the result of `replay_accident` for each scenario, in order."""
+    accidents = select_results(Avoidability, replays)
+    dropped = select_results(Dropped, replays)
     margins = {}
     for accident in accidents:
         margins[accident.accident.scenario] = accident.check.margin
@@ -455,18 +476,21 @@ def report_of(
         version=dataset.version,
         accidents=accidents,
         dropped=tuple(unusable_accident.why for unusable_accident in dropped),
-        skipped=those_of(Skipped, replays),
+        skipped=select_results(Skipped, replays),
         margins=margins,
     )
 
 
 def _secondary_text(accidents: Sequence[Avoidability]) -> str:
-    """Return in how many replays of braking at the last moment another actor is touched."""
-    num_touched = num_before_end = num_replays = 0
+    """Return a sentence on how often third actors are hit when the last moments are replayed."""
+    num_touched = 0
+    num_before_end = 0
+    num_replays = 0
     for accident in accidents:
         contacts = accident.secondary
+        recorded = [contact for contact in contacts if not contact.extrapolated]
         num_touched += len({contact.replay for contact in contacts})
-        num_before_end += len({contact.replay for contact in contacts if not contact.extrapolated})
+        num_before_end += len({contact.replay for contact in recorded})
         num_replays += int(np.isfinite(accident.last_moments.time).sum())
     return (
         f"other road users, who do not react, are touched in {num_before_end} of {num_replays} "
@@ -476,6 +500,7 @@ def _secondary_text(accidents: Sequence[Avoidability]) -> str:
 
 
 def _seconds_text(seconds: float) -> str:
+    """Format seconds with two decimals; a dash if they are infinite."""
     if np.isfinite(seconds):
         return f"{seconds:.2f}"
     return "–"

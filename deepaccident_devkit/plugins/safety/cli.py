@@ -2,18 +2,19 @@
 
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import click
 
 from deepaccident_devkit.cli.options import (
-    engine_of,
+    engine_options,
     figure_style_parameter,
     json_parameter,
+    print_written_report,
     refuse_unused,
     release_parameters,
-    say_report,
     where_parameter,
     write_report,
 )
@@ -27,81 +28,69 @@ from deepaccident_devkit.plugins.safety import (
     twin_report,
 )
 from deepaccident_devkit.plugins.safety.avoidability_report import ACCIDENT_GROUPS
-from deepaccident_devkit.plugins.safety.figures import (
-    AVOIDABILITY_SIZE,
-    COLUMN_HEIGHT,
-    LEAD_TIME_SIZE,
-    render_avoidability,
-    render_lead_times,
-)
+from deepaccident_devkit.plugins.safety.figures import render_avoidability, render_lead_times
 from deepaccident_devkit.plugins.safety.page import REPLAYS, save_safety_report
-from deepaccident_devkit.render.figures import report_figure, write_report_figure
+from deepaccident_devkit.render.figures import write_report_figure
 from deepaccident_devkit.support.files import writable_folder, write_bytes
 from deepaccident_devkit.support.text import counted
 
-# Scenarios that a verb is about; None for all.
+# Scenarios to examine; None for all.
 _Scenarios = Sequence[Any] | None
-# Name of a file in a folder → function that writes it at a path, and returns the path.
+# File name → function that writes the file to a path, and returns the path.
 Files = dict[str, Callable[[Path], Path]]
+# A report, and the further files that belong to it.
+_ReportFiles = tuple[Any, Files]
 
 
 def _replay_count(context: click.Context, parameter: click.Parameter, value: str) -> int | None:
-    """Parse a number, `none` (0) or `all` (None)."""
+    """Convert the value of `--replays` to a number: 0 for `none`, None for `all`."""
     word = value.strip().lower()
     if word == "all":
         return None
-    if word != "none" and not word.isdecimal():
+    if word == "none":
+        return 0
+    if not word.isdecimal():
         raise click.BadParameter(
             f"expected a number, all or none, found {value!r}", context, parameter
         )
-    if word == "none":
-        return 0
     return int(word)
 
 
-def _figure_writer(
-    render: Callable[..., Any], size: tuple[float, float], *arguments: Any
-) -> Callable[[Path], Path]:
-    """Return a function that renders a figure of this size into a file."""
-
-    def write(path: Path) -> Path:
-        fig = report_figure(size, column=COLUMN_HEIGHT)
-        return write_report_figure(render(*arguments, fig=fig), path)
-
-    return write
-
-
-def _lead_time(
+def _make_lead_times(
     dataset: DeepAccident, scenarios: _Scenarios, *, kind: Any, **engine: Any
-) -> tuple[Any, Files]:
+) -> _ReportFiles:
+    """Compute the report on lead times, and return it with the writer of its figure."""
     ledger = lead_time_ledger(dataset, scenarios, ObservationRule(kind=kind), **engine)
     if not ledger.accidents:
         return ledger, {}
-    return ledger, {"lead_times.png": _figure_writer(render_lead_times, LEAD_TIME_SIZE, ledger)}
+    draw = partial(render_lead_times, ledger)
+    return ledger, {"lead_times.png": partial(write_report_figure, draw)}
 
 
-def _avoidability(dataset: DeepAccident, scenarios: _Scenarios, **engine: Any) -> tuple[Any, Files]:
+def _make_avoidability(dataset: DeepAccident, scenarios: _Scenarios, **engine: Any) -> _ReportFiles:
+    """Compute the report on avoidability, and return it with the writers of its figures."""
     report = avoidability_report(dataset, scenarios, **engine)
     files: Files = {}
     for group in ACCIDENT_GROUPS:
         if report.members(group):
             name = f"avoidability_{group.replace('-', '_')}.png"
-            files[name] = _figure_writer(render_avoidability, AVOIDABILITY_SIZE, report, group)
+            files[name] = partial(write_report_figure, partial(render_avoidability, report, group))
     return report, files
 
 
-def _twins(dataset: DeepAccident, scenarios: _Scenarios, **engine: Any) -> tuple[Any, Files]:
+def _make_twins(dataset: DeepAccident, scenarios: _Scenarios, **engine: Any) -> _ReportFiles:
+    """Compute the report on twins, which has no figures."""
     return twin_report(dataset, scenarios, **engine), {}
 
 
-# Topic → function that makes its report and further files, and the report's JSON file.
-_TABLES: Final[dict[str, tuple[Callable[..., tuple[Any, Files]], str]]] = {
-    "lead-time": (_lead_time, "lead_times.json"),
-    "avoidability": (_avoidability, "avoidability.json"),
-    "twins": (_twins, "twins.json"),
+# Topic → function that makes its report and further files, and the name of the JSON file.
+_TABLES: dict[str, tuple[Callable[..., _ReportFiles], str]] = {
+    "lead-time": (_make_lead_times, "lead_times.json"),
+    "avoidability": (_make_avoidability, "avoidability.json"),
+    "twins": (_make_twins, "twins.json"),
 }
-# Parameter → the topics that take it.
-_TOPICS_BY_PARAMETER: Final = {
+# Parameter → topics that accept it.
+_TOPICS_BY_PARAMETER = {
     "kind": ("lead-time",),
     "scenario": ("describe",),
     "replays": ("report",),
@@ -119,7 +108,7 @@ _TOPICS_BY_PARAMETER: Final = {
     "kind",
     "--seen",
     "kind",
-    help="Of lead-time: what an observation is. points: the agent's label counts at least "
+    help="For lead-time: what counts as an observation. points: the agent's label counts at least "
     f"{ObservationRule().least_points} LiDAR points in the actor's box. "
     "released: the visibility rule of the released code. annotated: the label has the actor, "
     "hidden or not.",
@@ -130,44 +119,47 @@ _TOPICS_BY_PARAMETER: Final = {
     show_default=True,
     callback=_replay_count,
     metavar="N|all|none",
-    help="Of report: how many accidents have a replay page, the hardest first. With images, a page "
-    "takes up to 15 MB.",
+    help="For report: how many accidents get a replay page, the most severe first. With images, a "
+    "page takes up to 15 MB.",
 )
 @click.option(
     "--out",
     type=click.Path(),
     metavar="DIR",
-    help="Folder to write into: the page with its files, or tables (JSON, CSV) and figures. Of "
-    "describe: a JSON Lines file, with the facts and the text of each scenario.",
+    help="Folder for the page with its files, or for tables (JSON, CSV) and figures. For describe: "
+    "a JSON Lines file with the facts and the text of each scenario.",
 )
 @figure_style_parameter
 @json_parameter
 def safety(
     topic: str, where: tuple[str, ...], out: str | None, as_json: bool, **options: Any
 ) -> None:
-    """Look into the accidents in DATAROOT. TOPIC says what is asked of them:
+    """Examine the accidents in DATAROOT. TOPIC is one of:
 
     \b
-    report        All of it as one HTML page, a row an accident, with links to replays; needs --out.
+    report        Everything on one HTML page, with a row for each accident and links to replays; needs --out.
     describe      What happens in each scenario, in sentences and as facts.
-    lead-time     How long before the impact agents observe both colliders, and how partners share the gain.
-    avoidability  Until when braking of either collider, or of both, would have avoided the accident.
-    twins         When accidents and their normal twins part, and who acts differently.
+    lead-time     How long before the impact agents observe both colliders, and how much each partner adds.
+    avoidability  How late either collider, or both, could have braked and still avoided the accident.
+    twins         When accidents and their normal twins begin to differ, and which actors behave differently.
 
-    SCENARIO, a token of the form TYPE/NAME, makes `describe` tell of this one alone. All is
-    computed from labels and meta. What cannot be told is named with its reason, or left out.
-    docs/safety.md says what numbers mean.
+    SCENARIO, a token of the form TYPE/NAME, limits `describe` to one scenario. Everything is
+    computed from labels and meta files. Whatever is unknown is listed with the reason, or left out.
+    docs/safety.md explains the numbers.
     """  # noqa: D301, D415, E501 - \b is click's mark of lines that are not wrapped
     for name, topics in _TOPICS_BY_PARAMETER.items():
         if topic not in topics:
             refuse_unused(f"with {topic}", name)
-    scenario, kind, replays = (options.pop(name) for name in ("scenario", "kind", "replays"))
+    scenario = options.pop("scenario")
+    kind = options.pop("kind")
+    replays = options.pop("replays")
     if scenario is not None:
         refuse_unused("with a scenario", "where")
     if topic == "report" and out is None:
         raise click.UsageError("Missing option '--out': the folder of the page.")
     target = _target_path(topic, out)
-    dataset, engine = DeepAccident(**options), engine_of(options)
+    dataset = DeepAccident(**options)
+    engine = engine_options(options)
     scenarios: _Scenarios = dataset.find(*where) if where else None
     if topic in _TABLES:
         if topic in _TOPICS_BY_PARAMETER["kind"]:
@@ -181,7 +173,7 @@ def safety(
 
 
 def _target_path(topic: str, out: str | None) -> Path | None:
-    """Return the path of `--out`: a file for `describe`, otherwise a folder; None without it."""
+    """Return the path passed with `--out`: a file for `describe`, otherwise a folder; or None."""
     if out is None:
         return None
     if topic != "describe":
@@ -202,21 +194,24 @@ def _write_tables(
     as_json: bool,
     **arguments: Any,
 ) -> None:
+    """Print the report of a topic that has tables, and write its files."""
     make_report, name = _TABLES[topic]
     report, files = make_report(dataset, scenarios, **arguments)
     written = write_report(report, target, name)
     if target is not None:
         written += [write(target / file) for file, write in files.items()]
-    say_report(report, written, target, as_json=as_json)
+    print_written_report(report, written, target, as_json=as_json)
 
 
 def _describe(
     dataset: DeepAccident, scenarios: _Scenarios, out: Path | None, *, as_json: bool, **engine: Any
 ) -> None:
+    """Print what happens in scenarios, and write the facts to the file `out` unless it is None."""
     described = stories(dataset, scenarios, **engine)
-    lines = [
-        json.dumps({**story.facts, "text": story.text}, allow_nan=False) for story in described
-    ]
+    lines = []
+    for story in described:
+        facts = {**story.facts, "text": story.text}
+        lines.append(json.dumps(facts, allow_nan=False))
     if out is not None:
         write_bytes(out, "".join(f"{line}\n" for line in lines).encode())
     for line, story in zip(lines, described, strict=True):
@@ -227,12 +222,13 @@ def _describe(
         for reason in story.facts["unknown"]:
             click.echo(f"  not known: {reason}")
     if out is not None:
-        click.echo(f"written: {counted(len(lines), 'scenario')} in {out}", err=as_json)
+        click.echo(f"wrote {out} ({counted(len(lines), 'scenario')})", err=as_json)
 
 
 def _report(
     dataset: DeepAccident, scenarios: _Scenarios, folder: Path, replays: int | None, **engine: Any
 ) -> None:
+    """Write the HTML page of a release, and print which files were written."""
     if scenarios is not None and not scenarios:
         raise click.UsageError(
             "no scenario matches --where, so there is nothing to write; change it"
@@ -243,8 +239,10 @@ def _report(
     )
     summary = f"{counted(len(report.rows), 'accident')} of {counted(report.scenarios, 'scenario')}"
     if report.left_out:
-        summary += f"; {len(report.left_out)} reasons for what is left out are in the page"
+        summary += (
+            f"; the page says what is left out and why ({counted(len(report.left_out), 'reason')})"
+        )
     click.echo(summary)
     click.echo(
-        f"written: {counted(len(written), 'file')} in {folder}; open {written[-1]} in a browser"
+        f"wrote {counted(len(written), 'file')} to {folder}; open {written[-1]} in a browser"
     )

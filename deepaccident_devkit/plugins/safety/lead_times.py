@@ -1,7 +1,7 @@
-"""How long before an accident's impact sets of agents first observe both colliders.
+"""Lead times: how long before the impact a set of agents first observes both colliders.
 
-`lead_times` measures one accident, with what each partner adds; `lead_time_ledger` measures all
-accidents of a release.
+`lead_times` measures one accident, including what each partner adds; `lead_time_ledger` measures
+all accidents of a release.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
+from itertools import compress
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -18,10 +19,10 @@ from deepaccident_devkit.collisions.recorded import (
     Skipped,
     accident_of,
     counted_text,
-    each_scenario,
+    map_scenarios,
     reasons_text,
+    select_results,
     skipped_rows,
-    those_of,
 )
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.descriptions.observation import (
@@ -33,7 +34,13 @@ from deepaccident_devkit.descriptions.observation import (
     shapley_values,
 )
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray, known
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    FloatArray,
+    FrozenArrays,
+    IntArray,
+    json_numbers,
+)
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import columns_text, counted
 from deepaccident_devkit.taxonomy import AGENTS, AgentName, short_name
@@ -43,15 +50,17 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.support.parallel import Engine
 
-_EGO: Final = AGENTS[0]
+_EGO = AGENTS[0]
 PARTNERS: Final = AGENTS[1:]
-"""The agents that can join `ego_vehicle`."""
-CAVEAT: Final = "Observation bounds warning from above; it is no prediction."
-_RESAMPLES: Final = 2000
-_CONFIDENCE: Final = 0.95
-# Smallest number of accidents for which a mean has an interval.
-_MIN_ACCIDENTS: Final = 6
-_ACCIDENT_COLUMNS: Final = (
+"""The agents that can be added to `ego_vehicle`."""
+CAVEAT: Final = "Lead time is an upper bound: seeing both is not yet predicting."
+# Number of bootstrap resamples.
+_RESAMPLES = 2000
+# Nominal coverage of the intervals.
+_CONFIDENCE = 0.95
+# Fewest accidents for which an interval is computed.
+_MIN_ACCIDENTS = 6
+_ACCIDENT_COLUMNS = (
     "scenario",
     "actor_ids",
     "categories",
@@ -63,47 +72,47 @@ _ACCIDENT_COLUMNS: Final = (
 )
 
 
-_MEMBERS: Final = coalition_members(len(PARTNERS))
+_MEMBERS = coalition_members(len(PARTNERS))
 COALITIONS: Final[tuple[tuple[AgentName, ...], ...]] = tuple(
-    (_EGO, *(name for name, joins in zip(PARTNERS, row, strict=True) if joins))
-    for row in _MEMBERS.tolist()
+    (_EGO, *compress(PARTNERS, is_member)) for is_member in _MEMBERS.tolist()
 )
-"""The sixteen sets of agents with the ego; set number n has partner i if bit i of n is set."""
-# Bit of each partner, which is also the number of the set of the ego and this partner.
-_PARTNER_BITS: Final = [1 << partner for partner in range(len(PARTNERS))]
+"""The 16 sets of agents that include the ego; bit i of the index is set if partner i belongs."""
+# Name of each set in `COALITIONS`.
+_COALITION_NAMES = tuple(map("+".join, COALITIONS))
+# Bit of each partner; it is also the index of the set that consists of the ego and this partner.
+_PARTNER_BITS = [1 << partner for partner in range(len(PARTNERS))]
 # Columns of the CSV file.
-_CSV_HEADING: Final = (
+_CSV_HEADING = (
     *_ACCIDENT_COLUMNS,
-    *(f"lead_{'+'.join(members)}" for members in COALITIONS),
-    *(f"first_frame_{'+'.join(members)}" for members in COALITIONS),
+    *(f"lead_{name}" for name in _COALITION_NAMES),
+    *(f"first_frame_{name}" for name in _COALITION_NAMES),
     *(f"shapley_{name}" for name in PARTNERS),
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LeadTimes(FrozenArrays):
-    """When sets of agents first observe both colliders of an accident; arrays are read-only.
+    """When each set of agents first observes both colliders; arrays are read-only.
 
-    Observation bounds a warning from above. It is no prediction: an agent that sees both actors
-    need not foresee that they will collide.
+    A lead time is an upper bound for how early a warning can be. It is not a prediction: an agent
+    that sees both actors may not foresee their collision.
 
     Attributes:
         scenario: Token of the scenario.
-        rule: When an actor counts as observed.
+        rule: Rule for when an actor counts as observed.
         actor_ids: CARLA ids of the colliders, in the meta file's order.
         categories: Classes of the colliders.
-        colliding_agents: Agents that the colliders are; None for a collider that records nothing.
+        colliding_agents: Names of the colliders as agents; None for a collider that is no agent.
         missing: Agents without labels in this release.
-        num_frames: Number of frames of the recording; the last one counts as the impact.
-        touching: Seconds from the frame at which the outlines begin to touch to the last one; None
-            if they never do.
-        first_frames: Number (from 1) of the first frame at which each of `COALITIONS` observes
-            both, shape (16,), int64; 0 for a set that never does, and for a set with a missing
-            agent.
+        num_frames: Number of frames in the recording; the last one is taken as the impact.
+        touching: Seconds from the first frame in which the outlines touch to the last frame; None
+            if they never touch.
+        first_frames: Number (from 1) of the first frame in which each of `COALITIONS` observes
+            both, shape (16,), int64; 0 for a set that never does, or that has a missing agent.
         leads: Seconds from that frame to the last one, shape (16,); 0 for a set that never observes
-            both, NaN with a missing agent.
-        shapley: Shapley value of each of `PARTNERS`, shape (4,): seconds of the gain over the ego
-            without partners, shared among the partners with labels; NaN for a missing one.
+            both, NaN for a set with a missing agent.
+        shapley: Shapley value of each of `PARTNERS` in seconds, shape (4,): its share of the lead
+            time that all partners with labels add to the ego's; NaN for a missing partner.
     """
 
     scenario: str
@@ -125,49 +134,54 @@ class LeadTimes(FrozenArrays):
 
     @property
     def alone(self) -> float:
-        """Seconds of the ego without partners."""
+        """Lead time of the ego without partners, in seconds."""
         return float(self.leads[0])
 
     @property
     def together(self) -> float:
-        """Seconds of all agents with labels."""
+        """Lead time of all agents with labels together, in seconds."""
         return float(self.leads[self._full_coalition])
 
     @property
     def never_alone(self) -> bool:
-        """Whether the ego without partners never observes both at the same frame."""
+        """Whether the ego without partners never observes both colliders in the same frame."""
         return not self.first_frames[0]
 
     @property
     def never_together(self) -> bool:
-        """Whether all agents with labels never observe both at the same frame."""
+        """Whether all agents with labels together never observe both in the same frame."""
         return not self.first_frames[self._full_coalition]
 
     @property
     def from_the_start(self) -> bool:
-        """Whether all agents with labels observe both from the first frame on.
+        """Whether all agents with labels together already observe both in the first frame.
 
-        The recording may then cut the lead time.
+        If so, the true lead time may be longer than the recorded one.
         """
-        return int(self.first_frames[self._full_coalition]) == 1
+        first_frame = int(self.first_frames[self._full_coalition])
+        return first_frame == 1
 
     @property
     def gains(self) -> FloatArray:
-        """Seconds that each of `PARTNERS` adds to the ego, shape (4,); NaN for a missing one."""
-        return np.asarray(self.leads[_PARTNER_BITS] - self.leads[0])
+        """Seconds that each of `PARTNERS` adds to the ego's lead time, (4,); NaN if missing."""
+        leads_in_pairs = self.leads[_PARTNER_BITS]
+        return np.asarray(leads_in_pairs - self.leads[0])
 
     @property
     def losses(self) -> FloatArray:
-        """Seconds that all agents lose without each of `PARTNERS`, shape (4,); NaN if missing."""
+        """Seconds by which all agents' lead time falls without each of `PARTNERS`, shape (4,).
+
+        Values are NaN for missing partners.
+        """
         smaller_sets = [self._full_coalition & ~bit for bit in _PARTNER_BITS]
-        return np.where(np.isnan(self.gains), np.nan, self.together - self.leads[smaller_sets])
+        losses = self.together - self.leads[smaller_sets]
+        return np.where(np.isnan(self.gains), np.nan, losses)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the values for JSON.
 
-        None for unknown values, and for the first frame of a set that never observes both.
+        Unknown values are None, and so is the first frame of a set that never observes both.
         """
-        names = ["+".join(members) for members in COALITIONS]
         frames = [number or None for number in self.first_frames.tolist()]
         return {
             "scenario": self.scenario,
@@ -178,16 +192,16 @@ class LeadTimes(FrozenArrays):
             "missing": list(self.missing),
             "num_frames": self.num_frames,
             "touching": self.touching,
-            "lead_seconds": dict(zip(names, known(self.leads), strict=True)),
-            "first_frames": dict(zip(names, frames, strict=True)),
-            "gain_seconds": dict(zip(PARTNERS, known(self.gains), strict=True)),
-            "loss_seconds": dict(zip(PARTNERS, known(self.losses), strict=True)),
-            "shapley_seconds": dict(zip(PARTNERS, known(self.shapley), strict=True)),
+            "lead_seconds": _by_name(_COALITION_NAMES, json_numbers(self.leads)),
+            "first_frames": _by_name(_COALITION_NAMES, frames),
+            "gain_seconds": _by_name(PARTNERS, json_numbers(self.gains)),
+            "loss_seconds": _by_name(PARTNERS, json_numbers(self.losses)),
+            "shapley_seconds": _by_name(PARTNERS, json_numbers(self.shapley)),
         }
 
     @property
     def _full_coalition(self) -> int:
-        """Number of the set of all agents with labels."""
+        """Index in `COALITIONS` of the set of all agents with labels."""
         bits = zip(_PARTNER_BITS, PARTNERS, strict=True)
         return sum(bit for bit, name in bits if name not in self.missing)
 
@@ -195,19 +209,20 @@ class LeadTimes(FrozenArrays):
 def lead_times(
     dataset: Dataset, scenario: RowArgument, rule: ObservationRule | None = None
 ) -> LeadTimes | None:
-    """Return when each set of agents with `ego_vehicle` first observes both colliders.
+    """Measure when each set of agents that includes `ego_vehicle` first observes both colliders.
 
     Args:
         dataset: The release.
         scenario: Token or record of the scenario.
-        rule: When an actor counts as observed; None for `ObservationRule()`.
+        rule: Rule for when an actor counts as observed; None for `ObservationRule()`.
 
     Returns:
-        None if the meta file names no collision.
+        The lead times; None if the meta file names no collision.
 
     Raises:
-        TokenError: There is no such scenario.
-        NotAvailableError: `accident_of` raises it, or `ego_vehicle` has no labels in this release.
+        TokenError: If the release has no such scenario.
+        NotAvailableError: If `accident_of` raises it, or if `ego_vehicle` has no labels in this
+            release.
     """
     accident = accident_of(dataset, scenario)
     if accident is None:
@@ -216,9 +231,9 @@ def lead_times(
     present, observed = observed_actors(dataset, accident.scenario, accident.actor_ids, rule)
     if _EGO not in present:
         raise NotAvailableError(
-            f"{accident.scenario}: has no labels of {_EGO}, whose lead time is asked; unpack them"
+            f"{accident.scenario}: has no labels of {_EGO}, which its lead time needs; unpack them"
         )
-    first_frames, leads, shapley = _coalition_values(observed, present[1:])
+    first_frames, leads, shapley = _measure_coalitions(observed, present[1:])
     return LeadTimes(
         scenario=accident.scenario,
         rule=rule,
@@ -234,20 +249,23 @@ def lead_times(
     )
 
 
-def _coalition_values(
+def _measure_coalitions(
     observed: BoolArray, partners: tuple[AgentName, ...]
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return first frames (16,), leads (16,) and Shapley values (4,) of all sets and partners.
+    """Compute `first_frames`, `leads` and `shapley` of `LeadTimes`.
 
-    Values of sets with a missing partner are unknown, as are Shapley values of missing partners.
+    Args:
+        observed: Whether each agent with labels observes each collider in each frame.
+        partners: The partners that have labels.
     """
     indices = np.array([PARTNERS.index(name) for name in partners], dtype=np.int64)
     numbers = coalition_members(len(partners)) @ (1 << indices)
     first_index = first_together(observed)
     known_leads = leads_from(first_index, observed.shape[-1])
     first_frames = np.zeros(len(COALITIONS), dtype=np.int64)
+    first_frames[numbers] = first_index + 1
     leads = np.full(len(COALITIONS), np.nan)
-    first_frames[numbers], leads[numbers] = first_index + 1, known_leads
+    leads[numbers] = known_leads
     shapley = np.full(len(PARTNERS), np.nan)
     shapley[indices] = shapley_values(known_leads)
     return first_frames, leads, shapley
@@ -259,9 +277,9 @@ class MeanTime:
 
     Attributes:
         mean: Mean in seconds; None without accidents.
-        low: Lower end of the interval of 95 % by the bootstrap over accidents; None for fewer than
-            six.
-        high: Upper end of the interval.
+        low: Lower end of the 95 % interval from a bootstrap over accidents; None for fewer than
+            six accidents.
+        high: Upper end of the interval; None if there is no lower end.
         accidents: Number of accidents.
     """
 
@@ -275,7 +293,9 @@ class MeanTime:
         """The mean and its interval, such as `1.52 [1.20, 1.86]`."""
         if self.mean is None:
             return "–"
-        interval = "" if self.low is None else f" [{self.low:.2f}, {self.high:.2f}]"
+        interval = ""
+        if self.low is not None:
+            interval = f" [{self.low:.2f}, {self.high:.2f}]"
         return f"{self.mean:.2f}{interval}"
 
 
@@ -286,10 +306,10 @@ class LeadTimeLedger(Report):
     Attributes:
         dataroot: Folder of the release.
         version: `v1` or `v1-mini`.
-        rule: When an actor counts as observed.
-        accidents: Lead times, in the order of the release.
-        skipped: Scenarios with unknown lead times, and why.
-        without_accident: Number of scenarios with a meta file that names no collision.
+        rule: Rule for when an actor counts as observed.
+        accidents: Lead times of each accident, in the order of the release.
+        skipped: Scenarios whose lead times are unknown, and the reasons.
+        without_accident: Number of scenarios whose meta file names no collision.
     """
 
     dataroot: str
@@ -301,56 +321,64 @@ class LeadTimeLedger(Report):
 
     @cached_property
     def mean_leads(self) -> tuple[MeanTime, ...]:
-        """Mean lead time of each of `COALITIONS`.
-
-        Accidents without one of its agents do not count.
-        """
-        return _column_means([times.leads for times in self.accidents], len(COALITIONS))
+        """Mean lead time of each of `COALITIONS`, over accidents in which all its agents exist."""
+        return self._column_means("leads", len(COALITIONS))
 
     @cached_property
     def mean_gains(self) -> tuple[MeanTime, ...]:
-        """Mean of what each of `PARTNERS` adds to the ego."""
-        return _column_means([times.gains for times in self.accidents], len(PARTNERS))
+        """Mean lead time that each of `PARTNERS` adds to the ego's."""
+        return self._column_means("gains", len(PARTNERS))
 
     @cached_property
     def mean_losses(self) -> tuple[MeanTime, ...]:
-        """Mean of what all agents lose without each of `PARTNERS`."""
-        return _column_means([times.losses for times in self.accidents], len(PARTNERS))
+        """Mean lead time that all agents lose without each of `PARTNERS`."""
+        return self._column_means("losses", len(PARTNERS))
 
     @cached_property
     def mean_shapley(self) -> tuple[MeanTime, ...]:
         """Mean Shapley value of each of `PARTNERS`."""
-        return _column_means([times.shapley for times in self.accidents], len(PARTNERS))
+        return self._column_means("shapley", len(PARTNERS))
 
     @property
     def mean_together(self) -> MeanTime:
-        """Mean lead time of all agents that each accident has."""
-        return _column_means([times.together for times in self.accidents], 1)[0]
+        """Mean lead time of all agents with labels together."""
+        return self._column_means("together", 1)[0]
 
     @property
     def share_never_alone(self) -> float | None:
-        """Share of the accidents that the ego without partners never observes; None for none.
+        """Share of the accidents in which the ego by itself never observes both colliders at once.
 
-        To observe an accident is to observe both colliders at the same frame.
+        None without accidents.
         """
-        return _share([times.never_alone for times in self.accidents])
+        return self._share("never_alone")
 
     @property
     def share_never_together(self) -> float | None:
-        """Share of the accidents that all agents together never observe; None for none."""
-        return _share([times.never_together for times in self.accidents])
+        """Share of the accidents that all agents together never observe; None if there are none."""
+        return self._share("never_together")
 
     @property
     def share_from_the_start(self) -> float | None:
-        """Share of the accidents that all agents observe from the first frame on; None for none.
+        """Share of the accidents that all agents together already observe in the first frame.
 
-        In these accidents the beginning of the recording may have cut the lead time.
+        Their true lead times may be longer than the recorded ones. None without accidents.
         """
-        return _share([times.from_the_start for times in self.accidents])
+        return self._share("from_the_start")
+
+    def _column_means(self, name: str, columns: int) -> tuple[MeanTime, ...]:
+        """Average each column of a field of `LeadTimes` over the accidents."""
+        values = [getattr(times, name) for times in self.accidents]
+        return mean_times(np.array(values).reshape(-1, columns))
+
+    def _share(self, name: str) -> float | None:
+        """Return the share of accidents where a property of `LeadTimes` holds; None without any."""
+        if not self.accidents:
+            return None
+        count = sum(getattr(times, name) for times in self.accidents)
+        return float(count / len(self.accidents))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the values for JSON; None for unknown values."""
-        names = ["+".join(members) for members in COALITIONS]
         return {
             "dataroot": self.dataroot,
             "version": self.version,
@@ -366,24 +394,24 @@ class LeadTimeLedger(Report):
                 "share_never_together": self.share_never_together,
                 "share_from_the_start": self.share_from_the_start,
                 "together": asdict(self.mean_together),
-                "lead_seconds": _by_name(names, self.mean_leads),
-                "gain_seconds": _by_name(PARTNERS, self.mean_gains),
-                "loss_seconds": _by_name(PARTNERS, self.mean_losses),
-                "shapley_seconds": _by_name(PARTNERS, self.mean_shapley),
+                "lead_seconds": _by_name(_COALITION_NAMES, map(asdict, self.mean_leads)),
+                "gain_seconds": _by_name(PARTNERS, map(asdict, self.mean_gains)),
+                "loss_seconds": _by_name(PARTNERS, map(asdict, self.mean_losses)),
+                "shapley_seconds": _by_name(PARTNERS, map(asdict, self.mean_shapley)),
             },
             "accidents": [times.to_dict() for times in self.accidents],
             "skipped": [asdict(skipped) for skipped in self.skipped],
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
-        """Return `lead_times`, a row for each accident with unrounded seconds, and `skipped`."""
+        """Return the tables `lead_times` (one row per accident) and `skipped`."""
         return {
             "lead_times": [_CSV_HEADING, *map(_csv_row, self.accidents)],
             "skipped": skipped_rows(self.skipped),
         }
 
     def to_text(self) -> str:
-        """Return a table of the accidents and of their means, for a terminal."""
+        """Return the accidents and their means as tables for a terminal."""
         with_ego = sum(times.ego_collides for times in self.accidents)
         counts = (
             f"{counted(len(self.accidents), 'accident')}, {with_ego} of them with {_EGO} among the "
@@ -400,125 +428,127 @@ class LeadTimeLedger(Report):
         return "\n\n".join(blocks)
 
     def _accidents_text(self) -> str:
+        """Return a table with one row per accident, and an explanation of its columns."""
         partner_heads = (f"+ {short_name(name)}" for name in PARTNERS)
         rows = [("seconds before the impact", "ego alone", *partner_heads, "all")]
         for times in self.accidents:
-            partners = zip(times.gains.tolist(), times.shapley.tolist(), strict=True)
+            gains = map(_gain_text, times.gains.tolist(), times.shapley.tolist())
+            alone = _lead_text(times.alone, never=times.never_alone)
             together = _lead_text(times.together, never=times.never_together)
-            rows.append(
-                (
-                    times.scenario,
-                    _lead_text(times.alone, never=times.never_alone),
-                    *(_gain_text(gain, shapley) for gain, shapley in partners),
-                    together + "*" * bool(times.missing),
-                )
-            )
+            if times.missing:
+                together += "*"
+            rows.append((times.scenario, alone, *gains, together))
         notes = [
-            "+: what the partner alone adds to the ego, and in brackets its Shapley value",
-            "never: the colliders are not observed at the same frame",
+            "+ PARTNER: what this partner adds to ego; in brackets its Shapley value",
+            "never: no frame shows both colliders",
         ]
         if any(times.missing for times in self.accidents):
-            notes.append("*: of the agents that are there; – for the missing ones")
+            notes.append(
+                "*: some agents are missing (shown as –); the numbers count the other agents"
+            )
         return "\n".join([columns_text(rows), *notes])
 
     def _means_text(self) -> str:
-        means = zip(PARTNERS, self.mean_gains, self.mean_losses, self.mean_shapley, strict=True)
-        heading = ("partner", "adds to the ego", "all lose without", "Shapley value")
-        rows = [
-            (short_name(name), gain.text, loss.text, shapley.text)
-            for name, gain, loss, shapley in means
-        ]
-        alone, together = self.mean_leads[0].text, self.mean_together.text
-        start = (
-            "observed by all agents from the first frame on, so that the lead may be longer than "
-            "the recording: "
+        """Return a table with one row per partner, then lines with lead times and shares."""
+        heading = ("partner", "adds to the ego", "marginal loss without it", "Shapley value")
+        rows = [heading, *partner_rows(self)]
+        alone = self.mean_leads[0].text
+        together = self.mean_together.text
+        never_alone = _percent(self.share_never_alone)
+        never_together = _percent(self.share_never_together)
+        from_the_start = _percent(self.share_from_the_start)
+        return (
+            "means in seconds [95 % confidence interval, bootstrapped over accidents]\n"
+            f"{columns_text(rows)}\n"
+            f"lead time: ego alone {alone}, all agents {together}\n"
+            f"accidents in which both colliders are never observed together: {never_alone} by ego "
+            f"alone, {never_together} by all agents\n"
+            "accidents observed from the first frame on, so that the lead time may be longer: "
+            f"{from_the_start}"
         )
-        never = (
-            f"never observed together: by the ego alone {_percent(self.share_never_alone)}, by all "
-            "agents "
-        )
-        lines = [
-            "means in seconds [interval of 95 %, bootstrap over accidents]",
-            columns_text([heading, *rows]),
-            f"lead time: the ego alone {alone}, all agents {together}",
-            f"{never}{_percent(self.share_never_together)} of the accidents",
-            f"{start}{_percent(self.share_from_the_start)}",
-        ]
-        return "\n".join(lines)
 
 
-def mean_times(values: FloatArray) -> tuple[MeanTime, ...]:
-    """Return the mean of each column of seconds over accidents, with its bootstrap interval.
-
-    All columns use the same `_RESAMPLES` resamples of the accidents, always from the same random
-    numbers.
-
-    Args:
-        values: Seconds, shape (N, K); NaN for unknown ones.
-    """
-    count, columns = values.shape
-    known = np.isfinite(values)
-    if not count:
-        return tuple(MeanTime(mean=None, low=None, high=None, accidents=0) for _ in range(columns))
-    generator = np.random.default_rng(0)
-    draws = generator.multinomial(count, np.full(count, 1 / count), size=_RESAMPLES)
-    times = draws.astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        means = times @ np.where(known, values, 0) / (times @ known)
-    return tuple(
-        _mean_time(values[known[:, column], column], means[:, column]) for column in range(columns)
-    )
-
-
-def _column_means(rows: Sequence[FloatArray | float], columns: int) -> tuple[MeanTime, ...]:
-    return mean_times(np.array(rows).reshape(-1, columns))
-
-
-def _mean_time(values: FloatArray, resampled_means: FloatArray) -> MeanTime:
-    ends: Sequence[float | None] = (None, None)
-    if len(values) >= _MIN_ACCIDENTS:
-        tail = (1 - _CONFIDENCE) / 2
-        ends = np.nanquantile(resampled_means, (tail, 1 - tail)).tolist()
-    mean = math.fsum(values.tolist()) / len(values) if len(values) else None
-    return MeanTime(mean=mean, low=ends[0], high=ends[1], accidents=len(values))
-
-
-def _csv_row(times: LeadTimes) -> list[Any]:
-    payload = times.to_dict()
-    cells = dict(payload)
-    for name in ("actor_ids", "categories", "colliding_agents", "missing"):
-        cells[name] = " ".join("none" if value is None else str(value) for value in payload[name])
+def partner_rows(ledger: LeadTimeLedger) -> list[tuple[str, ...]]:
+    """Return the name, mean gain, mean loss and mean Shapley value of each partner as text."""
+    means = zip(PARTNERS, ledger.mean_gains, ledger.mean_losses, ledger.mean_shapley, strict=True)
     return [
-        *(cells[name] for name in _ACCIDENT_COLUMNS),
-        *payload["lead_seconds"].values(),
-        *payload["first_frames"].values(),
-        *payload["shapley_seconds"].values(),
+        (short_name(name), gain.text, loss.text, shapley.text)
+        for name, gain, loss, shapley in means
     ]
 
 
-def _by_name(names: Sequence[str], means: Sequence[MeanTime]) -> dict[str, Any]:
-    return {name: asdict(mean) for name, mean in zip(names, means, strict=True)}
+def mean_times(values: FloatArray) -> tuple[MeanTime, ...]:
+    """Average each column over the accidents, with a bootstrap interval.
+
+    All columns share the same `_RESAMPLES` resamples of the accidents. The random seed is fixed.
+
+    Args:
+        values: Seconds by accident and column, shape (N, K); NaN for unknown values.
+    """
+    count, columns = values.shape
+    is_known = np.isfinite(values)
+    resampled_means = np.zeros((0, columns))
+    if count:
+        generator = np.random.default_rng(0)
+        draws = generator.multinomial(count, np.full(count, 1 / count), size=_RESAMPLES)
+        times = draws.astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            resampled_means = times @ np.where(is_known, values, 0) / (times @ is_known)
+    means = []
+    for column in range(columns):
+        known_values = values[is_known[:, column], column]
+        means.append(_mean_time(known_values, resampled_means[:, column]))
+    return tuple(means)
 
 
-def _share(truths: Sequence[bool]) -> float | None:
-    if truths:
-        return sum(truths) / len(truths)
-    return None
+def _mean_time(values: FloatArray, resampled_means: FloatArray) -> MeanTime:
+    """Average the known values; the interval is taken from the resampled means."""
+    if not len(values):
+        return MeanTime(mean=None, low=None, high=None, accidents=0)
+    low = None
+    high = None
+    if len(values) >= _MIN_ACCIDENTS:
+        tail = (1 - _CONFIDENCE) / 2
+        low, high = np.nanquantile(resampled_means, (tail, 1 - tail)).tolist()
+    mean = math.fsum(values.tolist()) / len(values)
+    return MeanTime(mean=mean, low=low, high=high, accidents=len(values))
+
+
+def _csv_row(times: LeadTimes) -> list[Any]:
+    """Return an accident's cells in the CSV file, in the order of `_CSV_HEADING`."""
+    cells = times.to_dict()
+    for name in ("actor_ids", "categories", "colliding_agents", "missing"):
+        texts = ["none" if value is None else str(value) for value in cells[name]]
+        cells[name] = " ".join(texts)
+    return [
+        *map(cells.get, _ACCIDENT_COLUMNS),
+        *cells["lead_seconds"].values(),
+        *cells["first_frames"].values(),
+        *cells["shapley_seconds"].values(),
+    ]
+
+
+def _by_name(names: Sequence[str], values: Iterable[Any]) -> dict[str, Any]:
+    """Return a dictionary from names to values for JSON."""
+    return dict(zip(names, values, strict=True))
 
 
 def _percent(share: float | None) -> str:
+    """Format a share in percent; a dash for None."""
     if share is None:
         return "–"
     return f"{round(100 * share)} %"
 
 
 def _gain_text(gain: float, shapley: float) -> str:
+    """Format what a partner adds, with its Shapley value in brackets; a dash if unknown."""
     if math.isnan(gain):
         return "–"
     return f"{gain:.1f} ({shapley:.2f})"
 
 
 def _lead_text(lead: float, *, never: bool) -> str:
+    """Format a lead time with one decimal; `never` if both are never observed."""
     if never:
         return "never"
     return f"{lead:.1f}"
@@ -530,32 +560,32 @@ def lead_time_ledger(
     rule: ObservationRule | None = None,
     **engine: Unpack[Engine],
 ) -> LeadTimeLedger:
-    """Return the lead times of every accident, and the scenarios with unknown lead times.
+    """Measure the lead times of all accidents, and list the scenarios where they are unknown.
 
     Args:
         dataset: The release.
         scenarios: Tokens or records of scenarios, such as `find` returns; None for all.
-        rule: When an actor counts as observed; None for `ObservationRule()`.
+        rule: Rule for when an actor counts as observed; None for `ObservationRule()`.
         **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        TokenError: There is no such scenario.
+        TokenError: If the release has no such scenario.
     """
     rule = rule or ObservationRule()
     work = partial(lead_times, rule=rule)
-    results = each_scenario(work, dataset, scenarios, label="lead times", **engine)
+    results = map_scenarios(work, dataset, scenarios, label="Measuring lead times", **engine)
     return ledger_of(dataset, results, rule)
 
 
 def ledger_of(
     dataset: Dataset, results: Sequence[LeadTimes | Skipped | None], rule: ObservationRule
 ) -> LeadTimeLedger:
-    """Return the ledger of the results of `lead_times` for scenarios."""
+    """Build the ledger from the results of `lead_times`, one per scenario."""
     return LeadTimeLedger(
         dataroot=str(dataset.dataroot),
         version=dataset.version,
         rule=rule,
-        accidents=those_of(LeadTimes, results),
-        skipped=those_of(Skipped, results),
+        accidents=select_results(LeadTimes, results),
+        skipped=select_results(Skipped, results),
         without_accident=results.count(None),
     )

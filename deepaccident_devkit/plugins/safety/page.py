@@ -1,8 +1,7 @@
-"""`save_safety_report`: an HTML page of a release's accidents, with figures and replays."""
+"""`save_safety_report`: writes an HTML page on a release's accidents, with figures and replays."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,27 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
-from deepaccident_devkit.collisions import OUTCOMES
+from deepaccident_devkit.collisions.outcomes import OUTCOMES, Braking
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.plugins.safety import (
     COALITIONS,
-    PARTNERS,
     AccidentRow,
     OutcomeShares,
     SafetyReport,
 )
 from deepaccident_devkit.plugins.safety.avoidability_report import ACCIDENT_GROUPS
-from deepaccident_devkit.plugins.safety.figures import (
-    AVOIDABILITY_SIZE,
-    COLUMN_HEIGHT,
-    LEAD_TIME_SIZE,
-    render_avoidability,
-    render_lead_times,
-)
-from deepaccident_devkit.plugins.safety.lead_times import CAVEAT
+from deepaccident_devkit.plugins.safety.figures import render_avoidability, render_lead_times
+from deepaccident_devkit.plugins.safety.lead_times import CAVEAT, partner_rows
 from deepaccident_devkit.plugins.safety.report import CRITICAL_TTC, DECELERATIONS, actor_name
-from deepaccident_devkit.render.figures import report_figure, write_report_figure
+from deepaccident_devkit.render.figures import write_report_figure
 from deepaccident_devkit.render.replay import tried_replay
 from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.files import place_in, plain_names, writable_folder, write_bytes
@@ -38,9 +30,9 @@ from deepaccident_devkit.support.pages import document, part
 from deepaccident_devkit.support.parallel import Engine, Places, run_batch
 from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.support.scripts import bundled
-from deepaccident_devkit.support.text import number_text
+from deepaccident_devkit.support.text import PathType, counted, number_text
 from deepaccident_devkit.support.version import __version__
-from deepaccident_devkit.taxonomy import AGENTS, short_name
+from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, short_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,17 +40,20 @@ if TYPE_CHECKING:
 
 SAFETY_REPORT_FILE: Final = "report.html"
 REPLAYS: Final = 10
-"""Number of replay pages by default."""
-# Columns of the tables: seconds of warning.
-_LEAD_COLUMNS_S: Final = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
-_WARNED: Final = {
-    "ego": "the ego is warned and brakes",
-    "both": "both are warned and brake",
-    "first": "the first is warned and brakes",
-    "second": "the second is warned and brakes",
+"""Default number of replay pages."""
+# Warning times in seconds that are the columns of the tables.
+_LEAD_COLUMNS_S = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
+_WARNED = {
+    "ego": "ego is warned and brakes",
+    "both": "both drivers are warned and brake",
+    "first": "the first collider is warned and brakes",
+    "second": "the second collider is warned and brakes",
 }
-# Largest number of rows of the tables of the largest gaps and of the nearest pairs.
-_MAX_ROWS: Final = 10
+# Warning times and braking of the summary at the top.
+_SUMMARY_LEADS_S = (2.0, 3.0)
+_SUMMARY_BRAKING = Braking(reaction=1.0, deceleration=6.0)
+# Maximum number of rows in the tables of the largest margins and of the nearest pairs.
+_MAX_ROWS = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,9 +62,9 @@ class _Figure:
 
     Attributes:
         name: Name of its file.
-        caption: What it shows.
-        alt: The same for readers that cannot see it.
-        draw: Function that draws it.
+        caption: Text below the figure, for all readers.
+        alt: Alternative text for readers who cannot see the figure.
+        draw: Function that draws the figure.
     """
 
     name: str
@@ -80,7 +75,7 @@ class _Figure:
 
 def save_safety_report(
     report: SafetyReport,
-    folder: str | os.PathLike[str],
+    folder: PathType,
     *,
     dataset: Dataset | None = None,
     replays: int | None = REPLAYS,
@@ -88,27 +83,28 @@ def save_safety_report(
 ) -> list[Path]:
     """Write the page `report.html` into a folder, with its tables, figures and replay pages.
 
-    `accidents.csv` and `safety.json` have the page's rows, `figures/*.png` its figures, and
-    `replays/*.html` the pages that it links to, one for each accident (`render_replay`). Files of
-    an earlier report there are replaced; each file is complete or missing, and the page comes last.
+    `accidents.csv` and `safety.json` contain the page's rows. `figures/*.png` are its figures.
+    `replays/*.html` are the pages that it links to, one per replayed accident (`render_replay`).
+    Files of an earlier report in the folder are replaced. The page is written last; no file is ever
+    left half-written.
 
     Args:
-        report: Report of `safety_report`.
+        report: Report returned by `safety_report`.
         folder: Output folder; it is created if it does not exist.
-        dataset: The release, for replay pages; None for none.
-        replays: Number of accidents with a replay page, by the largest delta-v; None for all. A
-            page takes some seconds and up to 15 MB if there are images.
+        dataset: The release, from which replay pages are rendered; None for no replay pages.
+        replays: Number of accidents with a replay page, largest delta-v first; None for all. Each
+            page takes a few seconds, and up to 15 MB if it contains images.
         **engine: `workers`, `executor` and `progress` of the replay pages; see `parallel.Engine`.
             The folder must be visible to an executor.
 
     Returns:
-        The files written, the page last.
+        Paths of the files written, the page last.
 
     Raises:
-        ConfigError: `folder` cannot be written to, or is not a folder.
-        OutputFolderError: Its `figures` or `replays` is a link.
-        ChoiceError: `replays` is negative.
-        ChoiceError, WorkerError: See `parallel.Engine`.
+        ConfigError: If `folder` is not a folder, or cannot be written to.
+        OutputFolderError: If the folder `figures` or `replays` is a link.
+        ChoiceError: If `replays` is negative.
+        ChoiceError, WorkerError: For the reasons given in `parallel.Engine`.
     """
     if replays is not None and replays < 0:
         raise ChoiceError(f"replays: expected 0 or more, or None for all, found {replays}")
@@ -116,28 +112,24 @@ def save_safety_report(
     written = report.to_csv(folder)
     written.append(folder / "safety.json")
     write_bytes(written[-1], report.to_json().encode())
-    figures = list(figures_of(report))
     figures_folder = place_in(folder, "figures", opened=True)
-    figure_paths = [
-        write_report_figure(figure.draw(), figures_folder / f"{figure.name}.png")
-        for figure in figures
-    ]
+    pictures = []
+    for figure in figures_of(report):
+        path = write_report_figure(figure.draw, figures_folder / f"{figure.name}.png")
+        written.append(path)
+        pictures.append((figure, path))
     pages: dict[str, str] = {}
     failed: dict[str, str] = {}
     if dataset is not None:
-        scenarios = [row.scenario for row in by_severity(report.rows)][:replays]
-        names = replay_names(scenarios)
+        scenarios = [row.scenario for row in by_severity(report.rows)]
+        names = replay_names(scenarios[:replays])
         failed = _make_replays(dataset, folder.absolute(), names, **engine)
         pages = {scenario: name for scenario, name in names.items() if scenario not in failed}
-    pictures = list(zip(figures, figure_paths, strict=True))
+    written += [folder / name for name in pages.values()]
     page = safety_report_html(report, pictures, pages, sorted(failed.items()))
-    write_bytes(folder / SAFETY_REPORT_FILE, page.encode())
-    return [
-        *written,
-        *figure_paths,
-        *(folder / name for name in pages.values()),
-        folder / SAFETY_REPORT_FILE,
-    ]
+    written.append(folder / SAFETY_REPORT_FILE)
+    write_bytes(written[-1], page.encode())
+    return written
 
 
 def safety_report_html(
@@ -146,29 +138,26 @@ def safety_report_html(
     pages: Mapping[str, str],
     failed: Sequence[tuple[str, str]],
 ) -> str:
-    """Return the complete page.
+    """Render the complete page as HTML.
 
     Args:
-        report: Report of `safety_report`.
-        figures: Figures and their PNG files, which become part of the page.
+        report: Report returned by `safety_report`.
+        figures: Figures, each with its PNG file, which is embedded in the page.
         pages: Scenario → path of its replay page, relative to the report.
-        failed: Scenarios without a replay page because of an error, and the reasons.
+        failed: Scenarios whose replay page could not be written, each with the reason.
     """
-    ledger, avoidability = report.ledger, report.avoidability
-    means = zip(PARTNERS, ledger.mean_gains, ledger.mean_losses, ledger.mean_shapley, strict=True)
-    partners = [
-        [short_name(name), gain.text, loss.text, shapley.text]
-        for name, gain, loss, shapley in means
-    ]
+    ledger = report.ledger
+    avoidability = report.avoidability
     sets = [
         [", ".join(map(short_name, members)), mean.text, f"{mean.accidents:,}"]
         for members, mean in zip(COALITIONS, ledger.mean_leads, strict=True)
     ]
     largest = sorted(avoidability.margins.items(), key=lambda item: -item[1])[:_MAX_ROWS]
-    torn_twins = [
-        [twins.scenarios[0], twins.splits[0], twins.scenarios[1], twins.splits[1]]
-        for twins in report.twins.torn
-    ]
+    torn_twins = []
+    for twins in report.twins.torn:
+        scenario, twin = twins.scenarios
+        split, twin_split = twins.splits
+        torn_twins.append([scenario, split, twin, twin_split])
     failed_replays = [(scenario, "replay pages", reason) for scenario, reason in failed]
     pictures = [(read_bytes(path, "image"), figure.alt, figure.caption) for figure, path in figures]
     return document(
@@ -177,9 +166,10 @@ def safety_report_html(
         script=bundled(part, "sorting"),
         report=report,
         header=_header(report),
+        message=list(_message(report)),
         shares=list(_share_tables(report)),
         caveat=CAVEAT,
-        partners=partners,
+        partners=partner_rows(ledger),
         sets=sets,
         gaps=[[name, f"{count:,}"] for name, count in avoidability.margin_counts.items()],
         largest=[[name, number_text(gap, 3)] for name, gap in largest],
@@ -196,63 +186,104 @@ def safety_report_html(
 
 
 def by_severity(rows: Iterable[AccidentRow]) -> list[AccidentRow]:
-    """Return the accidents, the largest delta-v first."""
-    return sorted(rows, key=lambda row: (-row.severity, row.scenario))
+    """Sort accidents by the larger delta-v, largest first."""
+    by_scenario = sorted(rows, key=lambda row: row.scenario)
+    return sorted(by_scenario, key=lambda row: -row.severity)
 
 
 def _header(report: SafetyReport) -> dict[str, str]:
-    """Return what was examined, and how much of it."""
+    """Return the page's header, name → text: what was examined, and how much of it."""
     avoidability = report.avoidability
     return {
         "release": f"{report.version}, {report.dataroot}",
         "scenarios": f"{report.scenarios:,}, {report.ledger.without_accident:,} without an "
         "accident",
         "accidents": f"{len(report.rows):,}, {len(avoidability.accidents):,} of them replayed",
-        "left out": f"{len(avoidability.dropped):,} not shown by their recording, "
-        f"{len(avoidability.skipped):,} without meta or labels, {len(report.broken):,} broken",
+        "excluded": _excluded_text(report),
         "observed": report.ledger.rule.text,
         "devkit": __version__,
     }
 
 
-def _share_tables(report: SafetyReport) -> Iterator[dict[str, Any]]:
-    """Yield a table of the shares that braking avoids for each group and way to warn drivers.
+def _excluded_text(report: SafetyReport) -> str:
+    """Say how many scenarios are excluded, and why; without reasons that exclude none."""
+    counts = {
+        "without a contact in the recording": len(report.avoidability.dropped),
+        "without metadata or labels": len(report.avoidability.skipped),
+        "broken": len(report.broken),
+    }
+    texts = [f"{count:,} {reason}" for reason, count in counts.items() if count]
+    return ", ".join(texts) or "none"
 
-    Columns are seconds of warning.
+
+def _message(report: SafetyReport) -> Iterator[str]:
+    """Yield the sentences at the top of the page: who sees it when, and what braking avoids."""
+    ledger = report.ledger
+    if ledger.accidents:
+        yield (
+            f"On average, ego alone sees both colliders {ledger.mean_leads[0].mean:.1f} s before "
+            f"the impact; all agents together see them {ledger.mean_together.mean:.1f} s before it."
+        )
+    indices = {lead: round(lead / FRAME_PERIOD) for lead in _SUMMARY_LEADS_S}
+    for shares in report.avoidability.shares:
+        is_known = max(indices.values()) < len(shares.leads) and _SUMMARY_BRAKING in shares.brakings
+        if shares.warned != "both" or not is_known:
+            continue
+        column = shares.brakings.index(_SUMMARY_BRAKING)
+        texts = []
+        for lead, index in indices.items():
+            avoided, _ = _share_cell(shares, index, column)
+            texts.append(f"{avoided} with a warning {lead:g} s before the end")
+        yield (
+            f"Accidents avoided ({shares.group}), if both drivers brake with "
+            f"{_SUMMARY_BRAKING.deceleration:g} m/s² after {_SUMMARY_BRAKING.reaction:g} s: "
+            f"{' and '.join(texts)}."
+        )
+
+
+def _share_tables(report: SafetyReport) -> Iterator[dict[str, Any]]:
+    """Yield one table per group of accidents and choice of drivers: the share that braking avoids.
+
+    The columns are warning times in seconds.
     """
     tables = report.avoidability.shares
-    groups, warned = [shares.group for shares in tables], list(_WARNED)
-
-    def order(shares: OutcomeShares) -> tuple[int, int]:
-        return groups.index(shares.group), warned.index(shares.warned)
-
-    for shares in sorted(tables, key=order):
-        indices = [(lead, round(lead * 10)) for lead in _LEAD_COLUMNS_S]
-        leads = [(lead, index) for lead, index in indices if index < len(shares.leads)]
+    warned = list(_WARNED)
+    groups = [shares.group for shares in tables]
+    for shares in sorted(
+        tables, key=lambda shares: (groups.index(shares.group), warned.index(shares.warned))
+    ):
+        index_by_lead = {}
+        for lead in _LEAD_COLUMNS_S:
+            index = round(lead / FRAME_PERIOD)
+            if index < len(shares.leads):
+                index_by_lead[f"{lead:g}"] = index
         rows = []
         for column, braking in enumerate(shares.brakings):
-            cells = [_share_cell(shares, index, column) for _, index in leads]
+            cells = [_share_cell(shares, index, column) for index in index_by_lead.values()]
             label = f"reaction {braking.reaction:g} s, {braking.deceleration:g} m/s²"
             rows.append([label, *cells])
-        counts = [f"{shares.accidents[index]:,}" for _, index in leads]
-        accidents = f"({shares.accidents.max():,} accidents)"
+        counts = [f"{shares.accidents[index]:,}" for index in index_by_lead.values()]
+        accidents = counted(shares.accidents.max(), "accident")
         yield {
-            "title": f"{shares.group}: {_WARNED[shares.warned]} {accidents}",
+            "title": f"{shares.group}: {_WARNED[shares.warned]} ({accidents})",
             "open": shares.group == tables[0].group and shares.warned in ("ego", "both"),
-            "heading": ["warned before the end (s)", *(f"{lead:g}" for lead, _ in leads)],
-            "rows": [*rows, ["accidents recorded for so long", *counts]],
+            "heading": ["warning time before the end (s)", *index_by_lead],
+            "rows": [*rows, ["accidents with a long enough recording", *counts]],
         }
 
 
 def _share_cell(shares: OutcomeShares, index: int, column: int) -> tuple[str, str]:
-    """Return the share avoided, and for the line below it the share that is hit only later."""
+    """Return the share avoided; as a second line, the share with contact after the recording."""
     avoided = shares.shares[index, column, OUTCOMES.index("avoided")]
-    later = shares.extrapolated[index, column]
-    return f"{100 * avoided:.0f} %", f"{100 * later:.0f} % later" if later else ""
+    hit_later = shares.extrapolated[index, column]
+    second_line = ""
+    if hit_later:
+        second_line = f"{100 * hit_later:.0f} % later"
+    return f"{100 * avoided:.0f} %", second_line
 
 
 def _nearest_rows(report: SafetyReport) -> Iterator[list[str]]:
-    """Yield the normal recordings in which two actors come near a collision, the nearest first."""
+    """Yield a row for each accident-free recording with a near miss, the most critical first."""
     for story in report.normal:
         nearest = story.facts["nearest"]
         if nearest is not None:
@@ -265,60 +296,52 @@ def _nearest_rows(report: SafetyReport) -> Iterator[list[str]]:
 
 
 def replay_names(scenarios: Iterable[str]) -> dict[str, str]:
-    """Return scenario → path of its replay page, relative to the report.
+    """Map each scenario to the path of its replay page, relative to the report.
 
-    Paths only have letters, digits, `_`, `-` and `.`.
+    Paths consist of letters, digits, `_`, `-`, `.` and `/` only.
     """
-    return {scenario: f"replays/{name}.html" for scenario, name in plain_names(scenarios).items()}
+    names = plain_names(scenarios)
+    return {scenario: f"replays/{name}.html" for scenario, name in names.items()}
 
 
 def _make_replays(
     dataset: Dataset, folder: Path, names: Mapping[str, str], **engine: Unpack[Engine]
 ) -> dict[str, str]:
-    """Write the replay pages; return scenario → reason for pages that cannot be made."""
+    """Write the replay pages; return scenario → reason for the ones that failed."""
     places = Places(reads=dataset.places, writes=(folder,))
     work = partial(_make_replay, dataset, folder)
     items = list(names.items())
-    reasons = run_batch(work, items, label="replay pages", places=places, **engine)
-    return {
-        scenario: reason
-        for scenario, reason in zip(names, reasons, strict=True)
-        if reason is not None
-    }
+    reasons = run_batch(work, items, label="Writing replay pages", places=places, **engine)
+    failed = {}
+    for scenario, reason in zip(names, reasons, strict=True):
+        if reason is not None:
+            failed[scenario] = reason
+    return failed
 
 
 def _make_replay(dataset: Dataset, folder: Path, item: tuple[str, str]) -> str | None:
+    """Write the replay page of a scenario; return the reason on failure, otherwise None."""
     scenario, name = item
     return tried_replay(dataset, scenario, place_in(folder, name))
 
 
 def figures_of(report: SafetyReport) -> Iterator[_Figure]:
-    """Yield the page's figures: one of lead times, and one of each group of accidents."""
+    """Yield the page's figures: the lead times, and one figure per group of accidents."""
     if report.ledger.accidents:
         yield _Figure(
             name="lead_times",
-            caption="Mean lead times of sets of agents with the ego, and what each partner adds.",
+            caption="Mean lead times of ego with sets of partners, and what each partner adds.",
             alt="Mean lead times by set of agents and Shapley values of the partners; the tables "
             "have the numbers.",
-            draw=partial(_draw_lead_times, report),
+            draw=partial(render_lead_times, report.ledger),
         )
     for group in ACCIDENT_GROUPS:
         if report.avoidability.members(group):
             yield _Figure(
                 name=f"avoidability_{group.replace('-', '_')}",
-                caption=f"{group}: share avoided, and speed at the contact, over the seconds of "
-                "warning.",
-                alt=f"{group}: share of accidents avoided over the seconds of warning; the tables "
-                "have the numbers.",
-                draw=partial(_draw_avoidability, report, group),
+                caption=f"{group}: share of the accidents avoided, and speed at the contact, by "
+                "warning time.",
+                alt=f"{group}: share of the accidents avoided by warning time; the tables have the "
+                "numbers.",
+                draw=partial(render_avoidability, report.avoidability, group),
             )
-
-
-def _draw_lead_times(report: SafetyReport) -> Figure:
-    fig = report_figure(LEAD_TIME_SIZE, column=COLUMN_HEIGHT)
-    return render_lead_times(report.ledger, fig=fig)
-
-
-def _draw_avoidability(report: SafetyReport, group: str) -> Figure:
-    fig = report_figure(AVOIDABILITY_SIZE, column=COLUMN_HEIGHT)
-    return render_avoidability(report.avoidability, group, fig=fig)

@@ -1,4 +1,4 @@
-"""The offers of the plug-in `safety`."""
+"""What the plug-in `safety` adds to the devkit."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ if TYPE_CHECKING:
 
 
 def _safety() -> click.Command:
+    """Import and return the command `deepaccident safety`."""
     from deepaccident_devkit.plugins.safety.cli import safety
 
     return safety
 
 
 def _prevented() -> ExtraResult:
+    """Import and return the additional evaluation result `prevented`."""
     from deepaccident_devkit.plugins.safety.prevention import PREVENTED
 
     return PREVENTED

@@ -1,7 +1,7 @@
-"""Prevented accidents: which collisions braking after the alarms would have avoided.
+"""Prevented accidents: which collisions the drivers avoid if they brake when an alarm is raised.
 
-Computes figures and tables from the counts of warnings. `PREVENTED` is what evaluations know of
-this result (`evaluation.runs.further`).
+Figures and tables are computed from the counts of a warning evaluation. `PREVENTED` registers this
+result with evaluations (`evaluation.runs.further`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -23,7 +22,7 @@ from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.intervals import Resampling
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import ExtraResult, Json, with_further
-from deepaccident_devkit.evaluation.runs.text import number_text
+from deepaccident_devkit.evaluation.runs.text import table_number_text
 from deepaccident_devkit.evaluation.warning import (
     WARNING_PROTOCOLS,
     CleanWarnings,
@@ -32,19 +31,19 @@ from deepaccident_devkit.evaluation.warning import (
 from deepaccident_devkit.evaluation.warning.anticipation import (
     LATENCIES,
     draws_of,
-    mean_of,
+    mean_of_records,
     reference_threshold,
 )
 from deepaccident_devkit.evaluation.warning.recordings import (
-    GIVEN,
+    GIVEN_SCORES,
     PREDICTORS,
     TRIVIAL,
     UNPLACED,
     Recording,
     ScoresOf,
-    by_group,
-    parts_of,
+    group_recordings,
     recordings_of,
+    split_counts,
 )
 from deepaccident_devkit.plugins.safety.prevention_result import (
     BUDGET,
@@ -54,12 +53,13 @@ from deepaccident_devkit.plugins.safety.prevention_result import (
     AlarmOutcomes,
     OutcomeTable,
     PreventedResult,
-    PreventionCurve,
     PreventionFigures,
 )
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
+from deepaccident_devkit.support.human_names import heading_name, human_name
 from deepaccident_devkit.support.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.support.reports import Table
+from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -68,22 +68,23 @@ if TYPE_CHECKING:
     from deepaccident_devkit.render.evaluation.figures import RunFigure
     from deepaccident_devkit.support.parallel import Engine
 
-# Suffix of the name of a group of accidents with a pedestrian.
-_PEDESTRIAN_SUFFIX: Final = ", pedestrian"
-# Suffix of a random predictor at the threshold that costs at most one braking second a minute.
-_QUIET_SUFFIX: Final = ", quiet"
-# Shares of the accidents: each class of outcome, avoided by lasting alarms, with an alarm, and with
-# a contact only after the recording; and the cost.
-_COLUMNS: Final = (*OUTCOMES, "if lasting", "warned", "after end", "braking s/min")
-# Kind of alarm that warns → its name in tables, and the scores that raise it.
-_ALARM_KINDS: Final[Mapping[str, tuple[str, ScoresOf]]] = {
+# Suffix of the group names for accidents with a pedestrian.
+_PEDESTRIAN_SUFFIX = ", pedestrian"
+# Suffix of the name of a random predictor whose threshold costs at most one braking second per
+# minute.
+_QUIET_SUFFIX = ", quiet"
+# Last columns of the tables: share with an alarm, share with contact only after the recording, and
+# the cost. Before them are the shares with each outcome, and the share avoided by lasting alarms.
+_LAST_COLUMNS = ("warned", "extrapolated", "braking_seconds_per_minute")
+# Kind of alarm that warns the drivers → its name in tables, and the scores that trigger it.
+_ALARM_KINDS: Mapping[str, tuple[str, ScoresOf]] = {
     "right": ("right alarms", "pair"),
     "any_alarm": ("any alarm", "recording"),
 }
-# Key of a latency of zero seconds in the JSON of a result.
-_ZERO_LATENCY: Final = "0"
+# JSON key of the latency of zero seconds.
+_ZERO_LATENCY = "0"
 FramesByAgent = Mapping[str, Sequence[int]]
-"""Agent → frame numbers of its samples."""
+"""Agent → frame numbers of its evaluated samples."""
 
 
 def prevented_accidents(
@@ -91,20 +92,20 @@ def prevented_accidents(
     evaluator: Evaluator[Any],
     **engine: Unpack[Engine],
 ) -> PreventedResult:
-    """Return the accidents that braking after alarms prevents, and the cost of false alarms.
+    """Compute which accidents braking after the alarms prevents, and the cost of false alarms.
 
-    If the alarm is of an agent of the colliding pair, only this agent brakes. Any other agent warns
-    both of the pair, after a latency.
+    If the agent that raises the alarm is one of the two colliders, only that agent brakes. An alarm
+    of any other agent warns both colliders, after a latency.
 
     Args:
-        dataset: Release that the samples belong to.
-        evaluator: `WarningEvaluator` of the protocol `clean` that has counted the samples.
+        dataset: Release that contains the samples.
+        evaluator: `WarningEvaluator` with the protocol `clean`, after it has counted the samples.
         **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        EvaluationError: The evaluator is of another task or protocol.
-        TokenError: A sample belongs to no scenario of the release.
-        WorkerError: A worker was killed, or cannot do the work.
+        EvaluationError: If the evaluator is for another task or protocol.
+        TokenError: If a sample belongs to no scenario in the release.
+        WorkerError: If a worker was killed, or cannot do the work.
     """
     return prevention_evaluator(dataset, evaluator, **engine).compute()
 
@@ -115,18 +116,18 @@ def with_prevented(
     resampling: Resampling | None = None,
     **engine: Unpack[Engine],
 ) -> EvaluationRun:
-    """Return the run with the accidents that its alarms would have prevented, and their intervals.
+    """Add to a run which accidents its alarms would have prevented, with bootstrap intervals.
 
     Args:
-        run: Evaluation of warnings, protocol `clean`.
-        dataset: Release that the run evaluates.
-        resampling: How intervals are made, an accident and its twin together; None for the
-            defaults.
+        run: Evaluation of warnings with the protocol `clean`.
+        dataset: Release on which the run was evaluated.
+        resampling: How intervals are computed, with each accident and its twin drawn together; None
+            for the defaults.
         **engine: `workers` (1 by default), `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        EvaluationError: The run is of another task or protocol.
-        WorkerError: A worker was killed, or cannot do the work.
+        EvaluationError: If the run is for another task or protocol.
+        WorkerError: If a worker was killed, or cannot do the work.
     """
     return with_further(run, "prevented", dataset, resampling, **engine)
 
@@ -134,13 +135,13 @@ def with_prevented(
 def prevention_evaluator(
     dataset: Dataset, evaluator: Evaluator[Any], **engine: Unpack[Engine]
 ) -> PreventedEvaluator:
-    """Return an evaluator of prevented accidents with the same counts (`prevented_accidents`)."""
+    """Build an evaluator of prevented accidents from the counts of a warning evaluator."""
     protocol = getattr(evaluator, "protocol", None)
     if not isinstance(protocol, CleanWarnings):
         raise EvaluationError(
-            "evaluator: prevented accidents need one of warnings, protocol clean, which scores "
-            "whole recordings; "
-            f"found {evaluator!r} with the protocol {type(protocol).__name__}"
+            "evaluator: prevented accidents need an evaluator of warnings with the protocol "
+            f"clean, which scores whole recordings; found {evaluator!r} with the protocol "
+            f"{type(protocol).__name__}"
         )
     counts = evaluator.counts
     frames: dict[str, dict[str, list[int]]] = {}
@@ -148,7 +149,8 @@ def prevention_evaluator(
         sample = counts[token]
         if sample["kind"] in ("accident", UNPLACED):  # notes say why an unplaced one is not judged
             scenario, _, agent = sample["recording"].rpartition("/")
-            frames.setdefault(scenario, {}).setdefault(agent, []).append(sample["frame"])
+            frames_by_agent = frames.setdefault(scenario, {})
+            frames_by_agent.setdefault(agent, []).append(sample["frame"])
     outcomes = accident_outcomes(dataset, frames, **engine)
     prevention = PreventedEvaluator(outcomes, protocol)
     for token in evaluator.tokens:
@@ -161,36 +163,36 @@ def accident_outcomes(
     frames: Mapping[str, FramesByAgent],
     **engine: Unpack[Engine],
 ) -> AccidentOutcomes:
-    """Replay accidents for each frame at which an agent can raise its first alarm.
+    """Replay accidents for each frame in which an agent can raise its first alarm.
 
-    The result is the same to the bit for any number of workers.
+    The results are bit-identical for any number of workers.
 
     Args:
-        dataset: Release with the accidents.
-        frames: Scenario → agent → frame numbers of its samples, for agents with judged alarms.
+        dataset: Release that contains the accidents.
+        frames: Scenario → agent → frame numbers of the agent's samples, for the agents whose alarms
+            are judged.
         **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        TokenError: The release has no such scenario.
-        WorkerError: A worker was killed, or cannot do the work.
+        TokenError: If the release has no such scenario.
+        WorkerError: If a worker was killed, or cannot do the work.
     """
     work = partial(_scenario_outcomes, dataset)
     places = Places(reads=dataset.places)
     scenarios = sorted(frames.items())
-    results = run_unordered(work, scenarios, label="braking", places=places, **engine)
-    parts = list(in_order(results))
+    results = run_unordered(work, scenarios, label="Replaying accidents", places=places, **engine)
     tables: dict[str, OutcomeTable] = {}
-    for part in parts:
-        tables.update(part.tables)
-    return AccidentOutcomes(
-        tables=tables,
-        dropped=tuple(chain.from_iterable(part.dropped for part in parts)),
-        skipped=tuple(chain.from_iterable(part.skipped for part in parts)),
-    )
+    dropped: list[Skipped] = []
+    skipped: list[Skipped] = []
+    for outcomes in in_order(results):
+        tables.update(outcomes.tables)
+        dropped += outcomes.dropped
+        skipped += outcomes.skipped
+    return AccidentOutcomes(tables=tables, dropped=tuple(dropped), skipped=tuple(skipped))
 
 
 def _scenario_outcomes(dataset: Dataset, item: tuple[str, FramesByAgent]) -> AccidentOutcomes:
-    """Return the outcomes of one scenario, given as its token and the frames of its agents."""
+    """Replay one scenario; `item` is its token, and the frame numbers of each agent's samples."""
     scenario, agents = item
     try:
         accident = accident_of(dataset, scenario)
@@ -208,59 +210,69 @@ def _scenario_outcomes(dataset: Dataset, item: tuple[str, FramesByAgent]) -> Acc
         return AccidentOutcomes(dropped=(Skipped(scenario=scenario, reason=reason),))
     agent_frames = [np.array(frames, dtype=np.int64) for frames in agents.values()]
     frame = np.unique(np.concatenate(agent_frames))
-    pair = accident.agents
-    roles = {agent: (pair[0] == agent, pair[1] == agent) for agent in sorted(agents)}
-    table_by_role = {
-        role: _outcome_table(accident, role, frame) for role in dict.fromkeys(roles.values())
-    }
-    tables = {f"{scenario}/{agent}": table_by_role[role] for agent, role in roles.items()}
+    first, second = accident.agents
+    table_by_role: dict[tuple[bool, bool], OutcomeTable] = {}
+    tables = {}
+    for agent in sorted(agents):
+        role = (agent == first, agent == second)
+        if role not in table_by_role:
+            table_by_role[role] = _make_table(accident, role, frame)
+        tables[f"{scenario}/{agent}"] = table_by_role[role]
     return AccidentOutcomes(tables=tables)
 
 
-def _outcome_table(accident: Accident, role: tuple[bool, bool], frame: IntArray) -> OutcomeTable:
-    """Return the table of an agent, given whether it is the first and the second of the pair.
+def _make_table(accident: Accident, role: tuple[bool, bool], frame: IntArray) -> OutcomeTable:
+    """Replay an accident for each possible first alarm of an agent.
 
-    If it is neither, both brake, warned after some latency. A driver warned before the first frame
-    that shows both vehicles brakes from that frame on, at the earliest.
+    If the agent is not one of the two colliders, both brake, after a latency. A driver who is
+    warned before both vehicles appear in the recording brakes from their first common frame.
+
+    Args:
+        accident: The accident.
+        role: Whether the agent is the first collider, and whether it is the second.
+        frame: Frame numbers of possible first alarms, shape (W,).
     """
     seconds = (frame - accident.first_frame) * FRAME_PERIOD
+    first_alarms = np.append(seconds, np.nan)  # NaN for no alarm
     brakers = (True, True)
     latencies: tuple[float, ...] = LATENCIES
     if any(role):
-        brakers, latencies = role, LATENCIES[:1]
-    first_alarms = np.append(seconds, np.nan)
-    outcomes = [
-        outcomes_of(accident, brakers, first_alarms, latency=latency) for latency in latencies
-    ]
+        brakers = role
+        latencies = LATENCIES[:1]
+    outcome = []
+    extrapolated = []
+    for latency in latencies:
+        outcomes = outcomes_of(accident, brakers, first_alarms, latency=latency)
+        outcome.append(outcomes.outcome)
+        extrapolated.append(outcomes.extrapolated)
     return OutcomeTable(
         frame=frame,
-        outcome=np.stack([part.outcome for part in outcomes]).astype(np.int8),
-        extrapolated=np.stack([part.extrapolated for part in outcomes]),
+        outcome=np.stack(outcome).astype(np.int8),
+        extrapolated=np.stack(extrapolated),
         latencies=latencies,
         pedestrian="pedestrian" in accident.categories,
     )
 
 
 class PreventedEvaluator(Evaluator[PreventedResult]):
-    """The counts of a `WarningEvaluator` of the protocol `clean`, scored as prevented accidents.
+    """Evaluator of prevented accidents that counts like `WarningEvaluator` with protocol `clean`.
 
-    `compute` returns a `PreventedResult`. `prevented_accidents` replays the accidents and takes
-    over the counts.
+    `prevention_evaluator` replays the accidents, and copies the counts of a warning evaluator.
     """
 
     protocols = WARNING_PROTOCOLS
     result_class = PreventedResult
 
     def __init__(self, outcomes: AccidentOutcomes, protocol: str | CleanWarnings = "clean") -> None:
-        """Start without samples.
+        """Start without any samples.
 
         Args:
-            outcomes: How each accident ends, by the frame of the first alarm.
-            protocol: `clean`, or your own of its kind.
+            outcomes: Outcomes of each accident, by frame of the first alarm.
+            protocol: `clean`, or a protocol of the same class.
 
         Raises:
-            EvaluationError: The protocol is another one, which has no recordings with scores.
-            ChoiceError: No protocol has that name.
+            EvaluationError: If the protocol does not store scores by recording.
+            ChoiceError: If no protocol has that name.
         """
         super().__init__(protocol)
         if not isinstance(self.protocol, CleanWarnings):
@@ -271,135 +283,123 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
         self._outcomes = outcomes
 
     def update(self, token: str, *arguments: Any) -> None:
-        """Count one sample, as `WarningEvaluator.update` does; raises EvaluationError."""
+        """Count one sample like `WarningEvaluator.update`, with the same EvaluationErrors."""
         warnings = WarningEvaluator(self.protocol)
         warnings.update(token, *arguments)
         self.add(token, warnings.counts[token])
 
     def result_of(self, counts: Collection[Counts]) -> PreventedResult:
-        """Return the figures of counts, in any order, without references and curves."""
-        return self._result(parts_of(counts), references=False)
+        """Compute the figures from counts in any order, without references and curves."""
+        return self._result(split_counts(counts), references=False)
 
     def compute(self, tokens: Iterable[str] | None = None) -> PreventedResult:
-        """Return the figures of all samples, with references and curves; or of some, without."""
+        """Compute the figures of `tokens`; if None, of all samples, with references and curves."""
         if tokens is not None:
             return super().compute(tokens)
-        return self._result(parts_of(list(self._counts.values())), references=True)
+        return self._result(split_counts(list(self._counts.values())), references=True)
 
     def resampled(
         self, parts: Sequence[Sequence[Counts]], times: IntArray
     ) -> Iterator[PreventedResult]:
-        """Yield the result of each draw, without references and curves."""
-        groups = dict(self._recording_groups(recordings_of(parts)))
-        outcomes_by_group = {
-            group: self._alarm_outcomes(recordings, GIVEN) for group, recordings in groups.items()
-        }
+        """Yield the result of each bootstrap draw, without references and curves."""
+        outcomes_by_group = {}
+        for group, recordings in self._recording_groups(recordings_of(parts)):
+            outcomes_by_group[group] = self._alarm_outcomes(recordings, GIVEN_SCORES)
         for draw in times:
-            figures = {
-                group: self._prediction_figures(outcomes, draw)
-                for group, outcomes in outcomes_by_group.items()
-            }
-            yield self._to_result({GIVEN: figures})
+            figures_by_group = {}
+            for group, outcomes in outcomes_by_group.items():
+                figures_by_group[group] = self._prediction_figures(outcomes, draw)
+            yield self._make_result(figures_by_group)
 
     def _result(self, parts: Sequence[Collection[Counts]], *, references: bool) -> PreventedResult:
-        groups = dict(self._recording_groups(recordings_of(parts)))
-        outcomes_by_group = {
-            group: self._alarm_outcomes(recordings, GIVEN) for group, recordings in groups.items()
-        }
-        predictions = {
-            group: self._prediction_figures(outcomes)
-            for group, outcomes in outcomes_by_group.items()
-        }
-        by_predictor = {GIVEN: predictions}
-        if not references:
-            return self._to_result(by_predictor, tuple(self._notes(predictions)))
-        for group, recordings in groups.items():
-            for name, figures in self._reference_figures(recordings):
-                by_predictor.setdefault(name, {})[group] = figures
-        curves = {
-            group: outcomes[self._alarm_kind].curve()
-            for group, outcomes in outcomes_by_group.items()
-        }
-        return self._to_result(by_predictor, tuple(self._notes(predictions)), curves)
+        """Compute the figures of samples, with references and curves if `references` is true."""
+        predictions = {}
+        reference_figures: dict[str, dict[str, PreventionFigures]] = {}
+        curves = {}
+        for group, recordings in self._recording_groups(recordings_of(parts)):
+            outcomes = self._alarm_outcomes(recordings, GIVEN_SCORES)
+            predictions[group] = self._prediction_figures(outcomes)
+            if references:
+                curves[group] = outcomes[self._alarm_kind].curve()
+                for name, figures in self._reference_figures(recordings):
+                    reference_figures.setdefault(name, {})[group] = figures
+        return self._make_result(
+            predictions,
+            references=reference_figures,
+            curves=curves,
+            notes=tuple(self._notes(predictions)),
+        )
 
-    def _to_result(
-        self,
-        by_predictor: Mapping[str, Mapping[str, PreventionFigures]],
-        notes: tuple[str, ...] = (),
-        curves: Mapping[str, PreventionCurve] | None = None,
+    def _make_result(
+        self, groups: Mapping[str, PreventionFigures], **parts: Any
     ) -> PreventedResult:
-        references = {name: groups for name, groups in by_predictor.items() if name != GIVEN}
+        """Return the result with the predictions' figures by group; `parts` has other fields."""
         return PreventedResult(
             operating_by="budget" if self.protocol.threshold is None else "given",
             alarms=self._alarm_kind,
-            groups=by_predictor[GIVEN],
-            references=references,
-            curves=curves or {},
+            groups=groups,
             dropped=self._outcomes.dropped,
             skipped=self._outcomes.skipped,
-            notes=notes,
+            **{"references": {}, "curves": {}, **parts},
         )
 
     @property
     def _alarm_kind(self) -> str:
-        """The kind of alarm that the protocol scores.
-
-        A predictor that names nobody has no right alarms.
-        """
-        return next(
-            kind
-            for kind, (_, scores_of) in _ALARM_KINDS.items()
-            if scores_of == self.protocol.scores_of
-        )
+        """The kind of alarm that the protocol scores: `right` or `any_alarm`."""
+        kinds = {scores_of: kind for kind, (_, scores_of) in _ALARM_KINDS.items()}
+        return kinds[self.protocol.scores_of]
 
     def _recording_groups(
         self, recordings: Sequence[Recording]
     ) -> Iterator[tuple[str, list[Recording]]]:
-        """Yield each group and its recordings; accidents of pedestrians have groups of their own.
+        """Yield each group's name and recordings; accidents with pedestrians form separate groups.
 
-        Recordings without an accident belong to both groups.
+        Recordings without an accident are in both the group and its pedestrian counterpart.
         """
-        tables = self._outcomes.tables
-        for group, members in by_group(recordings):
-            with_pedestrian = {
-                recording.name
-                for recording in members
-                if recording.name in tables and tables[recording.name].pedestrian
-            }
-            yield (
-                group,
-                [recording for recording in members if recording.name not in with_pedestrian],
-            )
-            if with_pedestrian:
-                pedestrian_members = [
-                    recording
-                    for recording in members
-                    if recording.kind != "accident" or recording.name in with_pedestrian
-                ]
+        for group, members in group_recordings(recordings):
+            vehicle_members = []
+            pedestrian_members = []
+            has_pedestrian = False
+            for recording in members:
+                table = self._outcomes.tables.get(recording.name)
+                is_pedestrian = table is not None and table.pedestrian
+                has_pedestrian |= is_pedestrian
+                if not is_pedestrian:
+                    vehicle_members.append(recording)
+                if is_pedestrian or recording.kind != "accident":
+                    pedestrian_members.append(recording)
+            yield group, vehicle_members
+            if has_pedestrian:
                 yield f"{group}{_PEDESTRIAN_SUFFIX}", pedestrian_members
 
     def _alarm_outcomes(
         self, recordings: Sequence[Recording], predictor: str, draw: int = 0
     ) -> Mapping[str, AlarmOutcomes]:
-        """Return the outcomes by kind of alarm, for a predictor's scores of some recordings."""
+        """Return the outcomes in some recordings for each kind of alarm that a predictor raises."""
         tables = self._outcomes.tables
         right = AlarmOutcomes(recordings, predictor, "pair", tables, draw)
-        if predictor in TRIVIAL:
-            return {"right": right, "any_alarm": right}
-        any_alarm = AlarmOutcomes(recordings, predictor, "recording", tables, draw)
+        any_alarm = right
+        if predictor not in TRIVIAL:
+            any_alarm = AlarmOutcomes(recordings, predictor, "recording", tables, draw)
         return {"right": right, "any_alarm": any_alarm}
 
     def _prediction_figures(
         self, outcomes: Mapping[str, AlarmOutcomes], draw: IntArray | None = None
     ) -> PreventionFigures:
-        """Return the figures of the predictions; a recording weighs as often as it is drawn."""
+        """Compute the figures of the predictions.
+
+        Args:
+            outcomes: Outcomes by kind of alarm.
+            draw: How often each group of samples is drawn; None if each is used once.
+        """
         scored = outcomes[self._alarm_kind]
-        if draw is None:
-            weight = np.ones(len(scored.part))
-        else:
-            weight = draw[scored.part].astype(np.float64)
+        weight = np.ones(len(scored.part))
+        if draw is not None:
+            weight *= draw[scored.part]
         quiet = scored.quiet_braking(weight)
-        threshold = quiet if self.protocol.threshold is None else self.protocol.threshold
+        threshold = self.protocol.threshold
+        if threshold is None:
+            threshold = quiet
         return self._figures(outcomes, threshold, quiet, weight)
 
     def _figures(
@@ -409,111 +409,119 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
         quiet: float,
         weight: FloatArray,
     ) -> PreventionFigures:
+        """Compute the figures at one threshold.
+
+        Args:
+            outcomes: Outcomes by kind of alarm.
+            threshold: Lowest score that counts as an alarm.
+            quiet: Lowest threshold whose cost is within the budget.
+            weight: Weight of each recording, shape (N,).
+        """
         scored = outcomes[self._alarm_kind]
-        figures_by_alarm = {kind: part.ends(threshold, weight) for kind, part in outcomes.items()}
         return PreventionFigures(
             threshold=threshold,
             quiet_braking=quiet,
             accidents=int(weight[scored.accident].sum()),
             recordings=int(weight[scored.normal].sum()),
             minutes=scored.minutes(weight),
+            right=outcomes["right"].ends(threshold, weight),
+            any_alarm=outcomes["any_alarm"].ends(threshold, weight),
             lasting=scored.ends(threshold, weight, lasting=True),
-            **figures_by_alarm,
         )
 
     def _reference_figures(
         self, recordings: Sequence[Recording]
     ) -> Iterator[tuple[str, PreventionFigures]]:
-        """Yield each reference predictor and its figures.
+        """Yield the name and figures of each reference predictor.
 
-        A random predictor has the means over its draws, also at the threshold within the budget.
+        The figures of a random predictor are means over its draws: first at its own threshold, then
+        at the threshold of each draw that is within the budget.
         """
         weight = np.ones(len(recordings))
         for predictor in PREDICTORS[1:]:
-            fixed = reference_threshold(predictor)
+            threshold = reference_threshold(predictor)
             if draws_of(predictor) == 1:
                 outcomes = self._alarm_outcomes(recordings, predictor)
-                yield predictor, self._figures(outcomes, fixed, math.nan, weight)
+                yield predictor, self._figures(outcomes, threshold, math.nan, weight)
                 continue
-            draws = [
-                self._alarm_outcomes(recordings, predictor, draw)
-                for draw in range(draws_of(predictor))
-            ]
-            quiet = [outcomes[self._alarm_kind].quiet_braking(weight) for outcomes in draws]
-            variants = ((predictor, [fixed] * len(draws)), (f"{predictor}{_QUIET_SUFFIX}", quiet))
-            for name, thresholds in variants:
-                figures = [
-                    self._figures(*settings, weight)
-                    for settings in zip(draws, thresholds, quiet, strict=True)
-                ]
-                yield name, _mean_figures(figures)
+            figures = []
+            quiet_figures = []
+            for draw in range(draws_of(predictor)):
+                outcomes = self._alarm_outcomes(recordings, predictor, draw)
+                quiet = outcomes[self._alarm_kind].quiet_braking(weight)
+                figures.append(self._figures(outcomes, threshold, quiet, weight))
+                quiet_figures.append(self._figures(outcomes, quiet, quiet, weight))
+            yield predictor, _mean_figures(figures)
+            yield f"{predictor}{_QUIET_SUFFIX}", _mean_figures(quiet_figures)
 
     def _notes(self, groups: Mapping[str, PreventionFigures]) -> Iterator[str]:
+        """Yield the sentences that a reader of the figures needs to know."""
         for group, figures in groups.items():
+            group_name = human_name(group)
             if not figures.accidents:
                 yield (
-                    f"{group}: no accident is judged, so that no share prevented is known; give "
-                    "accident scenarios"
+                    f"{group_name}: no accident can be judged, so the share of prevented accidents "
+                    "is unknown; also evaluate accident scenarios"
                 )
             if not figures.recordings:
                 yield (
-                    f"{group}: no recording without an accident, so that no braking for nothing is "
-                    "known; give some"
+                    f"{group_name}: no recording without an accident, so the braking for false "
+                    "alarms is unknown; also evaluate normal scenarios"
                 )
         if groups:
             yield (
                 "an alarm that is over before the driver brakes costs nothing, but counts as a "
-                "warning: compare with "
-                "'random per frame, quiet', and with the share 'if lasting', where alarms must "
-                "outlast the reaction"
+                "warning: compare with 'random per frame, ≤ 1 s/min', and with the share "
+                "'if lasting', where alarms must outlast the reaction"
             )
         if groups and self.protocol.threshold is None:
             yield (
-                f"the threshold is the lowest with at most {BUDGET:g} braking second a minute on "
-                "these very "
-                "recordings, which flatters; take it from another split, evaluated with "
-                "--prevented: --threshold-from "
-                "BUNDLE --threshold-by braking"
+                f"the threshold is the lowest with at most {BUDGET:g} s of braking per minute on "
+                "these very recordings, so the numbers are too good; take the threshold from "
+                "another split that was evaluated with --prevented: --threshold-from BUNDLE "
+                "--threshold-by braking"
             )
-        for verdict, left_out in (
-            ("the self-check drops", self._outcomes.dropped),
-            ("not judged", self._outcomes.skipped),
-        ):
-            for skipped in left_out:
-                yield f"{verdict} {skipped.scenario}: {skipped.reason}"
+        for dropped in self._outcomes.dropped:
+            yield f"the self-check drops {dropped.scenario}: {dropped.reason}"
+        for skipped in self._outcomes.skipped:
+            yield f"not judged {skipped.scenario}: {skipped.reason}"
 
 
 def _mean_figures(draws: Sequence[PreventionFigures]) -> PreventionFigures:
-    """Return the means over draws, which have no counts."""
-    figures: PreventionFigures = mean_of(draws)
-    replaced: dict[str, Any] = {}
+    """Average figures over draws; counts are left empty."""
+    figures: PreventionFigures = mean_of_records(draws)
+    without_counts: dict[str, Any] = {}
     for kind in (*_ALARM_KINDS, "lasting"):
-        replaced[kind] = {
-            latency: {setting: replace(outcome, counts={}) for setting, outcome in settings.items()}
-            for latency, settings in getattr(figures, kind).items()
-        }
-    return replace(figures, **replaced)
+        by_latency: dict[float, dict[str, Any]] = {}
+        for latency, by_setting in getattr(figures, kind).items():
+            by_latency[latency] = {}
+            for setting, outcome in by_setting.items():
+                by_latency[latency][setting] = replace(outcome, counts={})
+        without_counts[kind] = by_latency
+    return replace(figures, **without_counts)
 
 
 def prevention_tables(prevented: Json) -> list[Table]:
-    """Return two tables for each group of recordings.
+    """Return two tables per group of recordings.
 
-    One compares the predictors at the nominal setting, the other has the predictions at all
+    One compares the predictors at the nominal setting. The other shows the predictions at all
     settings.
     """
     tables = []
+    headings = (*OUTCOMES, "if lasting", *map(heading_name, _LAST_COLUMNS))
     alarms = prevented["alarms"]
     for group, predictions in prevented["groups"].items():
-        figures_by_predictor = {GIVEN: predictions}
-        for name, groups in prevented["references"].items():
-            figures_by_predictor[name] = groups[group]
-        head = (f"{group}, {NOMINAL}", *_COLUMNS)
+        figures_by_predictor = {GIVEN_SCORES: predictions}
+        for name, figures_by_group in prevented["references"].items():
+            figures_by_predictor[name] = figures_by_group[group]
+        group_name = human_name(group)
+        head = (f"{group_name}, {NOMINAL}", *headings)
         predictor_rows = _predictor_rows(alarms, figures_by_predictor)
         notes = tuple(_group_notes(prevented, group, predictions))
         setting_rows = [(name, *_cells(predictions, alarms, setting=name)) for name in SETTINGS]
         tables += [
             Table((head, *predictor_rows), notes),
-            Table(((f"{group}, {GIVEN}", *_COLUMNS), *setting_rows)),
+            Table(((f"{group_name}, {human_name(GIVEN_SCORES)}", *headings), *setting_rows)),
         ]
     return tables
 
@@ -521,15 +529,17 @@ def prevention_tables(prevented: Json) -> list[Table]:
 def _predictor_rows(
     alarms: str, figures_by_predictor: Mapping[str, Json]
 ) -> Iterator[tuple[str, ...]]:
-    """Yield a row for each predictor; the evaluated one also with other alarms and each latency."""
+    """Yield each predictor's row; for the predictions, also rows for latencies and any alarm."""
     for name, figures in figures_by_predictor.items():
-        yield name, *_cells(figures, alarms)
-        if name == GIVEN:
+        row_name = human_name(name)
+        yield row_name, *_cells(figures, alarms)
+        if name == GIVEN_SCORES:
             for latency in figures[alarms]:
                 if latency != _ZERO_LATENCY:
-                    yield f"{name}, {latency} s later", *_cells(figures, alarms, latency)
-            (other,) = _ALARM_KINDS.keys() - {alarms}
-            yield f"{name}, {_ALARM_KINDS[other][0]}", *_cells(figures, other, lasting=None)
+                    yield f"{row_name}, {latency} s later", *_cells(figures, alarms, latency)
+            (other_alarms,) = _ALARM_KINDS.keys() - {alarms}
+            alarm_name, _ = _ALARM_KINDS[other_alarms]
+            yield f"{row_name}, {alarm_name}", *_cells(figures, other_alarms, lasting=None)
 
 
 def _cells(
@@ -539,43 +549,53 @@ def _cells(
     setting: str = NOMINAL,
     lasting: str | None = "lasting",
 ) -> Iterator[str]:
-    """Yield the cells of `_COLUMNS` for one predictor, latency and setting."""
+    """Yield the cells of a row for one predictor at one latency and setting."""
     figures = prediction[alarms][latency][setting]
     avoided = None
     if lasting is not None:
         avoided = prediction[lasting][latency][setting]["shares"][OUTCOMES[0]]
-    yield from map(number_text, (*figures["shares"].values(), avoided))
-    for name in ("warned", "extrapolated", "braking_seconds_per_minute"):
-        yield number_text(figures[name])
+    yield from map(table_number_text, (*figures["shares"].values(), avoided))
+    for name in _LAST_COLUMNS:
+        yield table_number_text(figures[name])
 
 
 def _group_notes(prevented: Json, group: str, predictions: Json) -> Iterator[str]:
-    """Yield what is avoided in a group, and at which threshold."""
-    threshold, quiet = predictions["threshold"], predictions["quiet_braking"]
-    threshold_text = "none" if threshold is None else f"{threshold:.4g}"
+    """Yield notes on the share avoided in a group, and on how the threshold was chosen."""
+    threshold = predictions["threshold"]
+    quiet = predictions["quiet_braking"]
+    threshold_text = "none"
+    if threshold is not None:
+        threshold_text = f"{threshold:.4g}"
     quiet_text = "–" if quiet is None else f"{quiet:.4g}"
-    origin = "given"
+    origin = "as given"
     if prevented["operating_by"] != "given":
-        origin = "at most 1 braking s/min on these recordings"
-    figures = predictions[prevented["alarms"]][_ZERO_LATENCY][NOMINAL]
+        origin = "chosen for at most 1 s of braking per minute on these recordings"
+    alarms = prevented["alarms"]
+    figures = predictions[alarms][_ZERO_LATENCY][NOMINAL]
     lasting = predictions["lasting"][_ZERO_LATENCY][NOMINAL]
-    path = f"groups/{group}/{prevented['alarms']}/{_ZERO_LATENCY}/{NOMINAL}/shares/{OUTCOMES[0]}"
+    avoided = table_number_text(figures["shares"][OUTCOMES[0]])
+    avoided_if_lasting = table_number_text(lasting["shares"][OUTCOMES[0]])
+    cost = table_number_text(figures["braking_seconds_per_minute"])
+    path = f"groups/{group}/{alarms}/{_ZERO_LATENCY}/{NOMINAL}/shares/{OUTCOMES[0]}"
     ends = prevented["intervals"].get(path)
-    interval = "" if not ends or None in ends else f" [{ends[0]:.3f}, {ends[1]:.3f}]"
+    interval = ""
+    if ends and None not in ends:
+        low, high = ends
+        interval = f" [{low:.3f}, {high:.3f}]"
     yield (
-        f"avoided: {number_text(figures['shares'][OUTCOMES[0]])}{interval} of "
-        f"{predictions['accidents']} accidents "
-        f"({number_text(lasting['shares'][OUTCOMES[0]])} by alarms that outlast the reaction), for "
-        f"{number_text(figures['braking_seconds_per_minute'])} braking seconds a minute in "
-        f"{predictions['minutes']:.1f} min "
-        f"of {predictions['recordings']} recordings without an accident"
+        f"avoided: {avoided}{interval} of {counted(predictions['accidents'], 'accident')} "
+        f"({avoided_if_lasting} by alarms that outlast the reaction), at a cost of {cost} s of "
+        f"braking per minute in the {predictions['minutes']:.1f} min of "
+        f"{counted(predictions['recordings'], 'recording')} without an accident"
     )
-    yield f"threshold {threshold_text} ({origin}); for another split: braking {quiet_text}"
+    yield (
+        f"threshold {threshold_text}, {origin}; threshold for another split: braking {quiet_text}"
+    )
 
 
 def _figures(result: PreventedResult) -> Iterator[RunFigure]:
-    """Return the figures of a result, drawn as they are asked for."""
-    # Imported here because it imports matplotlib.
+    """Return the figures of a result; each is only drawn when it is needed."""
+    # A local import, because the module imports matplotlib.
     from deepaccident_devkit.plugins.safety.prevention_figures import prevention_figures
 
     return prevention_figures(result)

@@ -1,15 +1,14 @@
 """How accidents would have ended (`OutcomeTable`), and which of them braking prevents.
 
-`AlarmOutcomes` returns how accidents end for one predictor's scores, as the threshold of an alarm
-moves; `PreventedResult` holds the figures.
+`AlarmOutcomes` computes how accidents end at any threshold on a predictor's scores.
+`PreventedResult` contains the figures.
 """
-
-from __future__ import annotations
 
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import ClassVar, Final
 
 import numpy as np
@@ -38,34 +37,36 @@ from deepaccident_devkit.taxonomy import FRAME_PERIOD
 SETTINGS: Final = tuple(
     f"{braking.reaction:g} s, {braking.deceleration:g} m/s²" for braking in BRAKINGS
 )
-"""Names of the ways of braking, in the order of `BRAKINGS`: reaction time and deceleration."""
+"""Names of the ways of braking (reaction time and deceleration), in the order of `BRAKINGS`."""
 NOMINAL: Final = SETTINGS[BRAKINGS.index(Braking(reaction=1.0, deceleration=6.0))]
-"""The setting of the headline, in the middle of the nine."""
+"""The setting used for the headline; the middle of the nine."""
 BUDGET: Final = 1.0
-"""Braking seconds a minute, on recordings without an accident, that the headline allows."""
+"""Largest cost that the headline allows: braking seconds per minute without an accident."""
 CURVE_ROWS: Final = 101
-"""Largest number of thresholds of a curve, besides the row without an alarm."""
-_NO_FRAME: Final = np.iinfo(np.int64).min
-_REACTIONS: Final = tuple(dict.fromkeys(braking.reaction for braking in BRAKINGS))
-# (K,) index in `_REACTIONS` of each way of braking.
-_REACTION_INDEX: Final = np.array([_REACTIONS.index(braking.reaction) for braking in BRAKINGS])
-_NOMINAL_REACTION: Final = int(_REACTION_INDEX[SETTINGS.index(NOMINAL)])
-# Braking seconds by which a sum of floats may exceed the budget.
-_BUDGET_TOLERANCE_S: Final = 1e-9
+"""Largest number of thresholds on a curve, not counting the row without an alarm."""
+# A number that no frame has.
+_NO_FRAME = np.iinfo(np.int64).min
+# The R distinct reaction times in seconds.
+_REACTIONS = tuple(dict.fromkeys(braking.reaction for braking in BRAKINGS))
+# Index into `_REACTIONS` for each way of braking, shape (K,).
+_REACTION_INDEX = np.array([_REACTIONS.index(braking.reaction) for braking in BRAKINGS])
+_NOMINAL_REACTION = int(_REACTION_INDEX[SETTINGS.index(NOMINAL)])
+# Rounding error in seconds by which a sum of braking seconds may exceed the budget.
+_BUDGET_TOLERANCE_S = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OutcomeTable(FrozenArrays):
-    """How one accident ends for each moment of the first alarm; arrays are read-only.
+    """Outcomes of one accident by the time of the first alarm; arrays are read-only.
 
     Attributes:
         frame: Frame numbers of possible first alarms, shape (W,), int64, ascending.
-        outcome: Indices in `collisions.OUTCOMES`, shape (L, W + 1, K), int8, by latency, first
-            alarm and setting; the last of the W + 1 is the outcome without an alarm.
-        extrapolated: Whether the two touch only after the recording's end, where both go straight
-            on, shape (L, W + 1, K), bool.
-        latencies: L seconds from the alarm to the warning of the drivers that brake.
-        pedestrian: Whether one of the colliding pair is a pedestrian.
+        outcome: Indices into `collisions.OUTCOMES`, shape (L, W + 1, K), int8, by latency, first
+            alarm and setting; the last column (W) is the outcome without an alarm.
+        extrapolated: Whether the two only touch after the recording's end, where both are assumed
+            to go straight on, shape (L, W + 1, K), bool.
+        latencies: The L latencies: seconds from the alarm until the drivers are warned.
+        pedestrian: Whether one of the two colliders is a pedestrian.
     """
 
     frame: IntArray
@@ -75,7 +76,7 @@ class OutcomeTable(FrozenArrays):
     pedestrian: bool = False
 
     def __post_init__(self) -> None:
-        """Check the arrays against each other; raise EvaluationError."""
+        """Raise an EvaluationError if shapes or values of the arrays do not fit together."""
         FrozenArrays.__post_init__(self)
         shape = (len(self.latencies), len(self.frame) + 1, len(BRAKINGS))
         for name in ("outcome", "extrapolated"):
@@ -92,9 +93,9 @@ class OutcomeTable(FrozenArrays):
             )
 
     def rows(self, frames: IntArray) -> IntArray:
-        """Return which of the W + 1 rows a first alarm at each frame has, shape (C,).
+        """Return the index, 0..W, of the first alarm that is raised in each frame, shape (C,).
 
-        Frames without a sample have the last row.
+        Frames without a sample get W, which means no alarm.
         """
         position = np.searchsorted(self.frame, frames)
         has_sample = np.append(self.frame, _NO_FRAME)[position] == frames
@@ -103,14 +104,15 @@ class OutcomeTable(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccidentOutcomes(ShortRepr):
-    """The tables of accidents, and the scenarios without one.
+    """The outcomes of accidents, and the scenarios whose outcomes are unknown.
 
     Attributes:
-        tables: Recording, such as `type1_subtype1_accident/Town03_…/ego_vehicle` → its accident's
-            table, for the drivers that this agent warns.
-        dropped: Scenarios that are not judged, as their labels do not show the two near each other
-            at the impact.
-        skipped: Scenarios with labels or a meta file that do not show how the two move.
+        tables: Recording, such as `type1_subtype1_accident/Town03_…/ego_vehicle` → outcomes of its
+            accident if that agent raises the alarm.
+        dropped: Scenarios that are not judged because their labels do not show the two colliders
+            near each other at the impact.
+        skipped: Scenarios that are not judged because their labels or meta file do not show how the
+            two move.
     """
 
     tables: Mapping[str, OutcomeTable] = field(default_factory=dict)
@@ -120,19 +122,19 @@ class AccidentOutcomes(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutcomeFigures(FrozenMappings):
-    """How the accidents of one group end, for one way of braking and one threshold.
+    """How the accidents of one group end with one way of braking, at one threshold.
 
-    NaN where there is nothing to count.
+    Values are NaN if there is nothing to count.
 
     Attributes:
-        warned: Share of the accidents with an alarm that counts.
-        shares: Class of `collisions.OUTCOMES` → share of the accidents; missed ones end as they
-            were recorded.
-        counts: Class → accidents; empty where the shares are means over draws.
-        extrapolated: Share that touches only after the recording's end, where both are assumed to
-            go straight on; if the replay ended there, these would count as avoided.
-        braking_seconds_per_minute: Cost on recordings without an accident: the length of each run
-            of alarmed frames less the reaction time.
+        warned: Share of the accidents with an alarm that warns a driver.
+        shares: Outcome of `collisions.OUTCOMES` → share of the accidents; accidents without an
+            alarm end as they were recorded.
+        counts: Outcome → number of accidents; empty if the shares are means over draws.
+        extrapolated: Share of the accidents with contact only after the recording's end, if both go
+            straight on; they would count as avoided if the replay ended with the recording.
+        braking_seconds_per_minute: Cost on recordings without an accident, in which each run of
+            alarmed frames costs its length less the reaction time.
     """
 
     warned: float
@@ -148,22 +150,22 @@ FiguresByLatency = Mapping[float, Mapping[str, OutcomeFigures]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreventionFigures(FrozenMappings):
-    """What one predictor's alarms prevent in one group of recordings.
+    """What the alarms of one predictor prevent in one group of recordings.
 
     Attributes:
-        threshold: Lowest score that is an alarm; NaN if unknown, infinite if any alarm costs too
-            much.
-        quiet_braking: Lowest threshold with at most one braking second a minute at a reaction of 1
-            s; to be passed when another split is evaluated.
+        threshold: Lowest score that counts as an alarm; NaN if unknown, infinite if every alarm is
+            too costly.
+        quiet_braking: Lowest threshold that costs at most one braking second per minute at a
+            reaction time of 1 s; pass it when another split is evaluated.
         accidents: Number of judged accidents.
         recordings: Number of recordings without an accident.
-        minutes: Their duration, up to where they count.
+        minutes: Counted duration of these recordings, in minutes.
         right: Figures if the first right alarm warns the drivers.
-        any_alarm: Figures if the very first alarm warns them, even if it names other actors or
-            another moment.
-        lasting: Figures if the first alarm that lasts longer than the reaction warns them. Only
-            such alarms cost anything, so alarms that flicker, such as random ones, prevent nothing
-            for free.
+        any_alarm: Figures if the first alarm warns the drivers, even if it names other actors or
+            another time.
+        lasting: Figures if the first alarm that lasts longer than the reaction time warns the
+            drivers. Shorter alarms cost nothing; here they prevent nothing either, so flickering
+            (such as random) alarms gain nothing for free.
     """
 
     threshold: float
@@ -178,17 +180,14 @@ class PreventionFigures(FrozenMappings):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreventionCurve(FrozenArrays):
-    """Shares prevented against the cost as the threshold falls, without latency.
-
-    The arrays are read-only.
+    """Shares prevented and costs at decreasing thresholds, without latency; read-only arrays.
 
     Attributes:
-        threshold: Thresholds, shape (C,), descending; the first is infinite: no alarm.
-        braking_seconds_per_minute: Cost in the order of `SETTINGS`, shape (C, K); never falls along
-            C.
-        avoided: Share of the accidents that do not happen, shape (C, K).
-        mitigated: Share of the accidents with a change of speed that is smaller by a tenth or more,
-            shape (C, K).
+        threshold: Thresholds, shape (C,), descending; the first is infinite (no alarm).
+        braking_seconds_per_minute: Cost by threshold and setting (`SETTINGS`), shape (C, K); it
+            never decreases along C.
+        avoided: Share of the accidents that are avoided, shape (C, K).
+        mitigated: Share of the accidents whose delta-v falls by at least a tenth, shape (C, K).
     """
 
     threshold: FloatArray
@@ -199,22 +198,22 @@ class PreventionCurve(FrozenArrays):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreventedResult(FrozenMappings):
-    """Prevented accidents, by group (`recordings.GROUPS`).
+    """Prevented accidents by group (`recordings.GROUPS`).
 
-    Accidents of pedestrians are groups of their own.
+    Accidents with a pedestrian are in separate groups.
 
     Attributes:
-        operating_by: `given` threshold, or `budget`: at most one braking second a minute on these
-            very recordings.
-        alarms: `right` or `any_alarm`: the kind of alarm of the headline and the curves.
+        operating_by: `given` if the caller passed the threshold, `budget` if it was chosen on these
+            same recordings to cost at most one braking second per minute.
+        alarms: Kind of alarm used for the headline and the curves, `right` or `any_alarm`.
         groups: Group → figures of the predictions.
-        references: Reference predictor of `recordings.PREDICTORS` (a random one also at its own
-            `quiet_braking`) → group → figures; empty for resamples.
+        references: Reference predictor of `recordings.PREDICTORS` (random ones also at their own
+            `quiet_braking` threshold) → group → figures; empty for resamples.
         curves: Group → curve of the predictions; empty for resamples.
-        dropped: Accidents without a judgement of braking, and why: their labels do not show the two
-            near each other.
-        skipped: Accidents with unknown motion, and why.
-        notes: Sentences that a reader of the numbers should know.
+        dropped: Accidents that are not judged because their labels do not show the two colliders
+            near each other, and the reasons.
+        skipped: Accidents in which the motion is unknown, and the reasons.
+        notes: Sentences that a reader of the figures should know.
     """
 
     rows: ClassVar[tuple[Row, ...]] = (
@@ -233,21 +232,22 @@ class PreventedResult(FrozenMappings):
     notes: tuple[str, ...] = ()
 
     def avoided(self, group: str) -> float:
-        """Return the headline: the share avoided at `NOMINAL` without latency; NaN for none."""
-        by_latency: FiguresByLatency = getattr(self.groups[group], self.alarms)
-        for figures in by_latency.values():
-            return figures[NOMINAL].shares[OUTCOMES[0]]
+        """Return the headline: the share avoided at `NOMINAL` with no latency; NaN if unknown."""
+        figures_by_latency: FiguresByLatency = getattr(self.groups[group], self.alarms)
+        for figures_by_setting in figures_by_latency.values():
+            return figures_by_setting[NOMINAL].shares[OUTCOMES[0]]
         return math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Alarms(FrozenArrays):
-    """The alarms at one threshold.
+    """The alarms at one threshold, for P accidents and M recordings without one.
 
     Attributes:
-        first_column: Column of the first alarm in each accident by reaction, shape (P, R).
-        lasting_column: Column of the first alarm that lasts longer than the reaction, shape (P, R).
-        seconds: Braking seconds in the recordings without an accident, shape (R, M).
+        first_column: Column of the scores at which the first alarm is raised, by accident and
+            reaction time, shape (P, R).
+        lasting_column: Columns of the first alarm that lasts longer than the reaction time.
+        seconds: Braking seconds by reaction time and accident-free recording, shape (R, M).
     """
 
     first_column: IntArray
@@ -256,15 +256,15 @@ class _Alarms(FrozenArrays):
 
 
 class AlarmOutcomes:
-    """One predictor's scores of a group of recordings, with the outcomes of its accidents.
+    """Outcomes of accidents at any threshold on a predictor's scores, for N recordings.
 
-    Every method takes weights of the recordings, so that resamples can be evaluated.
+    The methods take weights of the recordings, so that resamples can be evaluated.
 
     Attributes:
-        part: Group of samples of each recording, shape (N,).
-        accident: Rows of the judged accidents, shape (P,).
-        normal: Rows of the recordings without an accident, shape (M,).
-        levels: All different scores, ascending: the possible thresholds.
+        part: Index of the group of samples that each recording is in, shape (N,).
+        accident: Indices of the recordings with a judged accident, shape (P,).
+        normal: Indices of the recordings without an accident, shape (M,).
+        levels: The distinct scores, ascending; these are the possible thresholds.
     """
 
     def __init__(
@@ -275,7 +275,16 @@ class AlarmOutcomes:
         outcomes: Mapping[str, OutcomeTable],
         draw: int = 0,
     ) -> None:
-        """Prepare what figures at any threshold need; accidents without a table are not judged."""
+        """Collect the scores and outcomes.
+
+        Args:
+            recordings: The recordings.
+            predictor: Name of the predictor.
+            scores_of: Kind of scores to use.
+            outcomes: Recording → outcomes of its accident; accidents without an entry
+                are not judged.
+            draw: Index of the draw, for a random predictor.
+        """
         self._series = series_of(recordings, predictor, scores_of, draw)
         self.part = np.array([recording.part for recording in recordings], dtype=np.int64)
         is_judged = [
@@ -291,9 +300,10 @@ class AlarmOutcomes:
         accidents = [recordings[row] for row in self.accident.tolist()]
         tables = [outcomes[recording.name] for recording in accidents]
         self._latencies = tables[0].latencies if tables else (0.0,)
-        outcome, extrapolated = [], []
+        outcome = []
+        extrapolated = []
         for table, recording in zip(tables, accidents, strict=True):
-            rows = table.rows(self._frames(recording))
+            rows = table.rows(self._frame_numbers(recording))
             outcome.append(table.outcome[:, rows])
             extrapolated.append(table.extrapolated[:, rows])
         columns = self._series.scores.shape[1] + 1
@@ -303,17 +313,20 @@ class AlarmOutcomes:
         self._alarms_by_threshold: dict[float, _Alarms] = {}
 
     def __repr__(self) -> str:
-        accidents, normal = len(self.accident), len(self.normal)
-        return f"AlarmOutcomes({accidents:,} accidents, {normal:,} others, {self._series!r})"
+        """Return the numbers of accidents and of other recordings, and the kind of scores."""
+        accidents = len(self.accident)
+        others = len(self.normal)
+        return f"AlarmOutcomes({accidents:,} accidents, {others:,} others, {self._series!r})"
 
     def minutes(self, weight: FloatArray) -> float:
-        """Return the weighted duration of the recordings without an accident."""
-        return float((self._seconds * weight[self.normal]).sum()) / MINUTE
+        """Return the weighted duration of the recordings without an accident, in minutes."""
+        seconds = (self._seconds * weight[self.normal]).sum()
+        return float(seconds) / MINUTE
 
     def costs(self, threshold: float, weight: FloatArray) -> FloatArray:
-        """Return the braking seconds a minute of each setting, shape (K,).
+        """Return the braking seconds per minute at each setting, shape (K,).
 
-        NaN if every recording has an accident.
+        All are NaN if every recording has an accident.
         """
         minutes = self.minutes(weight)
         seconds = self._alarms_at(threshold).seconds @ weight[self.normal]
@@ -321,10 +334,10 @@ class AlarmOutcomes:
         return np.asarray(by_reaction[_REACTION_INDEX])
 
     def quiet_braking(self, weight: FloatArray) -> float:
-        """Return the lowest threshold within the budget at the nominal reaction.
+        """Return the lowest threshold that is within the budget at the nominal reaction time.
 
-        Infinite if there is none, NaN without recordings to measure the cost. A higher threshold
-        only splits and shortens runs of alarmed frames, so the cost never rises with it.
+        It is infinite if no threshold is, and NaN if no recording shows the cost. The cost never
+        rises with the threshold: a higher one only splits and shortens runs of alarmed frames.
         """
         minutes = self.minutes(weight)
         if not minutes:
@@ -332,23 +345,24 @@ class AlarmOutcomes:
         max_seconds = BUDGET * minutes + _BUDGET_TOLERANCE_S
 
         def is_quiet(threshold: float) -> int:
+            """Return 1 if a threshold is within the budget, otherwise 0."""
             by_recording = self._alarms_at(threshold).seconds[_NOMINAL_REACTION]
-            return int(float(by_recording @ weight[self.normal]) <= max_seconds)
+            seconds = float(by_recording @ weight[self.normal])
+            return int(seconds <= max_seconds)
 
-        position = bisect_left(self.levels.tolist(), 1, key=is_quiet)
-        if position < len(self.levels):
-            return float(self.levels[position])
-        return math.inf
+        levels: list[float] = [*self.levels.tolist(), math.inf]
+        position = bisect_left(levels, 1, hi=len(self.levels), key=is_quiet)
+        return levels[position]
 
     def ends(
         self, threshold: float, weight: FloatArray, *, lasting: bool = False
     ) -> FiguresByLatency:
-        """Return the figures at a threshold, by latency and setting; all NaN at NaN.
+        """Return the figures at a threshold by latency and setting; all NaN if `threshold` is NaN.
 
         Args:
-            threshold: Lowest score that is an alarm.
-            weight: Weights of the recordings, shape (N,).
-            lasting: Whether only alarms that outlast the reaction time warn.
+            threshold: Lowest score that counts as an alarm.
+            weight: Weight of each recording, shape (N,).
+            lasting: Whether only alarms that last longer than the reaction time warn the drivers.
         """
         is_unknown = math.isnan(threshold)
         alarms = self._alarms_at(math.inf if is_unknown else threshold)
@@ -360,21 +374,17 @@ class AlarmOutcomes:
             costs = self.costs(threshold, weight)
         has_alarm = columns < self._series.scores.shape[1]
         warned_by_reaction = (accident_weight[:, None] * has_alarm).sum(axis=0)
-        warned = warned_by_reaction[_REACTION_INDEX].tolist()
+        warned = warned_by_reaction[_REACTION_INDEX]
         total = float(accident_weight.sum())
-        by_latency: dict[float, dict[str, OutcomeFigures]] = {}
+        figures_by_latency: dict[float, dict[str, OutcomeFigures]] = {}
         for index, latency in enumerate(self._latencies):
-            sums, extrapolated = self._sums(index, columns, accident_weight)
-            by_latency[latency] = {
-                setting: _figures(
-                    sums[row], float(extrapolated[row]), warned[row], total, float(costs[row])
-                )
-                for row, setting in enumerate(SETTINGS)
-            }
-        return by_latency
+            sums, extrapolated = self._sum_outcomes(index, columns, accident_weight)
+            figures = map(_make_figures, sums, extrapolated, warned, costs, repeat(total))
+            figures_by_latency[latency] = dict(zip(SETTINGS, figures, strict=True))
+        return figures_by_latency
 
     def curve(self) -> PreventionCurve:
-        """Return the curve over all different thresholds, or over some of them spread evenly."""
+        """Compute the curve over all possible thresholds, or over `CURVE_ROWS` of them if more."""
         weight = np.ones(len(self.part))
         positions = np.linspace(0, len(self.levels) - 1, CURVE_ROWS)
         rows = np.unique(np.rint(positions).astype(np.int64))
@@ -383,31 +393,36 @@ class AlarmOutcomes:
             levels += self.levels[rows][::-1].tolist()
         accident_weight = weight[self.accident]
         sums = []
+        costs = []
         for level in levels:
-            class_sums, _ = self._sums(0, self._alarms_at(level).first_column, accident_weight)
-            sums.append(class_sums)
+            columns = self._alarms_at(level).first_column
+            outcome_sums, _ = self._sum_outcomes(0, columns, accident_weight)
+            sums.append(outcome_sums)
+            costs.append(self.costs(level, weight))
         shares = np.array(sums) / (len(accident_weight) or math.nan)
         return PreventionCurve(
             threshold=np.array(levels),
-            braking_seconds_per_minute=np.array([self.costs(level, weight) for level in levels]),
+            braking_seconds_per_minute=np.array(costs),
             avoided=shares[:, :, OUTCOMES.index("avoided")],
             mitigated=shares[:, :, OUTCOMES.index("mitigated")],
         )
 
-    def _frames(self, recording: Recording) -> IntArray:
+    def _frame_numbers(self, recording: Recording) -> IntArray:
         """Return the frame number of each column of the scores, shape (T + 1,).
 
-        The column after the last one has −1, which is no frame.
+        The additional last column means no alarm; its value is −1.
         """
         step = round(1 / (self._series.fps * FRAME_PERIOD))
-        return np.append(recording.frame[0] + step * np.arange(self._series.scores.shape[1]), -1)
+        columns = np.arange(self._series.scores.shape[1])
+        return np.append(recording.frame[0] + step * columns, -1)
 
     def _alarms_at(self, threshold: float) -> _Alarms:
-        """Return the alarms at a threshold, which are cached."""
+        """Return the alarms at a threshold; the result is cached."""
         if threshold not in self._alarms_by_threshold:
-            alarm, fps = self._scores >= threshold, self._series.fps
-            accident_runs = AlarmRuns.of(alarm[self.accident], fps)
-            normal_runs = AlarmRuns.of(alarm[self.normal], fps)
+            fps = self._series.fps
+            is_alarm = self._scores >= threshold
+            accident_runs = AlarmRuns.of(is_alarm[self.accident], fps)
+            normal_runs = AlarmRuns.of(is_alarm[self.normal], fps)
             first_column = self._series.first(np.array([threshold]))[self.accident]
             lasting_columns = [accident_runs.first_lasting(reaction) for reaction in _REACTIONS]
             seconds = [normal_runs.braking_seconds(reaction) for reaction in _REACTIONS]
@@ -418,12 +433,12 @@ class AlarmOutcomes:
             )
         return self._alarms_by_threshold[threshold]
 
-    def _sums(
+    def _sum_outcomes(
         self, latency_index: int, columns: IntArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the weights of the accidents by setting and class, and of the extrapolated ones.
+        """Sum the weights of accidents by setting and outcome, and of extrapolated contacts.
 
-        Shapes are (K, C) and (K,).
+        The shapes are (K, 5) and (K,).
         """
         index = (
             np.arange(len(self.accident))[:, None],
@@ -433,22 +448,36 @@ class AlarmOutcomes:
         )
         codes = self._outcome[index]
         column_weight = weight[:, None]
-        sums = [((codes == code) * column_weight).sum(axis=0) for code in range(len(OUTCOMES))]
+        sums = []
+        for code in range(len(OUTCOMES)):
+            has_outcome = codes == code
+            sums.append((has_outcome * column_weight).sum(axis=0))
         extrapolated = (self._extrapolated[index] * column_weight).sum(axis=0)
         return np.stack(sums, axis=1), extrapolated
 
 
-def _figures(
-    sums: FloatArray, extrapolated: float, warned: float, accidents: float, cost: float
+def _make_figures(
+    sums: FloatArray, extrapolated: float, warned: float, cost: float, accidents: float
 ) -> OutcomeFigures:
-    by_class = {name: float(value) for name, value in zip(OUTCOMES, sums, strict=True)}
-    counts: dict[str, int] = {}
-    if not math.isnan(accidents):
-        counts = {name: round(value) for name, value in by_class.items()}
+    """Turn weighted sums into the figures for one way of braking.
+
+    Args:
+        sums: Summed weight of the accidents by outcome, shape (5,).
+        extrapolated: Summed weight of the accidents with contact only after the recording's end.
+        warned: Summed weight of the accidents with an alarm.
+        cost: Braking seconds per minute.
+        accidents: Summed weight of all accidents.
+    """
+    shares = {}
+    counts = {}
+    for name, value in zip(OUTCOMES, sums.tolist(), strict=True):
+        shares[name] = ratio(value, accidents)
+        if not math.isnan(accidents):
+            counts[name] = round(value)
     return OutcomeFigures(
-        warned=ratio(warned, accidents),
-        shares={name: ratio(value, accidents) for name, value in by_class.items()},
+        warned=ratio(float(warned), accidents),
+        shares=shares,
         counts=counts,
-        extrapolated=ratio(extrapolated, accidents),
-        braking_seconds_per_minute=cost,
+        extrapolated=ratio(float(extrapolated), accidents),
+        braking_seconds_per_minute=float(cost),
     )

@@ -1,14 +1,20 @@
-"""`safety_report`: all that is known of a release's accidents, with a row for each."""
+"""`safety_report`: everything that is known about a release's accidents, one row per accident."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.collisions.outcomes import BRAKINGS
-from deepaccident_devkit.collisions.recorded import Skipped, each_scenario, those_of, tried
+from deepaccident_devkit.collisions.recorded import (
+    Skipped,
+    map_scenarios,
+    select_results,
+    try_scenario,
+)
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.descriptions.avoidability import BRAKERS, Avoidability
 from deepaccident_devkit.descriptions.observation import ObservationRule
@@ -33,7 +39,7 @@ from deepaccident_devkit.plugins.safety.twins import (
     diff_of_accident,
     twins_of,
 )
-from deepaccident_devkit.support.arrays import ShortRepr, known
+from deepaccident_devkit.support.arrays import ShortRepr, json_numbers
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 
@@ -46,14 +52,15 @@ if TYPE_CHECKING:
 
 # Time to collision in seconds below which a pair counts as exposed.
 CRITICAL_TTC: Final = InteractionConfig().taus[0]
-# Decelerations in m/s² of the last moments to brake.
+# Decelerations in m/s² for which the last moment to brake is listed.
 DECELERATIONS: Final = tuple(sorted({braking.deceleration for braking in BRAKINGS}))
-_SIDES: Final = ("first", "second")
-_COLLIDER_COLUMNS: Final = ("actor_id", "category", "agent", "turn", "speed", "side", "delta_v")
+
+_COLLIDER_COLUMNS = ("actor_id", "category", "agent", "turn", "speed", "side", "delta_v")
 # Columns of the CSV file.
 ROW_HEADING: Final = (
     "scenario",
-    *(f"{side}_{name}" for side in _SIDES for name in _COLLIDER_COLUMNS),
+    *(f"first_{name}" for name in _COLLIDER_COLUMNS),
+    *(f"second_{name}" for name in _COLLIDER_COLUMNS),
     *("gap", "closing_speed", "impact_angle", "margin", "head_on", "time_exposed", "pet"),
     *(f"lead_{agent}" for agent in AGENTS),
     "lead_all",
@@ -66,9 +73,9 @@ ROW_HEADING: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairMeasures:
-    """Measures of the colliders over the recording; None for unknown values.
+    """How near two colliders come during the recording; None for unknown values.
 
-    Their smallest time to collision is left out: it is 0 where they touch.
+    The smallest time to collision is left out because it is 0 for colliders that touch.
 
     Attributes:
         time_exposed: Seconds with a time to collision of at most `CRITICAL_TTC`.
@@ -80,28 +87,28 @@ class PairMeasures:
 
     @classmethod
     def of(cls, pairs: InteractionPairs, first: int, second: int) -> PairMeasures | None:
-        """Return the measures of two actors in `interactions(…).pairs`.
+        """Return the measures of two actors from `interactions(…).pairs`.
 
-        None if the two never come under a threshold there.
+        Return None if the actors are not among the pairs because they never come near enough.
         """
         index = pairs.position(first, second)
         if index is None:
             return None
-        time_exposed, pet = known(pairs.tet[index, 0], 2), known(abs(pairs.pet[index]), 2)
-        return cls(time_exposed=time_exposed, pet=pet)
+        pet = abs(pairs.pet[index])
+        return cls(time_exposed=json_numbers(pairs.tet[index, 0], 2), pet=json_numbers(pet, 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccidentRow(ShortRepr):
-    """An accident.
+    """Everything that is known about one accident.
 
     Attributes:
-        story: Its facts, and sentences about them.
-        replayed: Until when braking would have avoided it; None if the recording does not show it.
-        times: How long before the impact sets of agents observed both colliders; None if the ego
-            has no labels.
-        twin: Where it parts from its twin; None without a twin.
-        measures: Measures of the colliders over the recording.
+        story: Facts, and sentences about them.
+        replayed: Replay that shows how late braking could still have avoided the accident; None if
+            the recording does not show the impact.
+        times: Lead times of sets of agents; None if the ego has no labels.
+        twin: Comparison with the twin; None without a twin.
+        measures: How near the colliders come during the recording.
     """
 
     story: Story
@@ -117,7 +124,7 @@ class AccidentRow(ShortRepr):
 
     @property
     def colliders(self) -> list[dict[str, Any]]:
-        """The two colliders, as facts of the story."""
+        """Facts about the two colliders."""
         return list(self.story.facts["accident"]["pair"])
 
     @property
@@ -127,25 +134,31 @@ class AccidentRow(ShortRepr):
 
     @property
     def severity(self) -> float:
-        """The larger delta-v of the two, m/s; −1 if neither is known."""
-        values = [collider["delta_v"] for collider in self.colliders]
-        return max((value for value in values if value is not None), default=-1.0)
+        """The larger delta-v of the two colliders in m/s; −1 if neither is known."""
+        severity = -1.0
+        for collider in self.colliders:
+            if collider["delta_v"] is not None:
+                severity = max(severity, collider["delta_v"])
+        return severity
 
     @property
     def leads(self) -> dict[str, float | None]:
-        """Agent → seconds before the impact at which it first observes both; then `all`.
+        """Seconds before the impact at which each agent, and finally `all`, first observes both.
 
-        None for an agent without an observation.
+        None for an agent that never observes both.
         """
-        lead_by_agent = self.story.facts["accident"]["seen"]
-        together = None if self.times is None else round(self.times.together, 1)
-        return {**{agent: lead_by_agent.get(agent) for agent in AGENTS}, "all": together}
+        seen = self.story.facts["accident"]["seen"]
+        leads: dict[str, float | None] = {agent: seen.get(agent) for agent in AGENTS}
+        leads["all"] = None
+        if self.times is not None:
+            leads["all"] = round(self.times.together, 1)
+        return leads
 
     @property
     def brakes(self) -> list[str | None]:
-        """The drivers that brake in `last_moments`: only the ego if it collides, otherwise both.
+        """The drivers who brake in `last_moments`: the ego if it is a collider, otherwise both.
 
-        None for a driver that is no agent.
+        None for a driver that is not an agent.
         """
         braking = self.story.facts["accident"]["braking"]
         if braking is None:
@@ -154,30 +167,35 @@ class AccidentRow(ShortRepr):
 
     @property
     def last_moments(self) -> dict[float, float | None]:
-        """Deceleration → last seconds before the impact to brake and avoid it; None if too late."""
+        """Deceleration → last moment at which braking avoids the accident, in seconds before it.
+
+        None if braking cannot avoid it even from the start of the recording.
+        """
         if self.replayed is None:
             return {}
         row = BRAKERS.index("both")
         if len(self.brakes) == 1:
             row = self.replayed.accident.agents.index("ego_vehicle")
-        decelerations, slacks = self.replayed.decelerations, self.replayed.slack[row]
-        return {
-            deceleration: known(slack, 2)
-            for deceleration, slack in zip(decelerations.tolist(), slacks.tolist(), strict=True)
-        }
+        decelerations = self.replayed.decelerations.tolist()
+        moments = json_numbers(self.replayed.slack[row], 2)
+        return dict(zip(decelerations, moments, strict=True))
 
     @property
     def parts(self) -> float | None:
-        """Seconds before the impact at which the first actor acts differently in the twin.
+        """Seconds before the impact when the first actor begins to act differently in the twin.
 
-        None if no actor does.
+        None if no actor does, or if there is no twin.
         """
-        return None if self.twin is None else known(self.twin.to_dict()["time_to_impact"], 1)
+        if self.twin is None:
+            return None
+        seconds: float | None = json_numbers(self.twin.to_dict()["time_to_impact"], 1)
+        return seconds
 
     def to_dict(self) -> dict[str, Any]:
         """Return the values for JSON; None for unknown values."""
         accident = self.story.facts["accident"]
-        replayed, measures = self.replayed, self.measures
+        replayed = self.replayed
+        measures = self.measures
         return {
             "scenario": self.scenario,
             "colliders": self.colliders,
@@ -188,7 +206,9 @@ class AccidentRow(ShortRepr):
             "pet": None if measures is None else measures.pet,
             "leads": self.leads,
             "brakes": self.brakes,
-            "last_moments": {f"{key:g}": value for key, value in self.last_moments.items()},
+            "last_moments": {
+                f"{deceleration:g}": moment for deceleration, moment in self.last_moments.items()
+            },
             "twin": None if self.twin is None else self.twin.twin,
             "twin_parts": self.parts,
             "story": self.story.text,
@@ -197,7 +217,7 @@ class AccidentRow(ShortRepr):
 
 
 def actor_name(actor: Mapping[str, Any]) -> str:
-    """Return the name of an actor of a story: `ego (car)`, or `cyclist 1234` if it is no agent."""
+    """Name a story's actor: `ego (car)`, or `cyclist 1234` if it is not an agent."""
     category = actor["category"] or "road user"
     if actor["agent"]:
         return f"{short_name(actor['agent'])} ({category})"
@@ -205,9 +225,11 @@ def actor_name(actor: Mapping[str, Any]) -> str:
 
 
 def csv_row(row: AccidentRow) -> list[Any]:
-    """Return the cells of `ROW_HEADING`."""
+    """Return an accident's cells in the CSV file, in the order of `ROW_HEADING`."""
     payload = row.to_dict()
-    colliders = [collider[name] for collider in row.colliders for name in _COLLIDER_COLUMNS]
+    colliders: list[Any] = []
+    for collider in row.colliders:
+        colliders += map(collider.get, _COLLIDER_COLUMNS)
     measures = ("gap", "closing_speed", "impact_angle", "margin", "head_on", "time_exposed", "pet")
     moments = [row.last_moments.get(deceleration) for deceleration in DECELERATIONS]
     brakes = " ".join(agent or "none" for agent in row.brakes)
@@ -220,18 +242,18 @@ def csv_row(row: AccidentRow) -> list[Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyReport(Report):
-    """The accidents of a release, or of some of its scenarios, in all respects.
+    """Everything that is known about the accidents of a release, or of some of its scenarios.
 
     Attributes:
         scenarios: Number of examined scenarios.
-        rows: One row for each accident, in the order of the release, also if it cannot be replayed.
-        avoidability: Until when braking would have avoided them.
-        ledger: Lead times: which agents observed the colliders first.
-        twins: Where they part from their normal twins.
-        normal: Stories of the scenarios that end without a collision, the most critical first, by
-            the smallest time to collision of two moving actors; stories without such a time come
-            last.
-        broken: Scenarios that the index leaves out (`on_error='skip'`), of the entire release.
+        rows: One row per accident, in the order of the release; this includes accidents that cannot
+            be replayed.
+        avoidability: Report on how late braking could still have avoided them.
+        ledger: Lead times, which show which agents observed the colliders first.
+        twins: Comparison with their normal twins.
+        normal: Stories of the scenarios that end without a collision, sorted by the smallest time
+            to collision between two moving actors; stories in which it is undefined come last.
+        broken: Scenarios of the entire release that the index leaves out (`on_error='skip'`).
     """
 
     scenarios: int
@@ -254,12 +276,11 @@ class SafetyReport(Report):
 
     @property
     def left_out(self) -> list[tuple[str, str, str]]:
-        """Scenario, the parts that leave it out, and the reason; each reason once."""
-        unknown_facts = [
-            Skipped(scenario=story.facts["scenario"], reason=reason)
-            for story in self.normal
-            for reason in story.facts["unknown"]
-        ]
+        """Scenarios that are left out, the part of the report that omits each, and the reason."""
+        unknown_facts = []
+        for story in self.normal:
+            for reason in story.facts["unknown"]:
+                unknown_facts.append(Skipped(scenario=story.facts["scenario"], reason=reason))
         parts = {
             "braking: dropped": self.avoidability.dropped,
             "braking: skipped": self.avoidability.skipped,
@@ -297,7 +318,7 @@ class SafetyReport(Report):
         }
 
     def named_tables(self) -> dict[str, Iterable[Row]]:
-        """Return `accidents`, a row for each (metres, seconds, m/s, degrees), and `left_out`."""
+        """Return the tables `accidents` (metres, seconds, m/s, degrees) and `left_out`."""
         return {
             "accidents": [ROW_HEADING, *map(csv_row, self.rows)],
             "left_out": [("scenario", "part", "reason"), *self.left_out],
@@ -306,7 +327,7 @@ class SafetyReport(Report):
 
 @dataclass(frozen=True, slots=True)
 class _Examination:
-    """The results for one scenario; Skipped explains a missing one, None means no accident."""
+    """The results for one scenario; None if it has no accident, Skipped if a result failed."""
 
     replayed: Avoidability | Skipped | Dropped | None
     times: LeadTimes | Skipped | None
@@ -320,9 +341,9 @@ def safety_report(
     scenarios: Iterable[RowArgument] | None = None,
     **engine: Unpack[Engine],
 ) -> SafetyReport:
-    """Return last moments to brake, lead times, twins and stories of scenarios.
+    """Report last moments to brake, lead times, twins and stories of scenarios.
 
-    Each accident is replayed once.
+    Each accident is replayed only once.
 
     Args:
         dataset: The release.
@@ -330,17 +351,17 @@ def safety_report(
         **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
 
     Raises:
-        TokenError: There is no such scenario.
+        TokenError: If the release has no such scenario.
     """
-    results = each_scenario(_examine, dataset, scenarios, label="safety", at_once=1, **engine)
-    examinations = those_of(_Examination, results)
-    replays, times, twins, normal = [], [], [], []
-    for examination in examinations:
-        replays.append(examination.replayed)
-        times.append(examination.times)
-        twins.append(examination.twin)
-        if examination.story.facts["collision"] is False:
-            normal.append(examination.story)
+    results = map_scenarios(
+        _examine, dataset, scenarios, label="Examining accidents", at_once=1, **engine
+    )
+    examinations = select_results(_Examination, results)
+    replays = [examination.replayed for examination in examinations]
+    times = [examination.times for examination in examinations]
+    twins = [examination.twin for examination in examinations]
+    stories = [examination.story for examination in examinations]
+    normal = [story for story in stories if story.facts["collision"] is False]
     broken = [
         Skipped(scenario=problem.scenario, reason=" ".join(problem.messages))
         for problem in dataset.problems
@@ -357,7 +378,10 @@ def safety_report(
 
 
 def _examine(dataset: Dataset, record: ScenarioRecord) -> _Examination:
-    replayed: Avoidability | Dropped | Skipped | None = tried(replay_accident, dataset, record)
+    """Compute all results for one scenario."""
+    replayed: Avoidability | Dropped | Skipped | None = try_scenario(
+        replay_accident, dataset, record
+    )
     replay = replayed.why if isinstance(replayed, Dropped) else replayed
     facts = scenario_facts(dataset, record, replay)
     measures = None
@@ -367,18 +391,21 @@ def _examine(dataset: Dataset, record: ScenarioRecord) -> _Examination:
         measures = PairMeasures.of(pairs, *actor_ids)
     return _Examination(
         replayed=replayed,
-        times=tried(lead_times, dataset, record),
-        twin=tried(partial(diff_of_accident, parting=Parting()), dataset, record),
+        times=try_scenario(lead_times, dataset, record),
+        twin=try_scenario(partial(diff_of_accident, parting=Parting()), dataset, record),
         story=Story(facts=facts, text=story_text(facts)),
         measures=measures,
     )
 
 
 def _accident_rows(examinations: Iterable[_Examination]) -> Iterator[AccidentRow]:
+    """Yield a row for each examined scenario that has an accident."""
     for examination in examinations:
         if examination.story.facts["accident"] is None:
             continue
-        replayed, times, twin = examination.replayed, examination.times, examination.twin
+        replayed = examination.replayed
+        times = examination.times
+        twin = examination.twin
         yield AccidentRow(
             story=examination.story,
             replayed=replayed if isinstance(replayed, Avoidability) else None,
@@ -389,6 +416,9 @@ def _accident_rows(examinations: Iterable[_Examination]) -> Iterator[AccidentRow
 
 
 def _urgency(story: Story) -> tuple[float, str]:
+    """Return a key that sorts stories by smallest time to collision, then by scenario."""
+    min_ttc = math.inf
     nearest = story.facts["nearest"]
-    min_ttc = None if nearest is None else nearest["min_ttc"]
-    return float("inf") if min_ttc is None else min_ttc, story.facts["scenario"]
+    if nearest is not None and nearest["min_ttc"] is not None:
+        min_ttc = nearest["min_ttc"]
+    return min_ttc, story.facts["scenario"]

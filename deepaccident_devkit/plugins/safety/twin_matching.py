@@ -1,9 +1,7 @@
-"""Matching of a recording to its twin: which frames and actors correspond.
+"""Which frames and actors of a recording correspond to which of its twin.
 
-The clocks and the ids of the two recordings may differ.
+The two recordings may start at different times, and give the same actor different ids.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,35 +17,35 @@ from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 MatchedBy = Literal["agent", "id", "start"]
-# Largest distance in metres, at the first frame that shows both, of two actors of one class that
-# may be the same actor.
+# Actors of one class can only be the same actor if they are at most this many metres apart in
+# the first frame that shows both.
 START_DISTANCE: Final = 2.0
-# Largest number of frames by which one recording may begin later than the other.
+# Largest number of frames by which one recording may start later than the other.
 MAX_SHIFT: Final = 20
-# Number of frames at the beginning that decide the shift.
-_COMPARED_FRAMES: Final = 20
-# Distance in metres at which the cost of an agent is capped: farther away, it goes its own way.
-_DISTANCE_CAP_M: Final = 2.0
-# Improvement of the mean distance in metres that a larger shift must bring.
-_MIN_IMPROVEMENT_M: Final = 0.01
-# Smallest number of agents with equal ids for which equal ids mean the same actors.
-_MIN_COMMON_AGENTS: Final = 2
+# Number of frames at the start that determine the shift.
+_COMPARED_FRAMES = 20
+# Distance in metres at which an agent's cost is capped; beyond it, the agent takes another path.
+_DISTANCE_CAP_M = 2.0
+# Reduction of the mean distance that a larger shift must achieve.
+_MIN_IMPROVEMENT_M = 0.01
+# Fewest agents with equal ids from which equal ids are taken to mean equal actors.
+_MIN_COMMON_AGENTS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TwinRecording(FrozenArrays):
-    """The N actors of a scenario over its F frames, from all agents' labels.
+    """The N actors of a scenario over its F frames, from the labels of all agents.
 
-    Poses are in the world frame, metres, radians.
+    Poses are in the world frame, in metres and radians.
 
     Attributes:
         scenario: Token of the scenario.
         actor_id: CARLA ids, shape (N,), ascending.
         category: Indices in `taxonomy.CATEGORIES`, shape (N,).
-        size: Length, width, height by the last label, shape (N, 3).
-        poses: x, y, yaw, shape (N, F, 3); NaN at frames at which nobody annotated the actor.
+        size: Length, width and height from the actor's last label, shape (N, 3).
+        poses: x, y, yaw, shape (N, F, 3); NaN in frames in which no agent annotated the actor.
         speeds: Speeds over the ground in m/s, shape (N, F); NaN likewise.
-        agents: Vehicles that record → their ids, as far as meta names them.
+        agents: Name of each recording vehicle → its id, where the meta file states it.
     """
 
     scenario: str
@@ -60,29 +58,32 @@ class TwinRecording(FrozenArrays):
 
 
 def twin_recording(dataset: Dataset, scenario: str) -> TwinRecording:
-    """Return a scenario's actors as arrays.
+    """Collect the actors of a scenario as arrays.
 
     Raises:
-        TokenError: There is no such scenario.
-        NotAvailableError: The scenario has no labels.
+        TokenError: If the release has no such scenario.
+        NotAvailableError: If the scenario has no labels.
     """
     tracks = scenario_tracks(dataset, scenario)
     if not len(tracks.index):
         raise NotAvailableError(
-            f"{scenario} has no labels (the test split ships without), which say where actors are"
+            f"{scenario} has no labels (the test split has none), which say where actors are"
         )
     frames = dataset.scenario.get(scenario)["num_frames"]
     ids, first_rows, rows = np.unique(tracks.actor_id, return_index=True, return_inverse=True)
-    boxes, columns = tracks.boxes, tracks.index - 1
-    poses, speeds = np.full((len(ids), frames, 3), np.nan), np.full((len(ids), frames), np.nan)
+    boxes = tracks.boxes
+    columns = tracks.index - 1
+    poses = np.full((len(ids), frames, 3), np.nan)
     poses[rows, columns] = np.column_stack([boxes.center[:, :2], boxes.yaw])
+    speeds = np.full((len(ids), frames), np.nan)
     speeds[rows, columns] = np.linalg.norm(boxes.velocity[:, :2], axis=1)
     size = np.zeros((len(ids), 3))
     size[rows] = boxes.size
-    actors = {
-        name: dataset.agent.get(f"{scenario}/{name}")["actor_id"]
-        for name in agents_of(dataset, scenario)
-    }
+    agents = {}
+    for name in agents_of(dataset, scenario):
+        actor_id = dataset.agent.get(f"{scenario}/{name}")["actor_id"]
+        if actor_id is not None:
+            agents[name] = actor_id
     return TwinRecording(
         scenario=scenario,
         actor_id=ids,
@@ -90,25 +91,29 @@ def twin_recording(dataset: Dataset, scenario: str) -> TwinRecording:
         size=size,
         poses=poses,
         speeds=speeds,
-        agents={name: actor for name, actor in actors.items() if actor is not None},
+        agents=agents,
     )
 
 
 def shift_of(recording: TwinRecording, twin: TwinRecording) -> int:
-    """Return how much higher the frame number of a moment is in the twin than in the recording.
+    """Return how much higher the frame numbers are in the twin than in the recording.
 
-    Twins may begin at slightly different moments. The shift is the one with the smallest mean
-    distance between each agent and itself in the twin over the first two seconds, with distances
-    capped at `_DISTANCE_CAP_M`. Without a clear answer it is 0.
+    Twins may start at slightly different times. The shift is chosen so that the mean distance
+    between each agent and the same agent in the twin is smallest over the first two seconds.
+    Distances are capped at `_DISTANCE_CAP_M`. Without a clear minimum, the shift is 0.
     """
     pairs = _agent_rows(recording, twin)
-    num_frames, twin_frames = recording.poses.shape[1], twin.poses.shape[1]
+    if not pairs:
+        return 0
+    num_frames = recording.poses.shape[1]
+    twin_frames = twin.poses.shape[1]
     compared = min(_COMPARED_FRAMES, num_frames, twin_frames)
-    best_shift, lowest_cost = 0, np.inf
+    best_shift = 0
+    lowest_cost = np.inf
     for shift in sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs):
         begin = max(0, -shift)
         end = min(begin + compared, num_frames, twin_frames - shift)
-        if not pairs or end - begin < compared:
+        if end - begin < compared:
             continue
         twin_poses = twin.poses[list(pairs.values()), begin + shift : end + shift]
         offset = twin_poses - recording.poses[list(pairs), begin:end]
@@ -117,74 +122,83 @@ def shift_of(recording: TwinRecording, twin: TwinRecording) -> int:
             continue
         cost = float(np.nanmean(distance))
         if cost < lowest_cost - _MIN_IMPROVEMENT_M:
-            best_shift, lowest_cost = shift, cost
+            best_shift = shift
+            lowest_cost = cost
     return best_shift
 
 
 def shifted_recording(recording: TwinRecording, shift: int) -> TwinRecording:
-    """Return the recording on a clock that starts `shift` frames later; NaN before its start."""
+    """Delay the recording by `shift` frames; values before its start are NaN."""
     if not shift:
         return recording
-    poses, speeds = recording.poses[:, max(shift, 0) :], recording.speeds[:, max(shift, 0) :]
-    before = ((0, 0), (max(-shift, 0), 0))
+    begin = max(shift, 0)
+    poses = recording.poses[:, begin:]
+    speeds = recording.speeds[:, begin:]
+    padding = ((0, 0), (max(-shift, 0), 0))
     return replace(
         recording,
-        poses=np.pad(poses, (*before, (0, 0)), constant_values=np.nan),
-        speeds=np.pad(speeds, before, constant_values=np.nan),
+        poses=np.pad(poses, (*padding, (0, 0)), constant_values=np.nan),
+        speeds=np.pad(speeds, padding, constant_values=np.nan),
     )
 
 
 def matched_rows(recording: TwinRecording, twin: TwinRecording) -> dict[int, tuple[int, MatchedBy]]:
-    """Match the actors of a recording to the actors of its twin, which begins alike.
+    """Match the actors of a recording to the actors of its twin.
 
-    Agents are matched by their names. If at least two agents are in both recordings, and all of
-    these have equal ids, then actors of equal ids and classes are the same. The others are matched
-    by where they start: at the first frame that shows both, actors of one class that are at most
-    `START_DISTANCE` apart, one to one, so that the sum of the distances is smallest.
+    Agents are matched by name. If at least two agents are in both recordings, and the ids of all of
+    these are equal, then actors with equal ids and classes are matched too. The others are matched
+    by their first positions, in the first frame that shows both: actors of one class that are at
+    most `START_DISTANCE` apart are matched one to one, so that the sum of distances is smallest.
 
     Returns:
-        Row of the recording → row of the twin, and what they were matched by.
+        Index of an actor in the recording → its index in the twin, and how they were matched.
     """
-    matches: dict[int, tuple[int, MatchedBy]] = {
-        row: (twin_row, "agent") for row, twin_row in _agent_rows(recording, twin).items()
-    }
-    rows, twin_rows = _rows_by_id(recording), _rows_by_id(twin)
-    common = [name for name in recording.agents if name in twin.agents]
-    if len(common) >= _MIN_COMMON_AGENTS and all(
-        recording.agents[name] == twin.agents[name] for name in common
-    ):
-        for actor, row in rows.items():
-            twin_row = twin_rows.get(actor)
-            if (
-                row not in matches
-                and twin_row is not None
-                and recording.category[row] == twin.category[twin_row]
-            ):
+    matches: dict[int, tuple[int, MatchedBy]] = {}
+    for row, twin_row in _agent_rows(recording, twin).items():
+        matches[row] = (twin_row, "agent")
+    if _shares_ids(recording, twin):
+        twin_row_by_id = _rows_by_id(twin)
+        for actor, row in _rows_by_id(recording).items():
+            if row in matches or actor not in twin_row_by_id:
+                continue
+            twin_row = twin_row_by_id[actor]
+            if recording.category[row] == twin.category[twin_row]:
                 matches[row] = (twin_row, "id")
     for row, twin_row in _match_by_start(recording, twin, matches):
         matches[row] = (twin_row, "start")
     return matches
 
 
+def _shares_ids(recording: TwinRecording, twin: TwinRecording) -> bool:
+    """Return whether enough agents are in both recordings, and the ids of all of them agree."""
+    common_agents = recording.agents.keys() & twin.agents.keys()
+    has_equal_ids = [recording.agents[name] == twin.agents[name] for name in common_agents]
+    return len(common_agents) >= _MIN_COMMON_AGENTS and all(has_equal_ids)
+
+
 def _agent_rows(recording: TwinRecording, twin: TwinRecording) -> dict[int, int]:
-    """Return row → row of the twin for the vehicles that record in both."""
-    rows, twin_rows = _rows_by_id(recording), _rows_by_id(twin)
-    actor_pairs = [(actor, twin.agents.get(name)) for name, actor in recording.agents.items()]
-    return {
-        rows[actor]: twin_rows[twin_actor]
-        for actor, twin_actor in actor_pairs
-        if actor in rows and twin_actor in twin_rows
-    }
+    """Map the index of each vehicle that records in both recordings to its index in the twin."""
+    row_by_id = _rows_by_id(recording)
+    twin_row_by_id = _rows_by_id(twin)
+    rows = {}
+    for name, actor in recording.agents.items():
+        twin_actor = twin.agents.get(name)
+        if actor in row_by_id and twin_actor in twin_row_by_id:
+            row = row_by_id[actor]
+            rows[row] = twin_row_by_id[twin_actor]
+    return rows
 
 
 def _rows_by_id(recording: TwinRecording) -> dict[int | None, int]:
-    return {actor: row for row, actor in enumerate(recording.actor_id.tolist())}
+    """Return the index of each actor by its id."""
+    rows = range(len(recording.actor_id))
+    return dict(zip(recording.actor_id.tolist(), rows, strict=True))
 
 
 def _match_by_start(
     recording: TwinRecording, twin: TwinRecording, matches: Mapping[int, tuple[int, MatchedBy]]
 ) -> list[tuple[int, int]]:
-    """Match unmatched actors that start near each other; return their rows and the twin's rows."""
+    """Match the remaining actors that start near each other; return their pairs of indices."""
     from scipy.optimize import linear_sum_assignment
 
     matched_twin_rows = [twin_row for twin_row, _ in matches.values()]
@@ -193,18 +207,17 @@ def _match_by_start(
     distance = _start_distances(recording, twin)[np.ix_(rows, twin_rows)]
     is_near = distance <= START_DISTANCE
     cost = np.where(is_near, distance, 1e3 * START_DISTANCE)
-    assignment = zip(*linear_sum_assignment(cost), strict=True)
-    return [
-        (int(rows[index]), int(twin_rows[twin_index]))
-        for index, twin_index in assignment
-        if is_near[index, twin_index]
-    ]
+    indices, twin_indices = linear_sum_assignment(cost)
+    is_match = is_near[indices, twin_indices]
+    start_rows = rows[indices[is_match]].tolist()
+    twin_start_rows = twin_rows[twin_indices[is_match]].tolist()
+    return list(zip(start_rows, twin_start_rows, strict=True))
 
 
 def _start_distances(recording: TwinRecording, twin: TwinRecording) -> FloatArray:
-    """Return the distances in metres at the first frame that shows both actors, shape (N, M).
+    """Return the distances in metres in the first frame that shows both actors, shape (N, M).
 
-    Infinite for actors of different classes, and without such a frame.
+    They are infinite for actors of different classes, and if no frame shows both.
     """
     start = np.argmax(~np.isnan(recording.poses[..., 0]), axis=1)
     twin_start = np.argmax(~np.isnan(twin.poses[..., 0]), axis=1)

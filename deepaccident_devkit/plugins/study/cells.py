@@ -1,9 +1,9 @@
-"""The cells of a study, each made once and stored: releases, and weights and rows of each seed.
+"""The cells of a study, each made once and stored: releases, and each seed's weights and rows.
 
-A cell's key is a digest of everything that decides it: its part of the recipe, the keys of the
-cells that it depends on, and the devkit's version. So a study that runs again only makes what is
-missing: after a kill the remaining cells, after a change of the recipe the changed ones; and
-studies with the same folder share their common cells. The folder has
+A cell's key is a digest of everything that determines it: its part of the recipe, the keys of the
+cells that it depends on, and the devkit's version. A study that runs again thus only makes missing
+cells: after a kill the remaining ones, after a change of the recipe those that it affects. Studies
+in the same folder share their common cells. The folder contains
 
     release/KEY         a synthetic release
     weights/KEY         a training, which resumes from its latest checkpoint
@@ -54,17 +54,19 @@ if TYPE_CHECKING:
     from deepaccident_devkit.plugins.model import ModelChoice, SecondSource, TrainConfig
     from deepaccident_devkit.support.parallel import Engine
 
-# Makes a cell in its folder and returns its notes, as JSON holds them.
-_Work = Callable[[Path], dict[str, Any]]
+# Notes of a cell, which can be written as JSON.
+Notes = dict[str, Any]
+# Function that makes a cell in its folder, and returns its notes.
+_MakeCell = Callable[[Path], Notes]
 
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """The folder and the device that cells are made with; cheap to pickle.
+    """The folder in which cells are made, and the device; cheap to pickle.
 
     Attributes:
         out: Absolute path of the folder.
-        device: Device of models.
+        device: Device on which models run.
     """
 
     out: Path
@@ -73,15 +75,15 @@ class Workspace:
     @property
     def store(self) -> Store:
         """The store of finished cells."""
-        return Store(self.out / "cells", self.out, "makes cells of a study", ConfigError)
+        return Store(self.out / "cells", self.out, "is computing cells of a study", ConfigError)
 
-    def cell(self, kind: str, name: str, work: _Work, **decides: Any) -> StudyCell:
-        """Return a cell; `decides` is everything that decides it, as JSON holds it."""
+    def cell(self, kind: str, name: str, work: _MakeCell, **decides: Any) -> StudyCell:
+        """Describe a cell; `decides` is everything that determines its content, as JSON values."""
         key = digest_of({"devkit": __version__, "kind": kind, **decides})
         return StudyCell(self, kind, name, key, work)
 
     def split(self, scenarios: Sequence[str]) -> Path:
-        """Write a split file of scenarios, named by a digest of its content; return its path."""
+        """Write a split file whose name is a digest of its content; return its path."""
         path = self.out / "splits" / f"{digest_of(scenarios)}.txt"
         write_split_file(path, scenarios)
         return path
@@ -93,28 +95,35 @@ class Workspace:
         reads: tuple[Path, ...],
         **engine: Unpack[Engine],
     ) -> None:
-        """Make the missing cells; cells with the same key are made once.
+        """Make the missing cells; cells with equal keys are only made once.
 
-        `reads` are folders outside the workspace that workers read. Raises SomeFailedError, and the
-        errors of `Store.run`.
+        Args:
+            cells: The cells.
+            label: What is made; shown by the progress bar.
+            reads: Folders outside the workspace that workers read from.
+            **engine: `workers`, `executor` and `progress`; see `parallel.Engine`.
+
+        Raises:
+            SomeFailedError: If some cells failed; the others are finished.
+            DeepAccidentError: For the reasons in `Store.run`.
         """
-        missing = {}
+        missing_cells = {}
         for cell in cells:
             if cell.notes is None:
-                missing[f"{cell.kind}/{cell.key}"] = cell
+                missing_cells[cell.store_name] = cell
         places = Places(reads=reads, writes=(self.out,))
-        self.store.run(make_cell, missing, label=label, places=places, **engine)
+        self.store.run(make_cell, missing_cells, label=label, places=places, **engine)
 
 
 @dataclass(frozen=True, slots=True)
 class StudyCell:
-    """A cell; cheap to pickle.
+    """A cell of a study; cheap to pickle.
 
     Attributes:
-        workspace: The folder and the device to make it with.
+        workspace: The folder in which it is made, and the device.
         kind: `release`, `weights` or `row`.
         name: Name in the recipe, with the seed.
-        key: Digest of everything that decides the cell.
+        key: Digest of everything that determines the cell.
         work: Function that makes the cell.
     """
 
@@ -122,25 +131,30 @@ class StudyCell:
     kind: str
     name: str
     key: str
-    work: _Work
+    work: _MakeCell
+
+    @property
+    def store_name(self) -> str:
+        """The cell's name in the store, which is also the path of its folder."""
+        return f"{self.kind}/{self.key}"
 
     @property
     def folder(self) -> Path:
-        """The folder of its files."""
-        return self.workspace.out / self.kind / self.key
+        """The folder that contains the cell's files."""
+        return self.workspace.out / self.store_name
 
     @property
-    def notes(self) -> dict[str, Any] | None:
+    def notes(self) -> Notes | None:
         """The stored notes of the cell; None if they or its folder are missing."""
-        content = self.workspace.store.kept(f"{self.kind}/{self.key}", self.key, "results")
+        content = self.workspace.store.read_result(self.store_name, self.key, "results")
         if content is None or not self.folder.is_dir():
             return None
-        notes: dict[str, Any] = parsed_json(gzip.decompress(content), constants=True)
+        notes: Notes = parsed_json(gzip.decompress(content), constants=True)
         return notes
 
 
 def make_cell(cell: StudyCell) -> None:
-    """Make a cell if it is missing; errors are prefixed with its name."""
+    """Make a cell if it is missing; errors get its name as a prefix."""
     if cell.notes is not None:
         return
     start_time = time.monotonic()
@@ -154,22 +168,25 @@ def make_cell(cell: StudyCell) -> None:
         **work_notes,
     }
     content = gzip.compress(json.dumps(notes).encode(), mtime=0)
-    cell.workspace.store.keep(f"{cell.kind}/{cell.key}", cell.key, content)
+    cell.workspace.store.write_result(cell.store_name, cell.key, content)
 
 
 def machine_text(device: str) -> str:
-    """Return a description of the machine, which explains durations and last digits."""
+    """Describe the machine, to explain durations and differences in the last digits."""
     torch = sys.modules.get("torch")
-    packages = f"numpy {np.__version__}" + (f", torch {torch.__version__}" if torch else "")
+    packages = f"numpy {np.__version__}"
+    if torch:
+        packages += f", torch {torch.__version__}"
     python = f"Python {platform.python_version()}"
     return f"{platform.platform()}, {usable_cores()} cores, {python}, {packages}, {device}"
 
 
-def copy_weights(file: Path, folder: Path) -> dict[str, Any]:
-    """Copy existing weights into a cell's folder, so that the file may change later."""
+def copy_weights(file: Path, folder: Path) -> Notes:
+    """Copy existing weights into a cell's folder, so that the original may change later."""
     from deepaccident_devkit.plugins.model.checkpoint import FINAL_FILE
 
-    write_bytes(folder / FINAL_FILE, read_bytes(file, "weights"))
+    weights = read_bytes(file, "weights")
+    write_bytes(folder / FINAL_FILE, weights)
     return {}
 
 
@@ -181,11 +198,20 @@ def train_weights(
     also: SecondSource | None,
     device: str,
     folder: Path,
-) -> dict[str, Any]:
-    """Train weights on one or two releases, from other weights or from random ones (`start` None).
+) -> Notes:
+    """Train weights on one or two releases.
 
-    Returns the mean loss of the last 50 steps, and the seconds of all steps, including steps before
-    a kill.
+    Args:
+        dataset: The release to learn from.
+        choice: The model.
+        config: The training settings.
+        start: Weights to start from; None for random ones.
+        also: A second release to learn from; None for none.
+        device: Device on which the model runs.
+        folder: Folder of the training.
+
+    Returns:
+        Mean loss of the last 50 steps, and duration of all steps in seconds, also before a kill.
     """
     from deepaccident_devkit.plugins.model import train
     from deepaccident_devkit.plugins.model.training_run import one_thread, read_log
@@ -201,14 +227,14 @@ def train_weights(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowEvaluation:
-    """The work on a row with one seed: its samples are predicted and counted.
+    """The work on one row with one seed: predict the samples, and count the results.
 
     Attributes:
-        dataset: The release of the test.
+        dataset: The release on which it is tested.
         row: The row of the recipe.
         selection: The selected samples.
-        labels: Config of the motion labels that are predicted; it has the row's horizon.
-        weights: Weights of a model; None without a model.
+        labels: Config of the motion labels to predict, with the row's horizon.
+        weights: Weights of the model; None if the row has no model.
         device: Device of the model.
     """
 
@@ -219,17 +245,17 @@ class RowEvaluation:
     weights: Path | None
     device: str
 
-    def __call__(self, folder: Path) -> dict[str, Any]:
-        """Write the results files, if they are missing, and count them.
+    def __call__(self, folder: Path) -> Notes:
+        """Write the results files if they are missing, and evaluate them.
 
-        Returns `counts`: evaluator → token → counts.
+        The returned notes have `counts`: evaluator → token → counts.
         """
         if not folder.is_dir():
             self._write_results(folder)
         counts = {}
-        for task, setup in self._setups.items():
+        for task, setup in self._evaluation_setups.items():
             if task == "accident" and self.dataset.layout == "nuScenes":
-                continue  # nuScenes has no accidents
+                continue  # nuScenes contains no accidents
             path = folder / RESULTS_NAMES[task]
             run = evaluate_results(self.dataset, path, setup, self.selection, workers=1)
             counts[str(task)] = dict(run.evaluator.counts)
@@ -237,7 +263,7 @@ class RowEvaluation:
         return {"counts": counts}
 
     def _hidden_actor_counts(self, folder: Path) -> dict[str, Any]:
-        """Return the counts of hidden actors by sample token."""
+        """Count hidden actors; return sample token → counts."""
         hidden_actors = HiddenActors()
         motion_results = read_results(folder / RESULTS_NAMES["motion"])
         detection_results = read_results(folder / RESULTS_NAMES["detection"])
@@ -252,12 +278,12 @@ class RowEvaluation:
         return dict(hidden_actors.counts)
 
     @property
-    def _setups(self) -> Mapping[ResultsTask, EvaluationSetup]:
+    def _evaluation_setups(self) -> Mapping[ResultsTask, EvaluationSetup]:
         horizon = self.labels.future_frames * self.labels.step * FRAME_PERIOD
         return setups_of(str(self.labels.protocol), horizon)
 
     def _write_results(self, path: Path) -> None:
-        """Predict all samples and write one results file a task into a new folder."""
+        """Predict all samples, and write one results file per task into a new folder."""
         labels = self.labels
         tokens = self.selection.tokens(self.dataset)
         meta = {"method": self.row.name, "devkit": __version__}
@@ -268,11 +294,10 @@ class RowEvaluation:
         }
         with replacing_folder(path) as folder, ExitStack() as stack:
             writers = []
-            for task in self._setups:
+            for task in self._evaluation_setups:
                 options = motion_options if task == "motion" else {}
-                writers.append(
-                    ResultsWriter(folder / RESULTS_NAMES[task], task, meta=meta, **options)
-                )
+                results_path = folder / RESULTS_NAMES[task]
+                writers.append(ResultsWriter(results_path, task, meta=meta, **options))
             for writer in writers:
                 stack.enter_context(writer)
             predictions = predictions_of(

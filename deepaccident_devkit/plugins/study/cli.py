@@ -7,7 +7,7 @@ import click
 
 from deepaccident_devkit.cli.options import (
     PATH,
-    engine_of,
+    engine_options,
     engine_parameters,
     figure_style_parameter,
     refuse_unused,
@@ -16,7 +16,7 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.plugins.study import read_recipe, run_study
 from deepaccident_devkit.plugins.study.page import PAGE_FILE
-from deepaccident_devkit.support.parallel import workers_kept
+from deepaccident_devkit.support.parallel import keep_workers
 
 _EXAMPLES = """\b
 Examples:
@@ -31,29 +31,29 @@ Examples:
 @click.option(
     "--smoke",
     is_flag=True,
-    help="Run the recipe's tiny version, of minutes; its numbers say nothing.",
+    help="Run the tiny version of the recipe, which takes minutes but gives meaningless numbers.",
 )
 @engine_parameters
 @click.option(
     "--device",
     default="auto",
     show_default=True,
-    help="cpu, cuda, …; auto takes a GPU where there is one.",
+    help="Device of the models: cpu, cuda, …; auto uses a GPU if there is one.",
 )
 @figure_style_parameter
-@workers_kept()
+@keep_workers()
 def study(recipe: str, out: Path, smoke: bool, device: str, **options: Any) -> None:
-    """Train and compare what RECIPE says, and write tables, figures and a page into OUT/NAME.
+    """Train and compare models as RECIPE says, and write tables, figures and a page into OUT/NAME.
 
-    RECIPE is a YAML file, or the name of one that the devkit ships; docs/studies.md explains it. If
-    the command is interrupted or killed, the same command goes on. Studies with the same OUT share
-    releases, weights and rows.
+    RECIPE is a YAML file, or the name of a recipe of the devkit; docs/studies.md explains both. If
+    a run is interrupted, the same command continues it. Studies with the same OUT share releases,
+    weights and rows.
     """
     use_threads_sparingly()
     study_recipe = read_recipe(recipe, smoke=smoke)
     if not study_recipe.weights:
-        refuse_unused("with a recipe without weights", "device")
-    report = run_study(study_recipe, out, device=device, progress=True, **engine_of(options))
+        refuse_unused("with a recipe that trains no model", "device")
+    report = run_study(study_recipe, out, device=device, progress=True, **engine_options(options))
     folder = out / study_recipe.name
     click.echo(report.to_text())
-    click.echo(f"written: {folder}; open {folder / PAGE_FILE} in a browser")
+    click.echo(f"wrote {folder}; open {folder / PAGE_FILE} in a browser")

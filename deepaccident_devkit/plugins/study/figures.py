@@ -1,19 +1,18 @@
-"""Figures of a study: rows with intervals, and series of rows over a number such as the latency."""
+"""Figures of a study: rows with intervals, and rows in a series over, for example, the latency."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deepaccident_devkit.plugins.study.numbers import NUMBERS
-from deepaccident_devkit.plugins.study.summary import ALL, main_numbers
-from deepaccident_devkit.render.captions import set_title
-from deepaccident_devkit.render.figures import report_figure, with_light_grid
+from deepaccident_devkit.plugins.study.summary import ALL, Summary, main_numbers
+from deepaccident_devkit.render.captions import draw_legend, set_note, set_title
+from deepaccident_devkit.render.figures import figure_or_new, with_light_grid
 from deepaccident_devkit.render.styles import (
     ESTIMATE_COLOR,
-    MUTED_COLOR,
     SERIES_COLORS,
     current_style,
     in_own_settings,
@@ -24,27 +23,31 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PANEL_WIDTH_INCHES: Final = 2.7
-_UNITS: Final = {
+_PANEL_WIDTH_INCHES = 2.7
+# Key that can vary in a series of rows → its unit.
+_UNITS = {
     "latency": "s",
     "pose_noise": "m",
     "packet_loss": "share",
-    "budget": "bytes a frame",
+    "budget": "bytes per frame",
     "horizon": "s",
 }
-_NOTE: Final = "lines: intervals of 95 % over pairs; pale dots: seeds"
+_NOTE = "lines: 95 % intervals over scenario pairs; pale dots: seeds"
+# Heights in lines of letters: a row, the words above and below the rows, and a figure of curves.
+_ROW_LINES = 1.5
+_FRAME_LINES = 8
+_CURVE_LINES = 18
 
 
 @in_own_settings
-def rows_figure(summary: Mapping[str, Any]) -> Figure:
-    """Draw the rows as dots with intervals, and pale dots for single seeds.
+def rows_figure(summary: Summary) -> Figure:
+    """Draw the rows as dots with intervals; single seeds are pale dots.
 
-    There is a panel for each main number; a figure for a paper's column has only the first two.
-    Save it with `render.figures.write_report_figure`.
+    Each main number has a panel; in a paper's column, only the first two have.
     """
     rows = summary["rows"]
-    height = 1.2 + 0.26 * len(rows)
-    fig, panels = _figure_with_panels(summary, margin=1.8, height=height, sharey=True)
+    lines = _FRAME_LINES + _ROW_LINES * len(rows)
+    fig, panels = _figure_with_panels(summary, margin=1.8, lines=lines, sharey=True)
     for number, ax in panels.items():
         estimates = [row["groups"][ALL][number] for row in rows.values()]
         _draw_estimates(ax, range(len(rows)), estimates, upright=False)
@@ -55,68 +58,77 @@ def rows_figure(summary: Mapping[str, Any]) -> Figure:
     return fig
 
 
-def series_keys(summary: Mapping[str, Any]) -> list[str]:
-    """Return the keys with a series of rows, such as `latency`."""
-    keys = [row["over"][0] for row in summary["rows"].values() if row["over"]]
-    return list(dict.fromkeys(keys))
+def series_keys(summary: Summary) -> list[str]:
+    """Return the keys that vary in a series of rows, such as `latency`."""
+    keys: dict[str, None] = {}
+    for row in summary["rows"].values():
+        if row["over"]:
+            keys[row["over"][0]] = None
+    return list(keys)
 
 
 @in_own_settings
-def curves_figure(summary: Mapping[str, Any], key: str) -> Figure:
-    """Draw the main numbers over one of `series_keys`: a line for each series of rows.
+def curves_figure(summary: Summary, key: str) -> Figure:
+    """Draw the main numbers against one of `series_keys`; each series of rows is a line.
 
-    Its panels and its file are as of `rows_figure`.
+    Panels are as for `rows_figure`.
     """
-    rows = [row for row in summary["rows"].values() if row["over"] and row["over"][0] == key]
-    fig, panels = _figure_with_panels(summary, margin=0.6, height=3.0)
-    series_names = list(dict.fromkeys(row["over"][2] for row in rows))
+    series: dict[str, list[Any]] = {}
+    for row in summary["rows"].values():
+        if row["over"] and row["over"][0] == key:
+            series.setdefault(row["over"][2], []).append(row)
+    fig, panels = _figure_with_panels(summary, margin=0.6, lines=_CURVE_LINES)
     for number, ax in panels.items():
-        for index, name in enumerate(series_names):
-            series = [row for row in rows if row["over"][2] == name]
-            positions = [row["over"][1] for row in series]
-            estimates = [row["groups"][ALL][number] for row in series]
+        for index, (name, rows) in enumerate(series.items()):
+            positions = [row["over"][1] for row in rows]
+            estimates = [row["groups"][ALL][number] for row in rows]
             color = SERIES_COLORS[index % len(SERIES_COLORS)]
             _draw_estimates(ax, positions, estimates, upright=True, color=color, label=name)
         ax.set_xlabel(f"{key.replace('_', ' ')} ({_UNITS[key]})", fontsize=text_size())
         with_light_grid(ax, "both")
-    handles, labels = next(iter(panels.values())).get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=text_size())
+    first_panel = next(iter(panels.values()))
+    handles, _ = first_panel.get_legend_handles_labels()
+    draw_legend(fig, handles, loc="outside upper center")
     return fig
 
 
 def _figure_with_panels(
-    summary: Mapping[str, Any], *, margin: float, height: float, **shared_axes: Any
+    summary: Summary, *, margin: float, lines: float, **shared_axes: Any
 ) -> tuple[Figure, dict[str, Axes]]:
-    """Return a figure with a panel for each main number; its margin and height are in inches."""
+    """Make a figure with a panel per main number; `margin` is in inches, the height in lines."""
     numbers = main_numbers(summary)
-    if current_style().room == "column":
+    if current_style().layout == "column":
         numbers = numbers[:2]
-    fig = report_figure((margin + _PANEL_WIDTH_INCHES * len(numbers), height), column=1.1)
+    size = (margin + _PANEL_WIDTH_INCHES * len(numbers), 0)
+    fig = figure_or_new(None, size, lines=lines)
     axes = fig.subplots(1, len(numbers), squeeze=False, **shared_axes)[0]
     panels = dict(zip(numbers, axes, strict=True))
     for number, ax in panels.items():
-        set_title(ax, NUMBERS[number][2], fontsize=text_size())
-    fig.supxlabel(_NOTE, fontsize=text_size(), color=MUTED_COLOR)
+        words = NUMBERS[number][2]
+        if current_style().layout == "column":  # its panels are narrow
+            words = words.replace(", ", ",\n").replace(" (", "\n(")
+        set_title(ax, words, fontsize=text_size())
+    set_note(fig, _NOTE)
     return fig, panels
 
 
 def _draw_estimates(
     ax: Axes,
     positions: Iterable[float],
-    estimates: Sequence[Mapping[str, Any]],
+    estimates: Sequence[Summary],
     *,
     upright: bool,
     color: str = ESTIMATE_COLOR,
     label: str = "",
 ) -> None:
-    """Draw numbers with intervals and seeds at positions along an axis.
+    """Draw numbers with their intervals and seeds at positions along an axis.
 
-    Upright numbers stand over the x axis and are joined by a line. Missing values are not drawn.
+    If `upright`, positions are along the x axis, and a line joins the numbers. Missing values are
+    not drawn.
     """
-    values, lows, highs = (
-        np.array([estimate[name] for estimate in estimates], dtype=float)
-        for name in ("value", "low", "high")
-    )
+    arrays = {}
+    for name in ("value", "low", "high"):
+        arrays[name] = np.array([estimate[name] for estimate in estimates], dtype=float)
     coordinates = np.array(list(positions), dtype=float)
     seed_points = []
     for position, estimate in zip(coordinates, estimates, strict=True):
@@ -124,11 +136,15 @@ def _draw_estimates(
             seed_points.append((position, value))
     seed_positions, seed_values = np.array(seed_points, dtype=float).reshape(-1, 2).T
     if upright:
-        ax.vlines(coordinates, lows, highs, color=color, linewidth=1.4)
-        seed_xy, value_xy, marker = (seed_positions, seed_values), (coordinates, values), "o-"
+        ax.vlines(coordinates, arrays["low"], arrays["high"], color=color, linewidth=1.4)
+        seed_xy = (seed_positions, seed_values)
+        value_xy = (coordinates, arrays["value"])
+        marker = "o-"
     else:
-        ax.hlines(coordinates, lows, highs, color=color, linewidth=1.4)
-        seed_xy, value_xy, marker = (seed_values, seed_positions), (values, coordinates), "o"
+        ax.hlines(coordinates, arrays["low"], arrays["high"], color=color, linewidth=1.4)
+        seed_xy = (seed_values, seed_positions)
+        value_xy = (arrays["value"], coordinates)
+        marker = "o"
     ax.plot(*seed_xy, "o", color=SERIES_COLORS[-1], markersize=3, zorder=1.5)
     ax.plot(
         *value_xy,
@@ -136,5 +152,5 @@ def _draw_estimates(
         color=color,
         label=label,
         markersize=5,
-        clip_on=False,  # so that a dot at the end of the range is drawn completely
+        clip_on=False,  # draws a dot at the end of the range completely
     )

@@ -1,8 +1,8 @@
-"""What the plug-in `study` offers."""
+"""What the plug-in `study` adds to the devkit."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.support.plugins import PROTOCOL_VERSION, LazyVerb, Plugin, need_plugin
 
@@ -18,10 +18,10 @@ def _study() -> click.Command:
     return study
 
 
-PLUGIN: Final = Plugin(
+PLUGIN = Plugin(
     name="study",
     protocol_version=PROTOCOL_VERSION,
     verbs={
-        "study": LazyVerb("Train and compare what a recipe says.", _study),
+        "study": LazyVerb("Train and compare models as a recipe says.", _study),
     },
 )

@@ -1,4 +1,4 @@
-"""The predictions of a row: by a model, also with spoilt inputs, by a baseline, or trivial ones."""
+"""Predictions of a row: a model's (also with degraded inputs), a baseline's, or trivial ones."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from deepaccident_devkit.plugins.model import PredictConfig, V2XFormer
     from deepaccident_devkit.plugins.model.results import SamplePrediction
 
-# The parts of an item of `V2XDataset` that are not per agent; all other parts are indexed by agent.
-_SHARED_PARTS: Final = (
+# The parts of a `V2XDataset` item that all agents share; other parts are indexed by agent.
+_SHARED_PARTS = (
     "token",
     "agents",
     "agent_valid",
@@ -41,7 +41,7 @@ _SHARED_PARTS: Final = (
     "augmentation",
     "files_missing",
 )
-# The outputs of a sample: motion, accidents, and boxes in the world frame.
+# The outputs for a sample: motion, accidents, and boxes in the world frame.
 Prediction = tuple[MotionOutput, list[Accident], DetectedBoxes]
 
 
@@ -53,88 +53,26 @@ def predictions_of(
     tokens: Sequence[str],
     labels: MotionLabelConfig,
 ) -> Iterator[tuple[str, Prediction]]:
-    """Yield samples' tokens and predictions, one after another.
+    """Yield the token and the prediction of each sample.
 
     Args:
         row: The row of the recipe.
-        weights: Weights of a model; None without a model.
-        device: Device of the model.
+        weights: Weights of the model; None if the row has no model.
+        device: Device on which the model runs.
         dataset: The release.
         tokens: Tokens of the samples.
-        labels: Config of the motion labels that are predicted.
+        labels: Config of the motion labels to predict.
 
     Raises:
-        ConfigError: The weights were trained for other labels, or latency is longer than a sample's
+        ConfigError: If the weights were trained for other labels, or the latency exceeds a sample's
             past.
-        NotAvailableError: There is no other pair of scenarios to take partners from.
-        DeepAccidentError: As in `model.predictions`, or the baselines.
+        NotAvailableError: If there is no other pair of scenarios to take partners from.
+        DeepAccidentError: For the reasons in `model.predictions`, or in the baselines.
     """
-    if weights is not None:
-        yield from _model_predictions(row, weights, device, dataset, tokens, labels)
+    if weights is None:
+        for token in tokens:
+            yield token, _prediction_without_model(row, dataset, token, labels)
         return
-    for token in tokens:
-        yield token, _prediction_without_model(row, dataset, token, labels)
-
-
-def _prediction_without_model(
-    row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig
-) -> Prediction:
-    """Return the prediction of a baseline or a trivial row."""
-    if row.baseline is not None:
-        return _baseline_prediction(row, row.baseline, dataset, token, labels)
-    if row.trivial == "labels":
-        return _label_prediction(row, dataset, token, labels)
-    fill_value = row.trivial == "everything"
-    maps = np.full((1, labels.label_frames, *labels.grid.shape), fill_value, dtype=np.int32)
-    motion = MotionOutput(grid=labels.grid, instances=maps)
-    no_boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
-    return motion, [], DetectedBoxes(boxes=no_boxes, scores=np.zeros(0))
-
-
-def _baseline_prediction(
-    row: StudyRow,
-    motion_model: MotionModel,
-    dataset: Dataset,
-    token: str,
-    labels: MotionLabelConfig,
-) -> Prediction:
-    """Return the extrapolation of the actors that the cooperating agents see."""
-    cooperation = dict[str, Any](agents=row.cooperating, link=row.link)
-    motion = predict_motion(dataset, token, model=motion_model, config=labels, **cooperation)
-    horizon = labels.future_frames * (labels.step * FRAME_PERIOD)
-    accidents = predict_accidents(
-        dataset, token, model=motion_model, horizon=horizon, **cooperation
-    )
-    return motion, accidents, predict_detections(dataset, token, **cooperation)
-
-
-def _label_prediction(
-    row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig
-) -> Prediction:
-    """Return the labels of the actors that the agents see at the present."""
-    cooperation = dict[str, Any](agents=row.cooperating, link=row.link)
-    agent_labels = replace(labels, agents=row.cooperating)
-    truth = motion_labels(dataset, token, agent_labels).to_present()
-    visible_ids = {OWN_BOX_ID, *visible_actors(dataset, token, **cooperation).tolist()}
-    # Actors that only come into sight later are left out.
-    visible_numbers = [number for actor, number in truth.id_map.items() if actor in visible_ids]
-    instances = np.where(np.isin(truth.instance, visible_numbers), truth.instance, 0)
-    motion = MotionOutput(grid=labels.grid, instances=instances[None])
-    step = labels.step * FRAME_PERIOD
-    accident = foreseen_accident(motion, step=step, labels=str(labels.protocol))
-    accidents = [] if accident is None else [accident]
-    return motion, accidents, predict_detections(dataset, token, **cooperation)
-
-
-def _model_predictions(
-    row: StudyRow,
-    weights: Path,
-    device: str,
-    dataset: Dataset,
-    tokens: Sequence[str],
-    labels: MotionLabelConfig,
-) -> Iterator[tuple[str, Prediction]]:
-    """Yield samples' tokens and predictions by a model."""
     from deepaccident_devkit.plugins.model import PredictConfig, load_model, predictions
     from deepaccident_devkit.plugins.model.training_run import one_thread
 
@@ -142,7 +80,7 @@ def _model_predictions(
     trained_labels = model.config.labels_protocol
     if trained_labels != labels.protocol:
         raise ConfigError(
-            f"{weights}: was trained with the labels {trained_labels}; give "
+            f"{weights}: was trained with the labels {trained_labels}; set "
             f"`labels: {trained_labels}` in the recipe's `test`"
         )
     config = PredictConfig(agents=row.cooperating, link=row.link, device=device)
@@ -160,6 +98,59 @@ def _model_predictions(
             yield output.token, (output.motion, accidents, output.boxes)
 
 
+def _prediction_without_model(
+    row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig
+) -> Prediction:
+    """Return the prediction of a row with a baseline or trivial predictions."""
+    if row.baseline is not None:
+        return _baseline_prediction(row, row.baseline, dataset, token, labels)
+    if row.trivial == "labels":
+        return _label_prediction(row, dataset, token, labels)
+    fill_value = row.trivial == "everything"
+    shape = (1, labels.label_frames, *labels.grid.shape)
+    maps = np.full(shape, fill_value, dtype=np.int32)
+    motion = MotionOutput(grid=labels.grid, instances=maps)
+    no_boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
+    return motion, [], DetectedBoxes(boxes=no_boxes, scores=np.zeros(0))
+
+
+def _baseline_prediction(
+    row: StudyRow,
+    motion_model: MotionModel,
+    dataset: Dataset,
+    token: str,
+    labels: MotionLabelConfig,
+) -> Prediction:
+    """Extrapolate the motion of the actors that the cooperating agents see."""
+    cooperation = dict[str, Any](agents=row.cooperating, link=row.link)
+    motion = predict_motion(dataset, token, model=motion_model, config=labels, **cooperation)
+    horizon = labels.future_frames * (labels.step * FRAME_PERIOD)
+    accidents = predict_accidents(
+        dataset, token, model=motion_model, horizon=horizon, **cooperation
+    )
+    return motion, accidents, predict_detections(dataset, token, **cooperation)
+
+
+def _label_prediction(
+    row: StudyRow, dataset: Dataset, token: str, labels: MotionLabelConfig
+) -> Prediction:
+    """Return the labels of the actors that the agents see at t = 0, including their future."""
+    cooperation = dict[str, Any](agents=row.cooperating, link=row.link)
+    agent_labels = replace(labels, agents=row.cooperating)
+    truth = motion_labels(dataset, token, agent_labels).to_present()
+    visible_ids = {OWN_BOX_ID, *visible_actors(dataset, token, **cooperation).tolist()}
+    # Actors that only come into sight later are removed.
+    visible_numbers = [number for actor, number in truth.id_map.items() if actor in visible_ids]
+    instances = np.where(np.isin(truth.instance, visible_numbers), truth.instance, 0)
+    motion = MotionOutput(grid=labels.grid, instances=instances[None])
+    step = labels.step * FRAME_PERIOD
+    accident = foreseen_accident(motion, step=step, labels=str(labels.protocol))
+    accidents = []
+    if accident is not None:
+        accidents.append(accident)
+    return motion, accidents, predict_detections(dataset, token, **cooperation)
+
+
 def _spoilt_predictions(
     row: StudyRow,
     model: V2XFormer,
@@ -167,28 +158,28 @@ def _spoilt_predictions(
     tokens: Sequence[str],
     config: PredictConfig,
 ) -> Iterator[SamplePrediction]:
-    """Return the model's predictions from inputs that are spoilt by the row's control."""
+    """Yield the model's predictions from inputs degraded by the row's `control`."""
     from deepaccident_devkit.plugins.model.results import prediction_of
     from deepaccident_devkit.training.torch import V2XDataset, collate
 
     inputs = model.config.inputs(config.agents, link=config.link)
     items: Any = V2XDataset(dataset, tokens, inputs)
-    spoilt_items: Iterator[dict[str, Any]]
+    stranger_items: Any = None
     if row.control == "strangers":
-        stranger_items: Any = V2XDataset(dataset, strangers_of(tokens), inputs)
-        spoilt_items = (
-            with_strangers(items[index], stranger_items[index]) for index in range(len(items))
-        )
-    else:
-        spoilt_items = (blanked(items[index]) for index in range(len(items)))
-    return (prediction_of(model, collate([item]), config) for item in spoilt_items)
+        stranger_items = V2XDataset(dataset, strangers_of(tokens), inputs)
+    for index in range(len(items)):
+        if stranger_items is None:
+            spoilt_item = blanked(items[index])
+        else:
+            spoilt_item = with_strangers(items[index], stranger_items[index])
+        yield prediction_of(model, collate([spoilt_item]), config)
 
 
 def strangers_of(tokens: Sequence[str]) -> list[str]:
-    """Return a sample of another pair of scenarios for each sample; partners are taken from it.
+    """Return, for each sample, a sample of another pair of scenarios to take partners from.
 
-    It has the same rank among the samples of its scenario. Raises NotAvailableError: all samples
-    are of one pair.
+    It has the same rank among its scenario's samples. Raise NotAvailableError if all samples belong
+    to one pair.
     """
     tokens_by_scenario: dict[str, list[str]] = {}
     for token in tokens:
@@ -196,22 +187,22 @@ def strangers_of(tokens: Sequence[str]) -> list[str]:
     scenarios = list(tokens_by_scenario)
     strangers = []
     for index, scenario in enumerate(scenarios):
-        candidates = scenarios[index:] + scenarios[:index]
-        other = next(
-            (name for name in candidates if cluster_of(name) != cluster_of(scenario)), None
-        )
-        if other is None:
+        following = scenarios[index:] + scenarios[:index]
+        other_scenarios = [name for name in following if cluster_of(name) != cluster_of(scenario)]
+        if not other_scenarios:
             raise NotAvailableError(
-                f"{scenario}: there is no other pair to take strangers from; test on several pairs"
+                f"{scenario}: there is no other pair to take unrelated partners from; "
+                "test several pairs"
             )
-        other_tokens = tokens_by_scenario[other]
+        other_tokens = tokens_by_scenario[other_scenarios[0]]
+        last_rank = len(other_tokens) - 1
         for rank in range(len(tokens_by_scenario[scenario])):
-            strangers.append(other_tokens[min(rank, len(other_tokens) - 1)])
+            strangers.append(other_tokens[min(rank, last_rank)])
     return strangers
 
 
 def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an item of `V2XDataset` with black images and clouds without points."""
+    """Return an item of `V2XDataset` with black images and empty point clouds."""
     blank = dict(item)
     if "images" in item:
         blank["images"] = item["images"] * 0
@@ -221,11 +212,12 @@ def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_strangers(item: Mapping[str, Any], stranger: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an item with partners' sensors and poses from another item's agents of these names."""
+    """Return an item whose partners' sensors and poses come from the same agents in another."""
     changed = {}
     for name, value in item.items():
-        if name not in _SHARED_PARTS:
-            changed[name] = copy(value) if isinstance(value, list) else value.clone()
+        if name in _SHARED_PARTS:
+            continue
+        changed[name] = copy(value) if isinstance(value, list) else value.clone()
     for slot, name in enumerate(item["agents"]):
         if slot and name in stranger["agents"]:
             stranger_slot = stranger["agents"].index(name)

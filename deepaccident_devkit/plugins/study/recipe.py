@@ -1,10 +1,8 @@
 """A recipe: what a study trains and compares, read from a YAML file.
 
-Everything that does not need torch is checked here. `Recipe` describes the file, and
-docs/studies.md shows one. Every fault is a ConfigError that names the file, the key and the remedy.
+Everything that does not need torch is checked here. `Recipe` describes the file; docs/studies.md
+shows an example. Every fault raises a ConfigError that names the file, the key and the remedy.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import math
@@ -14,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain, product
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -36,19 +34,23 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import AGENT_SETS, Link
 
-SHIPPED_RECIPES: Final = Path(__file__).parent / "recipes"
-DEFAULT_HORIZON: Final = 2.0
-# The key that converts a synthetic release into nuScenes' format.
-NUSCENES: Final = "nuscenes"
-# The keys of a row that become its `Link`.
-_LINK_EFFECTS: Final = ("latency", "pose_noise", "packet_loss", "budget")
-# The keys of a row that may hold a list; each value of the list becomes a row.
-_LIST_KEYS: Final = ("agents", "horizon", *_LINK_EFFECTS)
-# Rows of a recipe, after each list has become one row for each of its values.
-MAX_ROWS: Final = 1000
-# Characters of a recipe file. Shipped recipes have up to 3,000; PyYAML needs many seconds for more.
-_MAX_CHARACTERS: Final = 100_000
-# Up to 100 numbers that fit into torch's generator.
+SHIPPED_RECIPES = Path(__file__).parent / "recipes"
+# Seconds that a row looks ahead by default.
+DEFAULT_HORIZON = 2.0
+# The key that converts a synthetic release to nuScenes' format.
+NUSCENES = "nuscenes"
+# The keys of a row that are fields of its `Link`.
+_LINK_EFFECTS = ("latency", "pose_noise", "packet_loss", "budget")
+# The keys of a row that may contain a list; each value of the list becomes a row.
+_LIST_KEYS = ("agents", "horizon", *_LINK_EFFECTS)
+# Largest number of rows after all lists have been expanded.
+MAX_ROWS = 1000
+# Largest size of a recipe file. Shipped recipes have up to 3,000 characters; PyYAML would take many
+# seconds to read a larger file.
+_MAX_CHARACTERS = 100_000
+# Key → value of a part of a recipe.
+Settings = Mapping[str, Any]
+# Up to 100 numbers that torch's generator accepts as seeds.
 StudySeeds = Annotated[
     tuple[Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)], ...], msgspec.Meta(max_length=100)
 ]
@@ -59,11 +61,11 @@ class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class StudyHeadline(_Part, frozen=True, kw_only=True):
-    """The comparison that is fixed before the study is run.
+    """The main comparison of a study, which is fixed before the study is run.
 
     Attributes:
-        row: Name of the row that is expected to have more.
-        less: Name of the row that is expected to have less.
+        row: Name of the row that is expected to have the higher number.
+        less: Name of the row that is expected to have the lower number.
         number: Name of the compared number in `NUMBERS`.
         where: Name of one of the recipe's groups; None for all samples.
     """
@@ -79,16 +81,17 @@ class TestedOn(_Part, frozen=True, kw_only=True):
 
     Attributes:
         release: Name of one of the recipe's releases.
-        split: `all`, or a split's name.
-        samples: The list of samples, as in `SampleSelection`.
-        scope: Whether only accidents are tested or their normal twins too, as in `SampleSelection`.
-        agents: The agents that the samples belong to, as in `SampleSelection`.
+        split: `all`, or the name of a split.
+        samples: The list of samples; see `SampleSelection`.
+        scope: Whether only accidents are tested, or also their normal twins; see `SampleSelection`.
+        agents: The agents whose samples are tested; see `SampleSelection`.
         horizon: Seconds before the end from which samples are taken; None for the longest horizon
-            of a row.
-        where: Filters as `--where` takes them; a pair of scenarios is tested if either matches all.
-        labels: The protocol of motion labels. Models of the presets `tiny` have `clean`.
-        includes_training: Whether models may have learned from scenarios of the test, from their
-            twins, or from other recordings of them; otherwise such a recipe is refused.
+            of any row.
+        where: Filters in the syntax of `--where`; an accident and its normal twin are both tested
+            if either one satisfies every filter.
+        labels: The protocol of motion labels. The `tiny` presets require `clean`.
+        includes_training: Allow models trained on test scenarios, their twins or other recordings
+            of them; if False, such a recipe raises an error.
     """
 
     release: str
@@ -104,34 +107,35 @@ class TestedOn(_Part, frozen=True, kw_only=True):
     def label_config(self, horizon: float | None) -> MotionLabelConfig:
         """Return the config of motion labels up to `horizon` seconds ahead.
 
-        None stands for the default horizon. Raises ConfigError or ChoiceError.
+        If None, the default horizon is used. Raise ConfigError or ChoiceError if it is not allowed.
         """
-        frame_count = len(path_times(horizon or DEFAULT_HORIZON))
-        return MotionLabelConfig(future_frames=frame_count, protocol=self.labels)
+        times = path_times(horizon or DEFAULT_HORIZON)
+        return MotionLabelConfig(future_frames=len(times), protocol=self.labels)
 
 
 class StudyRow(_Part, frozen=True, kw_only=True):
-    """A row of the tables: what predicts, and from which agents' data.
+    """A row of the tables: what makes the predictions, and from which agents' data.
 
     Attributes:
-        name: Name of the row. In the file it may contain keys that have lists, such as `late
+        name: Name of the row. In the file, it may refer to keys that contain lists, such as `late
             {latency} s`.
-        weights: Name of the recipe's weights of a model.
+        weights: Which of the recipe's weights a model uses; None without a model.
         baseline: Motion model of a baseline, which extrapolates the actors that agents see
-            according to the labels. With `weights` it extrapolates the model's detections, and its
-            alarms replace the alarms that follow from the model's maps.
+            according to the labels. With `weights`, it extrapolates the model's detections instead,
+            and its alarms replace the ones that follow from the model's maps.
         trivial: Used instead of both: `nothing` is an empty map without alarms and boxes;
-            `everything` is a map covered by one actor; `labels` are the labels of the actors that
-            the agents see at the present, including their future: an upper bound for a model.
+            `everything` is a map covered by one actor; `labels` are the labels, including the
+            future, of the actors that the agents see at t = 0: an upper bound for a model.
         agents: The cooperating agents: a configuration, or names of agents separated by commas.
-        control: How a model's inputs are spoilt: `blank` blanks all sensors of all agents;
+        control: How a model's inputs are degraded: `blank` blanks all sensors of all agents;
             `strangers` takes partners' data from another pair of scenarios.
-        latency: Seconds, as in `Link`.
-        pose_noise: Metres, as in `Link`.
-        packet_loss: Probability, as in `Link`.
-        budget: Bytes a frame, as in `Link`; a partner sends a model's features, or boxes.
-        horizon: Seconds that the row looks ahead, None for 2; the weights of a model define theirs.
-        over: For a row of a series that differs in a number: key, number, and name of the series.
+        latency: Age of partners' data in seconds; see `Link`.
+        pose_noise: Error of partners' positions in metres; see `Link`.
+        packet_loss: Probability that a partner's data are lost; see `Link`.
+        budget: Bytes per frame; see `Link`. A partner sends either a model's features or boxes.
+        horizon: Seconds that the row looks ahead; None for 2, or for what a model's weights define.
+        over: Key, number and name of a series of rows that differ in this number; None for other
+            rows.
     """
 
     name: str
@@ -153,31 +157,34 @@ class StudyRow(_Part, frozen=True, kw_only=True):
 
     @property
     def cooperating(self) -> str | list[str]:
-        """The cooperating agents, as `v2x.cooperating_agents` takes them."""
-        return self.agents if self.agents in AGENT_SETS else self.agents.split(",")
+        """The cooperating agents, as accepted by `v2x.cooperating_agents`."""
+        if self.agents in AGENT_SETS:
+            return self.agents
+        return self.agents.split(",")
 
     @property
     def link(self) -> Link | None:
-        """The degradation of partners' data; None for none. Raises ConfigError."""
+        """The link's effects on partners' data, None without any; raise ConfigError if invalid."""
         effects: dict[str, Any] = {}
         for name in _LINK_EFFECTS:
             value = getattr(self, name)
             if value:
                 effects[name] = value
+        if not effects:
+            return None
         if self.budget:
             effects["payload"] = "bev" if self.weights else "boxes"
-        return Link(**effects) if effects else None
+        return Link(**effects)
 
     @property
     def faults(self) -> list[str]:
-        """Messages on keys that do not go together."""
-        kinds = [
-            name for name in ("weights", "baseline", "trivial") if getattr(self, name) is not None
-        ]
-        extrapolates_model = (kinds, self.baseline) == (
-            ["weights", "baseline"],
-            "constant_velocity",
-        )
+        """Messages about keys that cannot be combined."""
+        kinds = []
+        for name in ("weights", "baseline", "trivial"):
+            if getattr(self, name) is not None:
+                kinds.append(name)
+        has_model_and_baseline = kinds == ["weights", "baseline"]
+        extrapolates_model = has_model_and_baseline and self.baseline == "constant_velocity"
         faults = []
         if len(kinds) != 1 and not extrapolates_model:
             faults.append(
@@ -185,28 +192,28 @@ class StudyRow(_Part, frozen=True, kw_only=True):
                 f"constant_velocity, found {' and '.join(kinds) or 'none'}"
             )
         if self.control and not self.weights:
-            faults.append("control: spoils what a model sees; leave it out, or give weights")
+            faults.append("control: changes what a model sees; remove it, or add weights")
         if self.horizon and self.weights:
-            faults.append("horizon: is what the weights were trained for; leave it out here")
+            faults.append("horizon: is set by the weights; remove it here")
         if self.control and self.budget:
-            faults.append("control, budget: do not go together; leave one out")
+            faults.append("control, budget: cannot be combined; remove one of them")
         return faults
 
 
 class TrainingPlan(msgspec.Struct, frozen=True, kw_only=True):
-    """A recipe's own settings of some weights.
+    """The settings for training some weights that only recipes have.
 
-    The other keys are fields of `ModelChoice` and `TrainConfig`.
+    The remaining keys are fields of `ModelChoice` and `TrainConfig`.
 
     Attributes:
-        release: Name of the recipe's release to learn from; empty for existing weights.
-        split: Split of that release.
-        validation: Split of that release that selects the best weights; None for none.
-        also: Name of another release to learn from; None for none.
+        release: Which of the recipe's releases to learn from; empty for existing weights.
+        split: Split of that release to learn from.
+        validation: Split of that release on which the best weights are selected; None for none.
+        also: Another release to learn from; None for none.
         also_split: Split of the other release.
-        mix: Share of all moments that come from the other release.
-        start: Name of earlier weights of the recipe to begin from; `from` in the file.
-        file: Existing weights, as `deepaccident predict` takes them.
+        mix: Share of the training frames that come from the other release.
+        start: Earlier weights of the recipe to start from; called `from` in the file.
+        file: Existing weights, as accepted by `deepaccident predict`.
     """
 
     release: str = ""
@@ -260,19 +267,19 @@ class Recipe(_Part, frozen=True, kw_only=True):
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """The pairs of rows that are compared, without repetition; the headline comes first."""
+        """The pairs of rows that are compared, without repetition, the headline first."""
         pairs = list(self.compare)
         if self.headline is not None:
             pairs.insert(0, (self.headline.row, self.headline.less))
         return list(dict.fromkeys(pairs))
 
     def plan(self, weights: str) -> TrainingPlan:
-        """Return the training plan of some weights; raises ValueError."""
+        """Return the training plan of some weights; raise ValueError if its keys are wrong."""
         return as_record(self.weights[weights], TrainingPlan)
 
 
 class _Source(msgspec.Struct):
-    """The keys of a release that name files."""
+    """The keys of a release that are file names."""
 
     dataroot: str = ""
     version: str = ""
@@ -288,77 +295,87 @@ class _File(msgspec.Struct):
 
 
 def read_recipe(recipe: str, *, smoke: bool = False) -> Recipe:
-    """Read a recipe from a file, or a shipped one by its name; `smoke` applies its part `smoke`.
+    """Read a recipe from a file, or a shipped recipe by name.
+
+    Args:
+        recipe: Path of the file, or name of a shipped recipe.
+        smoke: Whether to apply the changes in the recipe's part `smoke`.
 
     Raises:
-        ConfigError: The file does not exist, cannot be read, or is no recipe.
+        ConfigError: If the file does not exist, cannot be read, or is not a recipe.
     """
-    path = _recipe_path(recipe)
+    path = _find_recipe(recipe)
     content = _read_content(path)
     with recipe_place(path, "the recipe"):
         file = as_record(content, _File)
-        if smoke and not file.smoke:
-            raise ConfigError("smoke: is missing; write this part, or leave out --smoke")
-        merged = _merged(content, file.smoke if smoke else {})
-        merged |= {"name": f"{path.stem}{'-smoke' * smoke}"}
-        merged.pop("smoke", None)
-        file = as_record(merged, _File)
-        merged["rows"] = _all_rows(file)
-        for name, source in file.releases.items():
+        name = path.stem
+        if smoke:
+            if not file.smoke:
+                raise ConfigError("smoke: is missing; add this part, or remove --smoke")
+            content = _merge_changes(content, file.smoke)
+            name = f"{name}-smoke"
+        settings = {**content, "name": name}
+        settings.pop("smoke", None)
+        file = as_record(settings, _File)
+        settings["rows"] = _expand_rows(file)
+        for release, source in file.releases.items():
             if source.spec:
-                merged["releases"][name]["spec"] = str(path.parent / source.spec)
-        result = as_record(merged, Recipe)
+                settings["releases"][release]["spec"] = str(path.parent / source.spec)
+        result = as_record(settings, Recipe)
     _check_recipe(path, result)
     return result
 
 
-def _recipe_path(recipe: str) -> Path:
-    """Return the path of a recipe, given as a file or by the name of a shipped one."""
+def _find_recipe(recipe: str) -> Path:
+    """Return the path of a recipe, which is a file or the name of a shipped recipe."""
     path = Path(recipe)
     if path.suffix in (".yaml", ".yml"):
         return path
     shipped_names = sorted(file.stem for file in SHIPPED_RECIPES.glob("*.yaml"))
-    name = choice("RECIPE, which is no file .yaml", recipe, shipped_names, error=ConfigError)
+    name = choice("RECIPE", recipe, shipped_names, error=ConfigError, also=", or a .yaml file")
     return SHIPPED_RECIPES / f"{name}.yaml"
 
 
 def _read_content(path: Path) -> Any:
-    """Read a YAML file as plain values; raises ConfigError."""
+    """Read a YAML file as plain values; raise ConfigError if it is unreadable."""
     try:
         text = read_bytes(path, "spec").decode().strip()
         if len(text) > _MAX_CHARACTERS:
             raise ConfigError(f"{path}: has more than 100,000 characters; split the study")
-        return _plain(parse_yaml(text or "{}", str(path)))
+        return _plain_value(parse_yaml(text or "{}", str(path)))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {fault_text(error)}; give a file of YAML, in UTF-8") from error
+        raise ConfigError(f"{path}: {fault_text(error)}; give a YAML file in UTF-8") from error
 
 
-def _all_rows(file: _File) -> list[Mapping[str, Any]]:
-    """Return the rows with each list expanded; raises ConfigError if there are too many or none."""
+def _expand_rows(file: _File) -> list[Settings]:
+    """Expand the lists in the rows; raise ConfigError if there are no rows or too many."""
     count = 0
     for row in file.rows:
-        count += math.prod(map(len, _lists(row).values()))
+        count += math.prod(map(len, _lists_of_row(row).values()))
     if not 0 < count <= MAX_ROWS:
         raise ConfigError(
-            f"rows: expected 1 to {MAX_ROWS:,}, found {count:,}: a list makes a row of each of its "
-            "values, and several lists a row of each combination; change the lists"
+            f"rows: expected 1 to {MAX_ROWS:,}, found {count:,}; each value of a list, and each "
+            "combination of several lists, makes a row: change the lists"
         )
-    return [expanded for row in file.rows for expanded in _expanded_rows(row)]
+    expanded_rows: list[Settings] = []
+    for row in file.rows:
+        expanded_rows += _expand_row(row)
+    return expanded_rows
 
 
 @contextmanager
 def recipe_place(path: Path | str, place: str) -> Iterator[None]:
-    """Prefix errors of the block with the recipe and the key; raises ConfigError."""
+    """Add the recipe and a place in it to the errors of the block; they become ConfigErrors."""
     try:
         yield
     except (DeepAccidentError, ValueError) as error:
         raise ConfigError(f"{path}: {place}: {error}; docs/studies.md shows a recipe") from error
 
 
-def synth_config_of(source: Mapping[str, Any]) -> SynthConfig | None:
+def synth_config_of(source: Settings) -> SynthConfig | None:
     """Return the config of a synthetic release; None for an existing release.
 
-    Raises ConfigError, ChoiceError or ValueError.
+    Raise ConfigError, ChoiceError or ValueError if a field is wrong.
     """
     is_existing = "dataroot" in source
     if is_existing:
@@ -371,11 +388,13 @@ def synth_config_of(source: Mapping[str, Any]) -> SynthConfig | None:
     if source.get("spec"):
         settings["spec"] = Path(source["spec"])
     checked_flag(NUSCENES, settings.pop(NUSCENES, False))
-    return None if is_existing else as_record(settings, SynthConfig)
+    if is_existing:
+        return None
+    return as_record(settings, SynthConfig)
 
 
 def _check_recipe(path: Path, recipe: Recipe) -> None:
-    """Check that the parts of a recipe fit one another and the devkit; raises ConfigError."""
+    """Raise a ConfigError if parts of a recipe contradict each other or the devkit."""
     test = recipe.test
     name_counts = Counter(row.name for row in recipe.rows)
     for name, source in recipe.releases.items():
@@ -395,14 +414,14 @@ def _check_recipe(path: Path, recipe: Recipe) -> None:
             _check_row(row, recipe)
             if name_counts[row.name] > 1:
                 raise ConfigError(
-                    "name: is there twice; name the keys that have lists in it, such as {agents}"
+                    "name: appears twice; put the keys with lists into the name, such as {agents}"
                 )
     with recipe_place(path, "test.where, groups"):
         for text in chain(test.where, *recipe.groups.values()):
             parse_where(text)
     with recipe_place(path, "by"):
-        for by in recipe.by:
-            attribute_name(by)
+        for attribute in recipe.by:
+            attribute_name(attribute)
     with recipe_place(path, "compare, headline"):
         for name in chain(*recipe.pairs):
             _check_name("row", name, name_counts)
@@ -412,18 +431,18 @@ def _check_recipe(path: Path, recipe: Recipe) -> None:
 
 
 def _check_plan(recipe: Recipe, name: str, earlier_weights: Collection[Any]) -> None:
-    """Check the plan of some weights, which may begin from `earlier_weights`.
+    """Check the plan of some weights, which may start from `earlier_weights`.
 
-    Raises ConfigError or ChoiceError.
+    Raise ConfigError or ChoiceError if it is wrong.
     """
     plan = recipe.plan(name)
     if plan.file is not None:
         if len(recipe.weights[name]) > 1:
-            raise ConfigError("file: these weights are there; leave the other keys out")
+            raise ConfigError("file: these weights already exist; remove the other keys")
         return
     _check_name("release", plan.release, recipe.releases)
     _check_name("also", plan.also, (None, *recipe.releases))
-    _check_name("from, which stands above", plan.start, earlier_weights)
+    _check_name("from (weights listed above)", plan.start, earlier_weights)
     if not 0 < plan.mix < 1:
         raise ConfigError(
             f"mix: expected a share between 0 and 1 of all moments, found {plan.mix!r}"
@@ -431,15 +450,13 @@ def _check_plan(recipe: Recipe, name: str, earlier_weights: Collection[Any]) -> 
 
 
 def _check_name(kind: str, name: str | None, names: Collection[str | None]) -> None:
-    """Raise ChoiceError if `names` lacks the name, ConfigError if only its case differs."""
+    """Raise a ChoiceError if `names` lacks `name`; a ConfigError if only its case differs."""
     if choice(kind, name, names) != name:
-        raise ConfigError(
-            f"{kind}: found {name!r}; write it with the same capital letters everywhere"
-        )
+        raise ConfigError(f"{kind}: found {name!r}; use the same capital letters everywhere")
 
 
 def _check_row(row: StudyRow, recipe: Recipe) -> None:
-    """Check a row by itself and the names that it uses; raises ConfigError or ChoiceError."""
+    """Raise a ConfigError or ChoiceError if a row, or a name in it, is wrong."""
     faults = row.faults
     if faults:
         raise ConfigError(faults[0])
@@ -448,51 +465,63 @@ def _check_row(row: StudyRow, recipe: Recipe) -> None:
         for agent in row.cooperating:
             _check_name("agents", agent, (*AGENT_SETS, *AGENTS))
     recipe.test.label_config(row.horizon)
-    _ = row.link  # building the link checks its effects
+    _ = row.link  # creating the link checks its fields
 
 
-def _lists(row: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """Return the lists of a row that are expanded to rows, by key."""
-    return {key: row[key] for key in _LIST_KEYS if isinstance(row.get(key), list)}
+def _lists_of_row(row: Settings) -> dict[str, list[Any]]:
+    """Return the lists in a row that are expanded to rows, by key."""
+    lists = {}
+    for key in _LIST_KEYS:
+        if isinstance(row.get(key), list):
+            lists[key] = row[key]
+    return lists
 
 
-def _expanded_rows(row: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Yield a row for each combination of the values of its lists."""
-    lists = _lists(row)
-    series_key = next((key for key in lists if key != "agents"), None)
+def _expand_row(row: Settings) -> Iterator[Settings]:
+    """Yield one row per combination of the values in a row's lists."""
+    lists = _lists_of_row(row)
+    if not lists:
+        yield row
+        return
+    number_keys = [key for key in lists if key != "agents"]
     for combination in product(*lists.values()):
         values = dict(zip(lists, combination, strict=True))
-        if not values:
-            yield row
-            continue
         series = None
-        if series_key is not None:
-            series_name = _filled_name(row.get("name"), {**values, series_key: "…"})
-            series = [series_key, values[series_key], series_name]
-        name = _filled_name(row.get("name"), values)
+        if number_keys:
+            key = number_keys[0]
+            series_name = _fill_name(row.get("name"), {**values, key: "…"})
+            series = [key, values[key], series_name]
+        name = _fill_name(row.get("name"), values)
         yield {**row, **values, "name": name, "over": series}
 
 
-def _filled_name(name: object, values: Mapping[Any, Any]) -> str:
-    """Return a name with its `{key}` parts replaced by values.
+def _fill_name(name: object, values: Mapping[Any, Any]) -> str:
+    """Replace `{key}` in a name by values.
 
-    `str.format` would also read attributes.
+    `str.format` is not used because it would also read attributes.
     """
-    return re.sub(r"\{(\w+)\}", lambda match: str(values.get(match[1], match[0])), str(name))
+
+    def fill(match: re.Match[str]) -> str:
+        value = values.get(match[1], match[0])
+        return str(value)
+
+    return re.sub(r"\{(\w+)\}", fill, str(name))
 
 
-def _merged(value: Any, changes: Any) -> Any:
-    """Return a value replaced by its changes; two mappings are merged key by key."""
+def _merge_changes(value: Any, changes: Any) -> Any:
+    """Apply changes to a value; mappings are merged key by key."""
     if not (isinstance(value, dict) and isinstance(changes, dict)):
         return changes
-    changed = {key: _merged(value.get(key), change) for key, change in changes.items()}
-    return {**value, **changed}
+    merged = dict(value)
+    for key, change in changes.items():
+        merged[key] = _merge_changes(value.get(key), change)
+    return merged
 
 
-def _plain(node: Node) -> Any:
-    """Return the value of a YAML node as JSON holds it."""
+def _plain_value(node: Node) -> Any:
+    """Convert a YAML node to JSON values."""
     if isinstance(node.value, Mapping):
-        return {key: _plain(entry) for key, entry in node.value.items()}
+        return {key: _plain_value(entry) for key, entry in node.value.items()}
     if isinstance(node.value, tuple):
-        return [_plain(entry) for entry in node.value]
+        return [_plain_value(entry) for entry in node.value]
     return node.value

@@ -1,14 +1,14 @@
-"""`run_study`: from a recipe to its results, cell by cell."""
+"""`run_study`: makes a study cell by cell, from its recipe to its results."""
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -20,6 +20,7 @@ from deepaccident_devkit.evaluation.runs.setups import release_note, scenario_of
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.plugins.study.cells import (
+    Notes,
     RowEvaluation,
     StudyCell,
     Workspace,
@@ -34,6 +35,7 @@ from deepaccident_devkit.plugins.study.recipe import (
     DEFAULT_HORIZON,
     NUSCENES,
     Recipe,
+    Settings,
     TrainingPlan,
     recipe_place,
     synth_config_of,
@@ -54,7 +56,7 @@ from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.plugins import need_plugin
 from deepaccident_devkit.support.reading import file_checksum
-from deepaccident_devkit.support.text import choice, natural_order
+from deepaccident_devkit.support.text import PathType, choice, counted, natural_order
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -64,44 +66,46 @@ if TYPE_CHECKING:
     from deepaccident_devkit.plugins.model import ModelChoice
     from deepaccident_devkit.support.parallel import Engine
 
-# Settings of releases that keys of earlier studies lack, with the values that these studies had.
-_LATER_SETTINGS: Final = {"rig": "released", "decimals": None}
-# The model, and the weights of each seed; weights from a file have an empty text as their seed.
+# Release settings that the keys of earlier studies lack → the values in those studies.
+_LATER_SETTINGS = {"rig": "released", "decimals": None}
+# The model, and seed → cell of the weights; weights from a file have the seed "".
 _Weights = tuple["ModelChoice", dict[str, StudyCell]]
+# The cell of a release, and the opened release.
 _Release = tuple[StudyCell, DeepAccident]
 
 
 def run_study(
-    recipe: Recipe, out: str | os.PathLike[str], *, device: str = "auto", **engine: Unpack[Engine]
+    recipe: Recipe, out: PathType, *, device: str = "auto", **engine: Unpack[Engine]
 ) -> StudyReport:
     """Make the missing cells of a study, and write its results into `out/NAME`.
 
-    NAME is the recipe's. After a kill the same call resumes. Studies with the same `out` share
-    releases, weights and rows.
+    NAME is that of the recipe. After a kill, the same call resumes. Studies with the same `out`
+    share releases, weights and rows.
 
     Args:
-        recipe: A recipe from `read_recipe`.
-        out: Folder of one or several studies.
-        device: Device of models: `auto`, `cpu`, `cuda`, …
+        recipe: A recipe returned by `read_recipe`.
+        out: Folder for one or more studies.
+        device: Device on which models run: `auto`, `cpu`, `cuda`, …
         **engine: `workers` (None for the number of cores, or one with a GPU), `executor` and
-            `progress`, as in `parallel.Engine`.
+            `progress`; see `parallel.Engine`.
 
     Returns:
-        The report. The folder has it as `study.json`, `tables/*.csv`, `figures/*.png`,
+        The report. It is also written to the folder: `study.json`, `tables/*.csv`, `figures/*.png`,
         `index.html`, and the counts of all samples as `counts.json.gz` (`read_counts`).
 
     Raises:
-        ConfigError: The recipe asks for impossible weights or samples, or something cannot be
+        ConfigError: If the weights or samples of the recipe are impossible, or something cannot be
             written.
-        SomeFailedError: Some cells failed; the others are done.
-        DeepAccidentError: As in `make_release`, `model.train` and `evaluate_results`.
+        SomeFailedError: If some cells failed; the others are finished.
+        DeepAccidentError: For the reasons in `make_release`, `model.train` and `evaluate_results`.
     """
     if recipe.weights:
         need_plugin("model", "a study with weights")
         from deepaccident_devkit.plugins.model import checked_device
 
         device = checked_device(device)
-    workspace = Workspace(writable_folder(out).absolute(), device if recipe.weights else "cpu")
+    cell_device = device if recipe.weights else "cpu"
+    workspace = Workspace(writable_folder(out).absolute(), cell_device)
     default_workers = 1 if device.startswith("cuda") else usable_cores()
     cell_engine: Any = {**engine, "workers": engine.get("workers") or default_workers}
     test = recipe.test
@@ -109,34 +113,36 @@ def run_study(
         releases = {}
         for name in recipe.releases:
             releases[name] = _make_release(workspace, name, recipe, **engine)
-        dataset = releases[test.release][1]
-        candidates = _scenarios(dataset, test.split)
-        tested = _matching_scenarios(dataset, test.where, candidates, recipe, "test.where")
+        _, dataset = releases[test.release]
+        candidates = _scenarios_of_split(dataset, test.split)
+        tested = _find_matching_scenarios(dataset, test.where, candidates, recipe, "test.where")
         if not test.includes_training:
-            _refuse_known_tests(recipe, releases, (dataset, tested))
+            _refuse_known_scenarios(recipe, releases, (dataset, tested))
         weights = _make_weights(recipe, workspace, releases, **cell_engine)
         rows = _row_cells(recipe, workspace, releases[test.release], weights, tested)
-        cells_of_rows = [cell for seeds in rows.values() for cell in seeds.values()]
-        workspace.make_cells(cells_of_rows, "rows", dataset.places, **cell_engine)
-        counted = _counted(recipe, dataset, rows)
+        cells_of_rows = list(chain.from_iterable(seeds.values() for seeds in rows.values()))
+        workspace.make_cells(
+            cells_of_rows, "Predicting and evaluating rows", dataset.places, **cell_engine
+        )
+        row_counts = _collect_counts(recipe, dataset, rows)
         cells = [cell for cell, _ in releases.values()]
         for _, weight_cells in weights.values():
             cells += weight_cells.values()
         cells += cells_of_rows
         cell_notes = [_notes_without_counts(cell) for cell in cells]
     summary = {
-        **summarised(counted),
+        **summarised(row_counts),
         "recipe": msgspec.to_builtins(recipe),
         "devkit": __version__,
         "cells": cell_notes,
     }
     report = StudyReport(summary=json.loads(json.dumps(summary)))
-    save_study(report, counted, workspace.out / recipe.name)
+    save_study(report, row_counts, workspace.out / recipe.name)
     return report
 
 
-def _notes_without_counts(cell: StudyCell) -> dict[str, Any]:
-    """Return the report's entry of a cell."""
+def _notes_without_counts(cell: StudyCell) -> Notes:
+    """Return what the report contains about a cell: its notes without the counts."""
     notes = {"kind": cell.kind, "name": cell.name, "key": cell.key, **(cell.notes or {})}
     notes.pop("counts", None)
     return notes
@@ -145,15 +151,14 @@ def _notes_without_counts(cell: StudyCell) -> dict[str, Any]:
 def _make_release(
     workspace: Workspace, name: str, recipe: Recipe, **engine: Unpack[Engine]
 ) -> _Release:
-    """Return a release, which all workers make if it is missing."""
+    """Return the cell of a release, and open it; if missing, all workers make it together."""
     source = recipe.releases[name]
     config = synth_config_of(source)
-    decides: dict[str, Any]
+    decides: Notes = {}
     if config is None:
         dataset = _open_release(source)
-        decides = {**source, "release": release_note(dataset, _scenarios(dataset))}
+        decides = {**source, "release": release_note(dataset, _scenarios_of_split(dataset))}
     else:
-        decides = {}
         for setting, value in asdict(config).items():
             if _LATER_SETTINGS.get(setting, ...) != value:
                 decides[setting] = value
@@ -166,8 +171,8 @@ def _make_release(
     return cell, _open_release(source, cell.folder)
 
 
-def _open_release(source: Mapping[str, Any], folder: Path | None = None) -> DeepAccident:
-    """Open a release, in nuScenes' format if the recipe asks for it."""
+def _open_release(source: Settings, folder: Path | None = None) -> DeepAccident:
+    """Open a release; convert it to nuScenes' format if the recipe asks for it."""
     if folder is not None and source.get(NUSCENES):
         need_plugin("nuscenes", "a study on nuScenes")
         from deepaccident_devkit.plugins.nuscenes.check import check_source
@@ -176,36 +181,40 @@ def _open_release(source: Mapping[str, Any], folder: Path | None = None) -> Deep
         nuscenes = open_nuscenes(folder / NUSCENES)
         check_source(nuscenes)
         return nuscenes
-    return DeepAccident(source.get("version", "v1"), source.get("dataroot", folder), verbose=False)
+    version = source.get("version", "v1")
+    return DeepAccident(version, source.get("dataroot", folder), verbose=False)
 
 
-def _write_release(source: Mapping[str, Any], engine: Any, folder: Path) -> dict[str, Any]:
-    """Write a release if it is missing; return its number of scenarios and fingerprint."""
+def _write_release(source: Settings, engine: Any, folder: Path) -> Notes:
+    """Write a release if it is missing; return its number of scenarios, and its fingerprint."""
     config = synth_config_of(source)
-    release = folder.with_name(f"{folder.name}-release") if source.get(NUSCENES) else folder
+    release = folder
+    if source.get(NUSCENES):
+        release = folder.with_name(f"{folder.name}-release")
     if config is not None and not release.is_dir():
         make_release(release, config, **engine)
     if release != folder and not (folder / NUSCENES).is_dir():
         form = NuScenes(agents=AGENTS[:1], lidar_axes="nuscenes", sweeps=False)
         dataset = DeepAccident("v1", release, verbose=False)
         export_release(dataset, folder / NUSCENES, form, **engine)
-    folder.mkdir(parents=True, exist_ok=True)  # the folder of an existing release stays empty
+    folder.mkdir(parents=True, exist_ok=True)  # for existing releases, it stays empty
     dataset = _open_release(source, folder)
     quiet_engine = {name: value for name, value in engine.items() if name != "progress"}
-    hashes = scenario_hashes(dataset, _scenarios(dataset), **quiet_engine)
+    hashes = scenario_hashes(dataset, _scenarios_of_split(dataset), **quiet_engine)
     return {"scenarios": len(hashes), "fingerprint": fingerprint(hashes)}
 
 
-def _scenarios(dataset: DeepAccident, split: str = "all") -> list[str]:
-    """Return the tokens of a split's scenarios, in the order of the release."""
+def _scenarios_of_split(dataset: DeepAccident, split: str = "all") -> list[str]:
+    """Return the tokens of the scenarios in a split, in the order of the release."""
     split_tokens = dataset.split_scenarios(split)
-    return [record["token"] for record in dataset.scenario if record["token"] in split_tokens]
+    tokens = [record["token"] for record in dataset.scenario]
+    return [token for token in tokens if token in split_tokens]
 
 
-def _refuse_known_tests(
+def _refuse_known_scenarios(
     recipe: Recipe, releases: Mapping[str, _Release], tested: ReleaseScenarios
 ) -> None:
-    """Raise ConfigError if a training shows scenarios of the test, or their twins."""
+    """Raise a ConfigError if a training contains test scenarios, or their twins."""
     for name in recipe.weights:
         plan = recipe.plan(name)
         splits = (
@@ -214,17 +223,19 @@ def _refuse_known_tests(
             (plan.also, plan.also_split),
         )
         for release, split in splits:
-            if release and split:
-                with recipe_place(recipe.name, f"weights.{name}"):
-                    dataset = releases[release][1]
-                    known = known_scenarios((dataset, _scenarios(dataset, split)), tested)
-                    if known:
-                        raise ConfigError(
-                            f"{release}, {split}: shows {len(known)} scenarios of the test, or "
-                            f"their twins, such as {known[0]}; change split, also_split or "
-                            "validation here, or the test's split, or say includes_training: true "
-                            "in test"
-                        )
+            if not release or not split:
+                continue
+            with recipe_place(recipe.name, f"weights.{name}"):
+                _, dataset = releases[release]
+                learned = _scenarios_of_split(dataset, split)
+                known_tokens = known_scenarios((dataset, learned), tested)
+                if known_tokens:
+                    raise ConfigError(
+                        f"{release}, {split}: contains {counted(len(known_tokens), 'scenario')} of "
+                        f"the test, or their twins, such as {known_tokens[0]}; change split, "
+                        "also_split or validation here, or the split of the test, or set "
+                        "includes_training: true in test"
+                    )
 
 
 def _make_weights(
@@ -233,10 +244,10 @@ def _make_weights(
     releases: Mapping[str, _Release],
     **engine: Unpack[Engine],
 ) -> dict[str, _Weights]:
-    """Return all weights, which are made if they are missing.
+    """Make all missing weights; return the weights by name.
 
-    Weights that begin from random ones are made together, then the weights that begin from these,
-    and so on.
+    Weights that start from random ones are made together. Weights that start from these follow, and
+    so on.
     """
     weights: dict[str, _Weights] = {}
     depths: dict[str | None, int] = {None: -1}
@@ -252,7 +263,7 @@ def _make_weights(
         for name, (_, cells_by_seed) in weights.items():
             if depths[name] == depth:
                 cells += cells_by_seed.values()
-        workspace.make_cells(cells, "weights", tuple(reads), **engine)
+        workspace.make_cells(cells, "Training weights", tuple(reads), **engine)
     return weights
 
 
@@ -263,9 +274,9 @@ def _weight_cells(
     releases: Mapping[str, _Release],
     earlier_weights: Mapping[str, _Weights],
 ) -> _Weights:
-    """Return the model of some weights and the cell of each seed.
+    """Return the model of some weights, and the cell of each seed.
 
-    Raises ConfigError, ChoiceError or ValueError.
+    Raise ConfigError, ChoiceError or ValueError if the recipe's settings for it are wrong.
     """
     from deepaccident_devkit.plugins.model import (
         ModelChoice,
@@ -274,7 +285,8 @@ def _weight_cells(
         read_weights,
     )
 
-    plan, settings = recipe.plan(name), recipe.weights[name]
+    plan = recipe.plan(name)
+    settings = recipe.weights[name]
     if plan.file is not None:
         file = read_weights(plan.file)
         work = partial(copy_weights, file.path)
@@ -287,28 +299,33 @@ def _weight_cells(
     second_source = None
     if plan.also is not None:
         other_cell, other_dataset = releases[plan.also]
-        other_split = workspace.split(_scenarios(other_dataset, plan.also_split))
+        other_split = workspace.split(_scenarios_of_split(other_dataset, plan.also_split))
         second_source = SecondSource(dataset=other_dataset, split=str(other_split), mix=plan.mix)
         decides["also"] = {"release": other_cell.key, "mix": plan.mix}
-        if plan.also_split != "all":  # keys of earlier studies, which all had "all", lack it
+        if plan.also_split != "all":  # earlier studies always used "all", and their keys lack it
             decides["also"]["split"] = other_split.name
-    valid_keys = [*TrainingPlan.__struct_encode_fields__, *model_keys, *training_keys]
-    valid_keys = [key for key in valid_keys if key != "seed"]
+    plan_keys = TrainingPlan.__struct_encode_fields__
+    valid_keys = [key for key in (*plan_keys, *model_keys, *training_keys) if key != "seed"]
     for key in settings:
         choice("key", key, valid_keys)
-    start_model, start_cells = earlier_weights[plan.start] if plan.start else (ModelChoice(), {})
+    start_model = ModelChoice()
+    start_cells: dict[str, StudyCell] = {}
+    if plan.start:
+        start_model, start_cells = earlier_weights[plan.start]
     model_settings = {key: settings[key] for key in model_keys if key in settings}
     model = as_record({**start_model.as_dict(), **model_settings}, ModelChoice)
     training_settings = {key: settings[key] for key in training_keys if key in settings}
-    split = workspace.split(_scenarios(dataset, plan.split))
+    split = workspace.split(_scenarios_of_split(dataset, plan.split))
     cells = {}
     for seed in recipe.seeds:
-        config = as_record(
-            {"validation": None, **training_settings, "split": str(split), "seed": seed},
-            TrainConfig,
-        )
+        seed_settings = {**training_settings, "split": str(split), "seed": seed}
+        config = as_record({"validation": None, **seed_settings}, TrainConfig)
         start_cell = start_cells.get(str(seed), start_cells.get(""))
-        start_folder = None if start_cell is None else start_cell.folder
+        start_folder = None
+        start_key = None
+        if start_cell is not None:
+            start_folder = start_cell.folder
+            start_key = start_cell.key
         work = partial(
             train_weights, dataset, model, config, start_folder, second_source, workspace.device
         )
@@ -319,7 +336,7 @@ def _weight_cells(
             release=release_cell.key,
             model=model.as_dict(),
             training={**config.as_dict(), "split": split.name},
-            start=None if start_cell is None else start_cell.key,
+            start=start_key,
             **decides,
         )
     return model, cells
@@ -332,7 +349,7 @@ def _row_cells(
     weights: Mapping[str, _Weights],
     scenarios: Sequence[str],
 ) -> dict[str, dict[str, StudyCell]]:
-    """Return the cell of each seed of each row, all at the same samples of some scenarios."""
+    """Return row → seed → cell; all cells have the same samples."""
     release_cell, dataset = release
     test = recipe.test
     horizons = {}
@@ -348,7 +365,7 @@ def _row_cells(
     )
     with recipe_place(recipe.name, "test"):
         if not scenarios:
-            raise ConfigError("where: no pair of scenarios matches; change the filters")
+            raise ConfigError("where: no scenario pair matches; change the filters")
         selection.tokens(dataset)
     samples = {**selection.as_dict(), "split": Path(selection.split).name}
     cells: dict[str, dict[str, StudyCell]] = {}
@@ -362,44 +379,61 @@ def _row_cells(
         labels = test.label_config(horizons[row.name])
         cells[row.name] = {}
         for seed, weights_cell in cells_of_weights.items():
+            name = f"{row.name}, seed {seed}" if seed else row.name
+            weights_folder = None
+            weights_key = None
+            if weights_cell is not None:
+                weights_folder = weights_cell.folder
+                weights_key = weights_cell.key
             evaluation = RowEvaluation(
                 dataset=dataset,
                 row=row,
                 selection=selection,
                 labels=labels,
-                weights=None if weights_cell is None else weights_cell.folder,
+                weights=weights_folder,
                 device=workspace.device,
             )
             cells[row.name][seed] = workspace.cell(
                 "row",
-                f"{row.name}, seed {seed}" if seed else row.name,
+                name,
                 evaluation,
                 **decides,
                 labels=[test.labels, horizons[row.name]],
                 samples=samples,
                 release=release_cell.key,
-                trained=None if weights_cell is None else weights_cell.key,
+                trained=weights_key,
             )
     return cells
 
 
-def _matching_scenarios(
+def _find_matching_scenarios(
     dataset: DeepAccident,
     where: Sequence[str],
     scenarios: Iterable[str],
     recipe: Recipe,
     place: str,
 ) -> list[str]:
-    """Return the scenarios of all pairs in which one matches all filters; raises ConfigError."""
+    """Return the scenarios of all pairs in which either scenario satisfies every filter.
+
+    Args:
+        dataset: The release.
+        where: Filters, in the syntax of `--where`.
+        scenarios: Tokens of the candidates.
+        recipe: The recipe.
+        place: Where the recipe contains the filters, for error messages.
+
+    Raises:
+        ConfigError: If a filter is wrong.
+    """
     with recipe_place(recipe.name, place):
         pairs = {cluster_of(record["token"]) for record in find(dataset, *where)}
     return [token for token in scenarios if cluster_of(token) in pairs]
 
 
-def _counted(
+def _collect_counts(
     recipe: Recipe, dataset: DeepAccident, rows: Mapping[str, Mapping[str, StudyCell]]
 ) -> Counted:
-    """Return the counts of all rows, and the groups of samples."""
+    """Collect the counts of all rows, and the groups of samples."""
     description = {
         "title": recipe.title,
         "question": recipe.question,
@@ -417,11 +451,11 @@ def _counted(
     groups = {ALL: tokens}
     scenarios = [scenario_of(token) for token in tokens]
     for name, where in recipe.groups.items():
-        matches = set(_matching_scenarios(dataset, where, scenarios, recipe, f"groups.{name}"))
+        matches = set(_find_matching_scenarios(dataset, where, scenarios, recipe, f"groups.{name}"))
         groups[name] = [token for token in tokens if scenario_of(token) in matches]
     attributes = sample_attributes(dataset, tokens) if recipe.by else {}
-    for by in recipe.by:
-        values = tokens_by_value(attributes, by)
+    for attribute in recipe.by:
+        values = tokens_by_value(attributes, attribute)
         for value in sorted(values, key=natural_order):
-            groups[f"{by}={value or 'unknown'}"] = values[value]
+            groups[f"{attribute}={value or 'unknown'}"] = values[value]
     return counted_of(counts, groups, description)

@@ -1,17 +1,14 @@
-"""The numbers of a study, computed from the counts of its samples; and a file of these counts.
+"""The numbers of a study, computed from its samples' counts; and a file that stores these counts.
 
 `summarised(read_counts("studies/agents/counts.json.gz"))["headline"]` is the main result of a
-study; no release is needed.
+study. It can be computed without a release.
 """
-
-from __future__ import annotations
 
 import gzip
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
@@ -27,31 +24,32 @@ from deepaccident_devkit.plugins.study.numbers import (
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
-from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.reading import read_bytes, reason_text
 from deepaccident_devkit.support.reports import Report, Row
-from deepaccident_devkit.support.text import columns_text, fixed_text, path_of
+from deepaccident_devkit.support.text import PathType, columns_text, fixed_text, path_of
 
-# The name of the group of all samples.
-ALL: Final = "all samples"
-# Numbers that the terminal and the figures show after the headline's number.
-MAIN_NUMBERS: Final = ("apa", "iou_100", "map", "hidden_foreground")
-_VERDICT_TEXTS: Final = {
-    "wins": "{row} wins: it has more {number} than {less}, by {size}",
-    "loses": "{row} loses: it has less {number} than {less}, by {size}",
-    "not decided": "it is not decided whether {row} has more {number} than {less}: the difference "
-    "is {size}",
+# Numbers of a study or of a part of it, which can be written as JSON.
+Summary = Mapping[str, Any]
+# Name of the group that contains all samples.
+ALL = "all samples"
+# Numbers that the terminal and the figures show after the number in the headline.
+MAIN_NUMBERS = ("apa", "iou_100", "map", "hidden_foreground")
+_VERDICT_TEXTS = {
+    "wins": "{row} wins: its {number} is higher than that of {less}, by {size}",
+    "loses": "{row} loses: its {number} is lower than that of {less}, by {size}",
+    "not decided": "no significant difference in {number} between {row} and {less} ({size})",
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counted(ShortRepr):
-    """Everything that the numbers of a study are computed from.
+    """The counts from which all numbers of a study are computed.
 
     Attributes:
-        description: `title`, `question`, `headline`, `compare` and `labels` of the recipe, and
-            `over` of its rows.
-        groups: Name → tokens of its samples; the group `ALL` comes first.
-        rows: Name → its evaluators by seed; a row without seeds has an empty text as its seed.
+        description: The recipe's `title`, `question`, `headline`, `compare` and `labels`, and the
+            rows' `over`.
+        groups: Name → tokens of the group's samples; the group `ALL` comes first.
+        rows: Name → seed → evaluators; a row without seeds has the seed "".
     """
 
     description: Mapping[str, Any]
@@ -59,8 +57,8 @@ class Counted(ShortRepr):
     rows: Mapping[str, EvaluatorsBySeed]
 
 
-def write_counts(counted: Counted, path: str | os.PathLike[str]) -> None:
-    """Write all counts to a compressed JSON file; equal counts give equal bytes."""
+def write_counts(counted: Counted, path: PathType) -> None:
+    """Write all counts to a compressed JSON file; equal counts yield identical files."""
     rows: dict[str, dict[str, dict[str, Any]]] = {}
     for name, seeds in counted.rows.items():
         rows[name] = {}
@@ -74,15 +72,15 @@ def write_counts(counted: Counted, path: str | os.PathLike[str]) -> None:
     write_bytes(path_of(path), gzip.compress(text.encode(), mtime=0))
 
 
-def read_counts(path: str | os.PathLike[str]) -> Counted:
-    """Read a file of `write_counts`; raises ResultsError if it is unreadable or another file."""
+def read_counts(path: PathType) -> Counted:
+    """Read a file written by `write_counts`; raise ResultsError if it is not such a file."""
     source = path_of(path)
     try:
         payload = parsed_json(gzip.decompress(read_bytes(source, "results")), constants=True)
         return counted_of(payload.pop("rows"), payload.pop("groups"), payload)
     except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ResultsError(
-            f"{source}: no counts of a study ({fault_text(error)}); run the study again"
+            f"{source}: contains no counts of a study ({reason_text(error)}); run the study again"
         ) from error
 
 
@@ -91,7 +89,7 @@ def counted_of(
     groups: Mapping[str, Sequence[str]],
     description: Mapping[str, Any],
 ) -> Counted:
-    """Return the record of counts, given as row → seed → evaluator → token → counts."""
+    """Build `Counted` from counts by row, seed, evaluator and token (nested in this order)."""
     rows: dict[str, dict[str, Evaluators]] = {}
     for name, seeds in counts.items():
         for seed, counts_by_kind in seeds.items():
@@ -99,7 +97,7 @@ def counted_of(
             rows.setdefault(name, {})[seed] = evaluators
             for kind in list(evaluators):
                 if kind not in counts_by_kind:
-                    del evaluators[kind]  # nuScenes has no accidents
+                    del evaluators[kind]  # nuScenes contains no accidents
             for kind, evaluator in evaluators.items():
                 for token, sample_counts in counts_by_kind[kind].items():
                     evaluator.add(token, sample_counts)
@@ -107,23 +105,24 @@ def counted_of(
 
 
 def summarised(counted: Counted) -> dict[str, Any]:
-    """Return all numbers of a study, as JSON holds them; equal counts give equal numbers.
+    """Compute all numbers of a study as JSON values; equal counts yield equal numbers.
 
-    `rows`: name → `over` and `groups`: group → number (of `NUMBERS`) → `value`, `low` and `high` of
-    the interval, and the value of each of the `seeds`. `comparisons`: `row`, `less` and `groups` of
-    their differences. `headline`: the recipe's, with its difference, `verdict` and a `text`.
+    `rows`: name → `over` and `groups`: group → number (of `NUMBERS`) → `value`, `low` and `high`
+    of the interval, and `seeds`, the value of each seed. `comparisons`: `row`, `less`, and `groups`
+    of their differences. `headline`: the recipe's, with its difference, `verdict` and a `text`.
     """
-    rows, groups = counted.rows, counted.groups
+    rows = counted.rows
+    groups = counted.groups
+    description = counted.description
     comparisons = []
-    for row, less in counted.description["compare"]:
-        differences = {
-            group: numbers_of_rows(tokens, rows[row], rows[less])
-            for group, tokens in groups.items()
-        }
+    for row, less in description["compare"]:
+        differences = {}
+        for group, tokens in groups.items():
+            differences[group] = numbers_of_rows(tokens, rows[row], rows[less])
         comparisons.append({"row": row, "less": less, "groups": differences})
-    headline = counted.description["headline"]
+    headline = description["headline"]
     if headline is not None:
-        headline = _summarised_headline(headline, comparisons)
+        headline = _summarise_headline(headline, comparisons)
     group_sizes = {}
     for group, tokens in groups.items():
         pairs = {cluster_of(scenario_of(token)) for token in tokens}
@@ -131,10 +130,10 @@ def summarised(counted: Counted) -> dict[str, Any]:
     row_numbers = {}
     for name, seeds in rows.items():
         numbers = {group: numbers_of_rows(tokens, seeds) for group, tokens in groups.items()}
-        row_numbers[name] = {"over": counted.description["over"][name], "groups": numbers}
+        row_numbers[name] = {"over": description["over"][name], "groups": numbers}
     return {
-        "title": counted.description["title"],
-        "question": counted.description["question"],
+        "title": description["title"],
+        "question": description["question"],
         "headline": headline,
         "groups": group_sizes,
         "rows": row_numbers,
@@ -142,64 +141,70 @@ def summarised(counted: Counted) -> dict[str, Any]:
     }
 
 
-def _summarised_headline(
-    headline: Mapping[str, Any], comparisons: Iterable[Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Return the recipe's headline with its difference, verdict and text."""
-    row, less, number, where = (headline[name] for name in ("row", "less", "number", "where"))
-    difference = next(
-        comparison["groups"][where or ALL][number]
-        for comparison in comparisons
-        if (comparison["row"], comparison["less"]) == (row, less)
-    )
-    result = verdict(difference)
-    text = _VERDICT_TEXTS[result].format(
-        row=f"`{row}`",
-        less=f"`{less}`",
+def _summarise_headline(headline: Summary, comparisons: Iterable[Summary]) -> dict[str, Any]:
+    """Add the difference, verdict and text to the recipe's headline."""
+    row = headline["row"]
+    less = headline["less"]
+    number = headline["number"]
+    group = headline["where"] or ALL
+    pairs = {(comparison["row"], comparison["less"]): comparison for comparison in comparisons}
+    difference = pairs[row, less]["groups"][group][number]
+    summarised_headline = {**headline, **difference, "verdict": verdict(difference)}
+    return {**summarised_headline, "text": headline_text(summarised_headline)}
+
+
+def headline_text(headline: Summary) -> str:
+    """Return a sentence that says what came out, from the headline of a summary."""
+    number = headline["number"]
+    text = _VERDICT_TEXTS[headline["verdict"]].format(
+        row=f"`{headline['row']}`",
+        less=f"`{headline['less']}`",
         number=NUMBERS[number][2],
-        size=difference_text(difference, number),
+        size=difference_text(headline, number),
     )
-    group_text = f"`{where}`" if where else ALL
-    return {
-        **headline,
-        **difference,
-        "verdict": result,
-        "text": f"Among {group_text}: {text}.",
-    }
+    group_text = ALL
+    if headline["where"]:
+        group_text = f"`{headline['where']}`"
+    return f"Among {group_text}: {text}."
 
 
-def number_with_interval(estimate: Mapping[str, Any], number: str) -> str:
-    """Return `12.3 [10.1, 14.8]`, with the decimals that the number has in tables.
+def number_with_interval(estimate: Summary, number: str) -> str:
+    """Format a number with its interval, such as `12.3 [10.1, 14.8]`, rounded as in tables.
 
-    A missing number is a dash.
+    A missing number is formatted as a dash.
     """
-    digits = 1 if NUMBERS[number][2].endswith("(%)") else 2
     if estimate["value"] is None:
         return "–"
+    digits = 1 if NUMBERS[number][2].endswith("(%)") else 2
     text = fixed_text(estimate["value"], digits)
     if estimate["low"] is None:
         return text
-    low, high = fixed_text(estimate["low"], digits), fixed_text(estimate["high"], digits)
+    low = fixed_text(estimate["low"], digits)
+    high = fixed_text(estimate["high"], digits)
     return f"{text} [{low}, {high}]"
 
 
-def difference_text(difference: Mapping[str, Any], number: str) -> str:
-    """Return `+2.1 [0.4, 3.8]`."""
+def difference_text(difference: Summary, number: str) -> str:
+    """Format a difference with its sign and interval, such as `+2.1 [0.4, 3.8]`."""
+    text = number_with_interval(difference, number)
     value = difference["value"]
-    sign = "+" if value is not None and value > 0 else ""
-    return sign + number_with_interval(difference, number)
+    if value is not None and value > 0:
+        return f"+{text}"
+    return text
 
 
-def main_numbers(summary: Mapping[str, Any]) -> list[str]:
-    """Return the headline's number, then the other known ones of `MAIN_NUMBERS`."""
+def main_numbers(summary: Summary) -> list[str]:
+    """Return the headline's number, then the other numbers of `MAIN_NUMBERS` that are known."""
     names = list(MAIN_NUMBERS)
-    if summary["headline"] is not None:
-        names.insert(0, summary["headline"]["number"])
-    return [name for name in dict.fromkeys(names) if name in known_numbers(summary)]
+    headline = summary["headline"]
+    if headline is not None:
+        names.insert(0, headline["number"])
+    known_names = known_numbers(summary)
+    return [name for name in dict.fromkeys(names) if name in known_names]
 
 
-def known_numbers(summary: Mapping[str, Any]) -> list[str]:
-    """Return the names in `NUMBERS` that the study has; on nuScenes it has none of accidents."""
+def known_numbers(summary: Summary) -> list[str]:
+    """Return which of `NUMBERS` the study has; on nuScenes, none are about accidents."""
     row = next(iter(summary["rows"].values()))
     return list(row["groups"][ALL])
 
@@ -209,18 +214,17 @@ class StudyReport(Report):
     """The results of a study.
 
     Attributes:
-        summary: Numbers from `summarised`, with the `recipe`, the `devkit`'s version, and the
-            `cells`.
+        summary: Numbers from `summarised`, with the `recipe`, the `devkit` version and the `cells`.
     """
 
     summary: Mapping[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the summary, for JSON."""
+        """Return the summary as JSON values."""
         return dict(self.summary)
 
     def named_tables(self) -> Mapping[str, Iterable[Row]]:
-        """Return the tables `rows` and `comparisons`: a line for each number in each group."""
+        """Return the tables `rows` and `comparisons`, with one line per number and group."""
         rows = [((name,), row["groups"]) for name, row in self.summary["rows"].items()]
         pairs = []
         for comparison in self.summary["comparisons"]:
@@ -234,7 +238,7 @@ class StudyReport(Report):
     def _table(
         self, heads: tuple[str, ...], lines: Sequence[tuple[tuple[str, ...], Any]]
     ) -> Iterator[Row]:
-        """Yield the heading and the rows of a table; `heads` are the headings of the names."""
+        """Yield the heading and rows of a table; `heads` are the headings of the name columns."""
         seeds: dict[str, None] = {}
         for _, groups in lines:
             for estimate in groups[ALL].values():
@@ -249,7 +253,7 @@ class StudyReport(Report):
                     yield (*names, group, number, *interval, *seed_values)
 
     def to_text(self) -> str:
-        """Return the rows with the main numbers, and the headline."""
+        """Return the rows with their main numbers, then the headline."""
         numbers = main_numbers(self.summary)
         lines = [["row", *(NUMBERS[number][2] for number in numbers)]]
         for name, row in self.summary["rows"].items():
@@ -258,4 +262,6 @@ class StudyReport(Report):
             lines.append([name, *texts])
         table = columns_text(lines)
         headline = self.summary["headline"]
-        return table if headline is None else f"{table}\n\n{headline['text']}"
+        if headline is None:
+            return table
+        return f"{table}\n\n{headline['text']}"

@@ -1,4 +1,4 @@
-"""Road users: their bodies, their identity and their motion, in the ground frame."""
+"""Road users: their bodies, identities and motions, in the ground frame."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.plugins.synth import solids
-from deepaccident_devkit.plugins.synth.shapes import MODELS, shape_of
+from deepaccident_devkit.plugins.synth.shapes import MODELS, make_shape
 from deepaccident_devkit.plugins.synth.solids import Color, Solids
 from deepaccident_devkit.support.arrays import (
     AnyArray,
@@ -20,7 +20,7 @@ from deepaccident_devkit.taxonomy import CATEGORIES, STATIC_ACTOR_ID
 
 _BoxSize = tuple[float, float, float]
 
-# A time may be this far before the first sample or after the last one.
+# Largest distance of a time from the first or last sample at which the actor still moves.
 _TIME_TOLERANCE_S = 1e-9
 MEDIAN_SIZES: dict[str, _BoxSize] = {
     "car": (4.60, 1.93, 1.52),
@@ -52,7 +52,9 @@ _TRUCK_BOXES: tuple[Color, ...] = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SampledMotion(FrozenArrays):
-    """A motion in straight lines between samples; before the first and after the last it stands.
+    """A motion in straight lines between samples.
+
+    Before the first sample and after the last one, the actor stands still.
 
     Times are seconds since the first recorded frame. The motions of M actors with the same times
     can be in one.
@@ -75,29 +77,31 @@ class SampledMotion(FrozenArrays):
 
         The shape is (T, 3), or (T, M, 3) for M actors.
         """
-        requested = np.asarray(times, dtype=np.float64)
-        return self._between(self.samples, requested)
+        requested_times = np.asarray(times, dtype=np.float64)
+        return self._interpolate(self.samples, requested_times)
 
     def velocities(self, times: ArrayLike) -> FloatArray:
         """Return velocities, m/s in the ground frame, at times (T,).
 
         The shape is (T, 2), or (T, M, 2) for M actors.
         """
-        requested = np.asarray(times, dtype=np.float64)
+        requested_times = np.asarray(times, dtype=np.float64)
         end = self.start + self.period * (len(self.samples) - 1)
-        begun = requested >= self.start - _TIME_TOLERANCE_S
-        moving = begun & (requested <= end + _TIME_TOLERANCE_S)
-        values = self._between(self.sample_velocities, requested)
-        return np.where(_expanded(moving, values), values, 0.0)
+        has_begun = requested_times >= self.start - _TIME_TOLERANCE_S
+        is_moving = has_begun & (requested_times <= end + _TIME_TOLERANCE_S)
+        values = self._interpolate(self.sample_velocities, requested_times)
+        return np.where(_add_axes(is_moving, values.ndim), values, 0.0)
 
-    def _between(self, values: FloatArray, times: FloatArray) -> FloatArray:
+    def _interpolate(self, values: FloatArray, times: FloatArray) -> FloatArray:
         """Return values (S, …) interpolated at times (T,)."""
-        position = np.clip((times - self.start) / self.period, 0.0, len(values) - 1.0)
-        low = np.minimum(position.astype(np.int64), max(len(values) - 2, 0))
-        high = np.minimum(low + 1, len(values) - 1)
+        last_row = len(values) - 1
+        position = np.clip((times - self.start) / self.period, 0.0, float(last_row))
+        low = np.minimum(position.astype(np.int64), max(last_row - 1, 0))
+        high = np.minimum(low + 1, last_row)
         before = values[low]
         after = values[high]
-        return np.asarray(before + _expanded(position - low, before) * (after - before))
+        weight = _add_axes(position - low, values.ndim)
+        return np.asarray(before + weight * (after - before))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,7 +129,7 @@ class Actor:
 
     @property
     def parked(self) -> bool:
-        """Whether it stands as a static vehicle."""
+        """Whether it is a parked vehicle."""
         return self.actor_id >= STATIC_ACTOR_ID
 
 
@@ -160,18 +164,23 @@ class Actors:
     def of(cls, actors: Sequence[Actor]) -> "Actors":
         """Gather actors, sorted by id."""
         ordered = tuple(sorted(actors, key=lambda actor: actor.actor_id))
+        actor_ids = [actor.actor_id for actor in ordered]
+        object_ids = [actor.object_id for actor in ordered]
         categories = [CATEGORIES.index(actor.category) for actor in ordered]
-        solid_counts = [len(actor.shape) for actor in ordered]
+        sizes = [actor.size for actor in ordered]
+        origins = [actor.origin for actor in ordered]
+        shapes = [actor.shape for actor in ordered]
+        solid_counts = [len(shape) for shape in shapes]
         return cls(
             all=ordered,
-            actor_id=readonly(np.array([actor.actor_id for actor in ordered], dtype=np.int64)),
-            object_id=readonly(np.array([actor.object_id for actor in ordered], dtype=np.int64)),
+            actor_id=readonly(np.array(actor_ids, dtype=np.int64)),
+            object_id=readonly(np.array(object_ids, dtype=np.int64)),
             category=readonly(np.array(categories, dtype=np.int8)),
-            size=readonly(np.array([actor.size for actor in ordered], dtype=np.float64)),
-            origin=readonly(np.array([actor.origin for actor in ordered], dtype=np.float64)),
-            solids=solids.concatenate_solids([actor.shape for actor in ordered]),
+            size=readonly(np.array(sizes, dtype=np.float64)),
+            origin=readonly(np.array(origins, dtype=np.float64)),
+            solids=solids.concatenate_solids(shapes),
             solid_actor=readonly(np.repeat(np.arange(len(ordered)), solid_counts)),
-            motions=_grouped([actor.motion for actor in ordered]),
+            motions=_group_motions([actor.motion for actor in ordered]),
         )
 
     def __len__(self) -> int:
@@ -180,7 +189,8 @@ class Actors:
 
     def row_of(self, actor_id: int) -> int:
         """Return the row of the actor with this id."""
-        return int(np.flatnonzero(self.actor_id == actor_id)[0])
+        [row] = np.flatnonzero(self.actor_id == actor_id)
+        return int(row)
 
     def at(self, time: float) -> "Snapshot":
         """Return the positions of all actors at a time, seconds."""
@@ -205,30 +215,27 @@ class Snapshot:
     velocities: FloatArray
 
 
-def _grouped(motions: Sequence[SampledMotion]) -> tuple[tuple[list[int], SampledMotion], ...]:
+def _group_motions(motions: Sequence[SampledMotion]) -> tuple[tuple[list[int], SampledMotion], ...]:
     """Group motions with the same times, as in `Actors.motions`."""
     rows_by_times: dict[Hashable, list[int]] = {}
     for row, motion in enumerate(motions):
-        key = (motion.start, motion.period, len(motion.samples))
-        rows_by_times.setdefault(key, []).append(row)
+        times = (motion.start, motion.period, len(motion.samples))
+        rows_by_times.setdefault(times, []).append(row)
     groups = []
     for rows in rows_by_times.values():
-        groups.append((rows, _joined([motions[row] for row in rows])))
+        members = [motions[row] for row in rows]
+        joined = replace(
+            members[0],
+            samples=np.stack([motion.samples for motion in members], axis=1),
+            sample_velocities=np.stack([motion.sample_velocities for motion in members], axis=1),
+        )
+        groups.append((rows, joined))
     return tuple(groups)
 
 
-def _joined(motions: Sequence[SampledMotion]) -> SampledMotion:
-    """Join several motions with the same times into one."""
-    return replace(
-        motions[0],
-        samples=np.stack([motion.samples for motion in motions], axis=1),
-        sample_velocities=np.stack([motion.sample_velocities for motion in motions], axis=1),
-    )
-
-
-def _expanded(weights: AnyArray, values: FloatArray) -> AnyArray:
-    """Reshape weights (T,) of the first axis of values (T, …), to be multiplied with them."""
-    shape = weights.shape + (1,) * (values.ndim - weights.ndim)
+def _add_axes(weights: AnyArray, ndim: int) -> AnyArray:
+    """Reshape weights (T,) to (T, 1, …) with `ndim` axes, so that they broadcast along axis 0."""
+    shape = weights.shape + (1,) * (ndim - weights.ndim)
     return weights.reshape(shape)
 
 
@@ -252,19 +259,22 @@ class Body:
 def random_body(rng: np.random.Generator, category: str) -> Body:
     """Draw a body of a category, near the median size of the real release."""
     factors = 1 + np.array(_SIZE_SPREAD) * rng.uniform(-1, 1, 3)
-    size_array = (np.array(MEDIAN_SIZES[category]) * factors).astype(np.float32)
-    size: _BoxSize = tuple(size_array.tolist())
-    color, accent = _colors(rng, category)
+    drawn_size = (np.array(MEDIAN_SIZES[category]) * factors).astype(np.float32)
+    size: _BoxSize = tuple(drawn_size.tolist())
+    color, accent = _draw_colors(rng, category)
     model = int(rng.integers(len(MODELS[category])))
-    shape = shape_of(category, size, color, accent, model=model)
+    shape = make_shape(category, size, color, accent, model=model)
     # An ego origin is ahead of the box's centre, mostly by some centimetres, seldom by up to 0.3 m.
-    origin_x = round(float(_MAX_ORIGIN_M * rng.random() ** 3), 4)
-    return Body(category, size, shape, (origin_x, 0.0))
+    offset = _MAX_ORIGIN_M * rng.random() ** 3
+    return Body(category, size, shape, (round(offset, 4), 0.0))
 
 
-def _colors(rng: np.random.Generator, category: str) -> tuple[Color, Color]:
+def _draw_colors(rng: np.random.Generator, category: str) -> tuple[Color, Color]:
     """Draw the main colour and the accent of a body."""
-    paints = _CLOTHES if category == "pedestrian" else _PAINTS
+    if category == "pedestrian":
+        paints = _CLOTHES
+    else:
+        paints = _PAINTS
     accents = _TRUCK_BOXES if category == "truck" else _CLOTHES
     color = paints[rng.integers(len(paints))]
     return color, accents[rng.integers(len(accents))]

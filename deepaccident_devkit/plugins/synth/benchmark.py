@@ -1,9 +1,9 @@
-"""Benchmarks: releases that anybody makes anew, compared with the published ones.
+"""Benchmarks: releases that anyone can reproduce and compare with the published ones.
 
 See docs/benchmark.md. Labels, meta, calib and split files are the same bytes wherever they are
-made: their numbers are rounded (`SynthConfig.decimals`), which removes the last digits, in which
-processors differ. But numbers that are counted by rays, `num_lidar_pts`, and images and clouds are
-compared within a tolerance.
+made, because their numbers are rounded (`SynthConfig.decimals`), which removes the last digits, in
+which processors differ. Only `num_lidar_pts` (which is counted by casting rays), images and clouds
+are compared within a tolerance.
 """
 
 from __future__ import annotations
@@ -52,16 +52,15 @@ TOLERANCES: Final[Mapping[str, float]] = {
     "BEV pictures": 6,
 }
 """Largest distance of a file from the published one: the root of the mean squared difference of its
-pixels on a scale to 255; for a cloud, as described for `_sketch_of`. docs/benchmark.md has the
-measurements."""
-# Rows and columns from each compared one to the next: to compare all takes longer than to decode.
-_PIXEL_STEPS: Final = {"images": 2, "BEV pictures": 8}
-# Wave vectors of space, radians a metre, and a row of phases, radians; as good as random.
-_WAVES: Final = 2 * np.sin(np.arange(32, dtype=np.float32).reshape(4, 8) ** 2)
+pixels on a scale to 255; for a cloud, as described for `_sketch_file`."""
+# Step between compared rows and columns; comparing all of them takes longer than decoding.
+_PIXEL_STEPS = {"images": 2, "BEV pictures": 8}
+# Wave vectors in space, radians for each metre, and a row of phases, radians; as good as random.
+_WAVES = 2 * np.sin(np.arange(32, dtype=np.float32).reshape(4, 8) ** 2)
 
 
 def described(scenario: ScenarioFolder) -> dict[str, Any]:
-    """Return the compared description of a scenario, as JSON holds it.
+    """Describe a scenario for comparison, in JSON types.
 
     - `meta`, `calib`: hashes of their bytes; `boxes`: of the labels without `num_lidar_pts`.
     - `num_lidar_pts`, `images`, `clouds`, `BEV pictures`: the sketch of that column, and of each
@@ -70,17 +69,18 @@ def described(scenario: ScenarioFolder) -> dict[str, Any]:
     hashes = folder_hashes(scenario)
     sketches: dict[str, dict[str, Sketch]] = {kind: {} for kind in TOLERANCES}
     sketches["num_lidar_pts"] = {"all agents": hashes.points}
+    kind_by_channel = {LIDAR: "clouds", BEV_CAMERA: "BEV pictures"}
     for agent, (channel, ending) in product(AGENTS, CHANNEL_FORMAT.items()):
-        kind = {LIDAR: "clouds", BEV_CAMERA: "BEV pictures"}.get(channel, "images")
+        kind = kind_by_channel.get(channel, "images")
         frames, _ = frame_numbers(scenario.kind_folder(agent, channel), ending)
         for frame in frames:
             path = scenario.channel_path(agent, channel, frame)
-            sketches[kind][f"{agent}/{channel}/{frame}"] = _sketch_of(path, kind)
+            sketches[kind][f"{agent}/{channel}/{frame}"] = _sketch_file(path, kind)
     return {"boxes": hashes.boxes, "meta": hashes.meta, "calib": hashes.calib, **sketches}
 
 
 def described_release(root: Path, **engine: Unpack[Engine]) -> dict[str, Any]:
-    """Return the compared description of a release.
+    """Describe a release for comparison.
 
     Args:
         root: Folder of the release.
@@ -90,57 +90,64 @@ def described_release(root: Path, **engine: Unpack[Engine]) -> dict[str, Any]:
         `splits`, a hash of its split files, and `scenarios` by token, as from `described`.
     """
     layout = find_release(root)
-    splits = {
-        name: read_lines(path, "split", SplitFileError) for name, path in layout.split_files.items()
-    }
-    descriptions = run_batch(described, layout.scenarios, label="comparing", **engine)
+    splits = {}
+    for name, path in layout.split_files.items():
+        splits[name] = read_lines(path, "split", SplitFileError)
+    descriptions = run_batch(described, layout.scenarios, label="Comparing scenarios", **engine)
     tokens = [scenario.token for scenario in layout.scenarios]
     scenarios = dict(zip(tokens, descriptions, strict=True))
     return {"splits": digest_of(splits), "scenarios": scenarios}
 
 
 def published(name: str) -> dict[str, Any]:
-    """Return the description of a benchmark as it was published, as from `described_release`.
+    """Return the published description of a benchmark, as `described_release` returns it.
 
     Raises:
         ChoiceError: There is no such benchmark.
     """
     choice("benchmark", name, BENCHMARKS)
     path = Path(__file__).parent / f"benchmark_{name}.json.xz"
-    return dict(json.loads(lzma.decompress(path.read_bytes())))
+    text = lzma.decompress(path.read_bytes())
+    return dict(json.loads(text))
 
 
 def differences(release: Mapping[str, Any], benchmark: Mapping[str, Any]) -> list[str]:
-    """Return the differences between a release and a published benchmark, a line each.
+    """List the differences between a release and a published benchmark, one per line.
 
     Args:
         release: Description of the release, from `described_release`.
         benchmark: Description of the benchmark, from `published`; only the kinds of files that the
             release has are compared (`compared_kinds`).
     """
-    lines = ["its split files differ"] if release["splits"] != benchmark["splits"] else []
+    lines = []
+    if release["splits"] != benchmark["splits"]:
+        lines.append("the split files differ")
     for token in sorted({*release["scenarios"], *benchmark["scenarios"]}):
         scenario = release["scenarios"].get(token)
         reference = benchmark["scenarios"].get(token)
-        if scenario is None or reference is None:
-            lines.append(f"{token}: is {'missing' if scenario is None else 'not of the benchmark'}")
+        if scenario is None:
+            lines.append(f"{token}: is missing")
+            continue
+        if reference is None:
+            lines.append(f"{token}: is not part of the benchmark")
             continue
         for kind in ("boxes", "meta", "calib"):
             if scenario[kind] != reference[kind]:
                 lines.append(f"{token}: {kind} differ")
         for kind in compared_kinds(release):
-            name = _first_distant(scenario[kind], reference[kind], TOLERANCES[kind])
+            name = _find_distant(scenario[kind], reference[kind], TOLERANCES[kind])
             if name is not None:
                 lines.append(f"{token}: {kind} differ by more than the tolerance, such as {name}")
     return lines
 
 
-def _first_distant(
+def _find_distant(
     sketches: Mapping[str, Sketch], references: Mapping[str, Sketch], tolerance: float
 ) -> str | None:
-    """Return the first name with sketches that are farther apart than a tolerance, or None."""
+    """Return the first name whose two sketches differ by more than a tolerance, or None."""
     for name in sorted({*sketches, *references}):
-        if distance(sketches.get(name, ()), references.get(name, ())) > tolerance:
+        pair_distance = distance(sketches.get(name, ()), references.get(name, ()))
+        if pair_distance > tolerance:
             return name
     return None
 
@@ -151,7 +158,7 @@ def compared_kinds(release: Mapping[str, Any]) -> list[str]:
     return [kind for kind in TOLERANCES if any(scenario[kind] for scenario in scenarios)]
 
 
-def _sketch_of(path: ReleasePath, kind: str) -> Sketch:
+def _sketch_file(path: ReleasePath, kind: str) -> Sketch:
     """Return the sketch of a sensor's file.
 
     For pictures, the distance of two sketches is the root of the mean squared difference of their
@@ -161,8 +168,10 @@ def _sketch_of(path: ReleasePath, kind: str) -> Sketch:
     if kind == "clouds":
         cloud = read_lidar(path)
         phases = cloud.xyz.astype(np.float32) @ _WAVES[:3] + _WAVES[3]
-        return whole_numbers((0.5 + cloud.intensity) @ np.cos(phases))
+        sums = (0.5 + cloud.intensity) @ np.cos(phases)
+        return whole_numbers(sums)
     image = read_image(path) if kind == "images" else read_bev(path, raw=True)
     step = _PIXEL_STEPS[kind]
     pixels = image[::step, ::step]
-    return sketch((pixels - np.float32(128)) / np.sqrt(pixels.size))
+    centered_pixels = pixels - np.float32(128)
+    return sketch(centered_pixels / np.sqrt(pixels.size))

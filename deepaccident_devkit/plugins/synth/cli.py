@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import click
 
 from deepaccident_devkit.cli.options import (
     PATH,
-    engine_of,
+    engine_options,
     engine_parameters,
     pixel_size,
     refuse_unused,
@@ -29,41 +29,42 @@ from deepaccident_devkit.support.text import counted
 
 _EXAMPLES = """\b
 Examples:
-  deepaccident synth OUT --scenarios 24 --sensors none     only labels, all twelve designs
+  deepaccident synth OUT --scenarios 24 --sensors none     labels only, all twelve designs
   deepaccident synth --show-design 3 > mine.yaml           print a scenario file to edit
   deepaccident synth OUT --design mine.yaml                make accidents from your file
   deepaccident synth OUT --for-released-code               for the released DeepAccident code
-  deepaccident synth OUT --benchmark v1 --sensors cameras  a benchmark that everybody has the same
+  deepaccident synth OUT --benchmark v1 --sensors cameras  a benchmark, identical for everyone
 """
-_MAX_SHOWN_DIFFERENCES: Final = 5
+_MAX_SHOWN_DIFFERENCES = 5
 
 
 def _show_design(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
-    """Print the scenario file of a design, and stop."""
+    """Print the scenario file of a design, and exit."""
     if value is not None:
-        click.echo(design_text(_number(context, parameter, value)), nl=False)
+        click.echo(design_text(_read_number(context, parameter, value)), nl=False)
         context.exit()
 
 
-def _number(context: click.Context, parameter: click.Parameter, text: str) -> int:
-    """Return the number of a design; raises BadParameter."""
-    kind: Any = click.IntRange(DESIGN_NUMBERS[0], DESIGN_NUMBERS[-1])
-    return int(kind.convert(text, parameter, context))
+def _read_number(context: click.Context, parameter: click.Parameter, text: str) -> int:
+    """Return the number of a design; raise BadParameter if there is no such design."""
+    first, *_, last = DESIGN_NUMBERS
+    number_type: Any = click.IntRange(first, last)
+    return int(number_type.convert(text, parameter, context))
 
 
-def _designs(
+def _read_designs(
     context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
 ) -> dict[str, Any]:
     """Return the fields `designs` and `spec`: numbers of designs, or one scenario file."""
     files = [text for text in texts if not text.isdecimal()]
-    if len(files) > 1 or (files and len(texts) > 1):
+    if files and len(texts) > 1:
         raise click.BadParameter(
-            "give one scenario file, or numbers of designs", context, parameter
+            "expected one scenario file, or numbers of designs", context, parameter
         )
     if files:
         return {"designs": (), "spec": Path(files[0])}
-    numbers = tuple(_number(context, parameter, text) for text in texts)
-    return {"designs": numbers, "spec": None}
+    numbers = [_read_number(context, parameter, text) for text in texts]
+    return {"designs": tuple(numbers), "spec": None}
 
 
 @verb(epilog=_EXAMPLES)
@@ -81,8 +82,8 @@ def _designs(
     "image_size",
     callback=pixel_size,
     metavar="WxH",
-    help="Size of the camera images in pixels. The real ones have 1600x900, and the released "
-    "DeepAccident code assumes this size: with another size it computes wrong camera geometry.  "
+    help="Size of the camera images in pixels. Real images have 1600x900. The released code "
+    "assumes this size, and computes wrong camera geometry with any other.  "
     "[default: {}x{}; {}x{} with --for-released-code]".format(*IMAGE_SIZE, *RELEASED_IMAGE_SIZE),
 )
 @field_option(SynthConfig, "layout")
@@ -95,10 +96,10 @@ def _designs(
     "--design",
     "designs",
     multiple=True,
-    callback=_designs,
+    callback=_read_designs,
     metavar="N|FILE",
-    help="Only accidents of this design; you can repeat this option. Or a scenario file of your "
-    "own; docs/synth.md describes its fields.  [default: all twelve in turn]",
+    help="Make only accidents of this design; you can repeat this option. Or make those of your "
+    "own scenario file (docs/synth.md).  [default: all twelve in turn]",
 )
 @field_option(SynthConfig, "designed")
 @field_option(SynthConfig, "unplanned", option=advanced)
@@ -106,9 +107,9 @@ def _designs(
 @click.option(
     "--benchmark",
     type=WordChoice(BENCHMARKS),
-    help="Make the release of this benchmark, and say whether it is as published; with --sensors "
-    "cameras or clouds, a part of its files. One that is there is only compared. docs/benchmark.md "
-    "says what it is for.",
+    help="Make the release of this benchmark, and compare it with the published one. With "
+    "--sensors cameras or clouds, make only a part of its files. An existing release is only "
+    "compared. See docs/benchmark.md.",
 )
 @engine_parameters
 @click.option(
@@ -117,34 +118,37 @@ def _designs(
     is_eager=True,
     expose_value=False,
     callback=_show_design,
-    help="Print the scenario file of a design, as a start for your own, and stop; docs/synth.md "
-    "lists them.",
+    help="Print the scenario file of a design, as a start for your own, and exit. docs/synth.md "
+    "lists the designs.",
 )
 def synth(out: Path, *, designs: dict[str, Any], benchmark: str | None, **options: Any) -> None:
     """Make a complete synthetic release in the new folder OUT.
 
     If a run is interrupted, the same command continues it.
     """
-    engine = engine_of(options)
+    engine = engine_options(options)
     if benchmark is not None:
         unused = (set(options) | {"designs"}) - {*engine, "sensors"}
-        refuse_unused("with --benchmark, which says all of it", *unused)
+        refuse_unused("with --benchmark, which defines all settings", *unused)
         _make_benchmark(out, benchmark, options["sensors"], engine)
         return
     settings = {name: value for name, value in options.items() if name not in engine} | designs
     if settings["spec"] is not None or settings["view"] == "hidden":
         refuse_unused(
-            "with a scenario file or --view hidden, which ask for one certain accident", "unplanned"
+            "with a scenario file or --view hidden, which define the accident", "unplanned"
         )
     config = SynthConfig(**settings)
     if config.sensors == "none" and not has_embree():
         click.echo(
-            "slow without the package embreex; in a checkout: pip install '.[synth]'", err=True
+            "warning: slow without the package embreex; run pip install '.[synth]' in a checkout",
+            err=True,
         )
     release = make_release(out, config, progress=True, **engine)
-    frames = "" if config.frames is None else f" of {counted(config.frames, 'frame')}"
+    frames = ""
+    if config.frames is not None:
+        frames = f" of {counted(config.frames, 'frame')}"
     scenarios = counted(config.scenarios, "scenario")
-    click.echo(f"{release}: {scenarios}{frames} with five agents, layout {config.layout}")
+    click.echo(f"wrote {release} ({scenarios}{frames} with five agents, layout {config.layout})")
     click.echo(f"next: deepaccident info {release}")
     if config.spec is None or read_spec(config.spec).meets:
         layers = " --layers boxes" if config.sensors == "none" else ""
@@ -152,16 +156,16 @@ def synth(out: Path, *, designs: dict[str, Any], benchmark: str | None, **option
 
 
 def _make_benchmark(out: Path, name: str, sensors: Sensors, engine: dict[str, Any]) -> None:
-    """Make a benchmark's release unless the folder has one, and compare it.
+    """Make a benchmark's release unless it exists, and compare it with the published one.
 
     Args:
         out: Folder of the release.
         name: Name of the benchmark.
-        sensors: Sensors' files to make.
-        engine: Options of the workers.
+        sensors: Which files of sensors to make, as in `SynthConfig`.
+        engine: Workers, executor and progress.
 
     Raises:
-        ClickException: The release is not as published.
+        ClickException: The release differs from the published one.
     """
     if not (out.is_dir() and any(out.iterdir())):
         config = replace(BENCHMARKS[name], sensors=sensors)
@@ -170,13 +174,13 @@ def _make_benchmark(out: Path, name: str, sensors: Sensors, engine: dict[str, An
     faults = differences(release, published(name))
     if faults:
         raise click.ClickException(
-            f"{out}: is not the benchmark {name} as published, "
-            f"{counted(len(faults), 'difference')}:\n"
+            f"{out}: differs from the published benchmark {name} "
+            f"({counted(len(faults), 'difference')}):\n"
             + "\n".join(faults[:_MAX_SHOWN_DIFFERENCES])
-            + f"\nMake it with the libraries of benchmarks/{name}/lock.txt; evaluations of this "
-            "release do not compare with others."
+            + f"\nMake it with the libraries in benchmarks/{name}/lock.txt; evaluations on this "
+            "release cannot be compared with others."
         )
     scenarios = counted(len(release["scenarios"]), "scenario")
     kinds = ", ".join(compared_kinds(release))
-    click.echo(f"{out}: is the benchmark {name} as published, {scenarios}: labels, {kinds}")
+    click.echo(f"{out}: same as the published benchmark {name} ({scenarios}: labels, {kinds})")
     click.echo(f"next: deepaccident info {out}")

@@ -46,20 +46,20 @@ from deepaccident_devkit.v2x.tracks import scenario_tracks
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import FrameRecord, ScenarioRecord
 
-_PAGE_FILE: Final = "index.html"
+_PAGE_FILE = "index.html"
 PICTURES: Final = (
     "countdown.png",
     "five_agents_1s_before.png",
     "ego_cameras_1s_before.png",
     "motion_labels_1s_before.png",
 )
-"""Files beside the page, as its template shows them."""
+"""Files next to the page, in the order in which its template shows them."""
 MODEL_PICTURE: Final = "model_1s_before.png"
-"""File of the picture that is made where PyTorch is installed."""
-_REPLAY_FILE: Final = "replay.html"
+"""Name of the picture that is made only where PyTorch is installed."""
+_REPLAY_FILE = "replay.html"
 REPORT_FOLDER: Final = "evaluation"
-# A browser loads only files beside the page, on a disk or a server; only pages in frames run code.
-_CONTENT_POLICY: Final = (
+# The page may load only files from its own folder, and only pages in frames may run code.
+_CONTENT_POLICY = (
     "default-src 'none'; img-src 'self' file:; frame-src 'self' file:; style-src 'unsafe-inline'"
 )
 SCENARIO: Final = """\
@@ -81,42 +81,41 @@ weather: Clear
 time_of_day: Noon
 """
 RELEASE: Final = SynthConfig(scenarios=2, frames=40, seed=1, sensors="accidents", traffic="v1")
-# The file by which the demo knows a folder as its own.
-_MARKER_FILE: Final = ".deepaccident_demo"
-_SCENARIO_FILE: Final = "accident.yaml"
-_RUN_NAME: Final = "single_vehicle"
-_RESULTS_FILE: Final = f"{_RUN_NAME}.json"
-# Seconds before the impact; at the first the house hides the other car from ego.
-_COUNTDOWN: Final = (3.0, 2.0, 1.0, 0.5, 0.0)
-_SECONDS_BEFORE: Final = 1.0
+# File that marks a folder as one of the demo.
+_MARKER_FILE = ".deepaccident_demo"
+_SCENARIO_FILE = "accident.yaml"
+_RUN_NAME = "single_vehicle"
+_RESULTS_FILE = f"{_RUN_NAME}.json"
+# Times before the impact, seconds; at the first one the house hides the other car from ego.
+_COUNTDOWN = (3.0, 2.0, 1.0, 0.5, 0.0)
+_SECONDS_BEFORE = 1.0
 # Distance from ego to the edge of the model's picture.
-_VIEW_RANGE_M: Final = 35.0
+_VIEW_RANGE_M = 35.0
 # The released labels, but they end at the impact.
-_LABEL_CONFIG: Final = MotionLabelConfig(future_frames=2)
-# The samples of the table and of the report: ego's in the last four seconds of the accident and of
-# its twin.
-_SELECTION: Final = SampleSelection(
-    split="train", scope="all", agents=("ego_vehicle",), horizon=4.0
-)
-_AGENT_SET_NAMES: Final = {"single": "single vehicle", "all": "five agents"}
+_LABEL_CONFIG = MotionLabelConfig(future_frames=2)
+# Samples of the table and of the report: ego's samples in the last four seconds of the accident and
+# of its twin.
+_SELECTION = SampleSelection(split="train", scope="all", agents=("ego_vehicle",), horizon=4.0)
+_AGENT_SET_NAMES = {"single": "single vehicle", "all": "five agents"}
 # The protocol of each task, and the heading of each number of the table with its name in the
 # result.
-_TABLE_NUMBERS: Final[Mapping[ResultsTask, tuple[str, Mapping[str, str]]]] = {
+_TABLE_NUMBERS: Mapping[ResultsTask, tuple[str, Mapping[str, str]]] = {
     "motion": ("paper", {"IoU (%)": "iou 100x100", "VPQ (%)": "vpq 100x100"}),
     "accident": ("boxes", {"APA": "apa", "precision": "precision", "recall": "recall"}),
     "detection": ("paper", {"mAP (%)": "mAP"}),
 }
+_RECORDING = "Recording the scene"
 # Approximate duration of each step on two cores, seconds.
-_STEP_SECONDS: Final = {
-    "recording": 15.0,
-    "indexing": 1.0,
-    "pictures": 5.0,
-    "model": 5.0,
-    "table": 3.0,
-    "evaluation": 4.0,
-    "replay": 4.0,
+_STEP_SECONDS = {
+    _RECORDING: 15.0,
+    "Indexing the release": 1.0,
+    "Drawing pictures": 5.0,
+    "Predicting with the model": 5.0,
+    "Comparing one car with five": 3.0,
+    "Evaluating the baseline": 4.0,
+    "Writing the replay": 4.0,
 }
-_BAR_FORMAT: Final = "{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+_BAR_FORMAT = "{desc:<33} {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,35 +137,36 @@ class NextStep:
 def demo(out: Path, workers: int | None) -> None:
     """Make a small synthetic release in the folder OUT, and a page that shows what the devkit does.
 
-    The release has an accident, and of its normal twin the labels. The page OUT/index.html has
-    pictures, motion labels, a table of what one car and five agents predict, a replay, the report
-    of an evaluation, and six next steps. Where PyTorch is installed, it also shows what a small
-    trained model foresees.
+    The release contains one accident with all sensor files, and its normal twin (the same traffic
+    without the accident) with labels only. The page OUT/index.html shows pictures, motion labels, a
+    table that compares the predictions of one car and of five agents, a replay, the report of an
+    evaluation, and six next steps. If PyTorch is installed, the page also shows the predictions of
+    a small trained model.
 
-    OUT must be missing, empty, or the folder of an earlier demo, which then keeps its release.
+    OUT must be a new or empty folder, or the folder of an earlier demo, whose release is reused.
     """
-    _claim(out)
-    steps = _next_steps(out)
+    _claim_folder(out)
+    steps = _list_next_steps(out)
     with tqdm(total=sum(_STEP_SECONDS.values()), bar_format=_BAR_FORMAT, disable=None) as bar:
-        with _step(bar, "recording"):
+        with _show_step(bar, _RECORDING):
             _make_release(out, workers, bar)
-        with _step(bar, "indexing"):
+        with _show_step(bar, "Indexing the release"):
             release = DeepAccident("v1", out / "release", workers=workers, verbose=False)
-        with _step(bar, "pictures"):
+        with _show_step(bar, "Drawing pictures"):
             draw_accident(release, out)
-        with _step(bar, "model"):
+        with _show_step(bar, "Predicting with the model"):
             model = draw_model(release, out)
-        with _step(bar, "table"):
+        with _show_step(bar, "Comparing one car with five"):
             table = demo_table(release)
-        with _step(bar, "evaluation"):
+        with _show_step(bar, "Evaluating the baseline"):
             _evaluate(release, out)
-        with _step(bar, "replay"):
+        with _show_step(bar, "Writing the replay"):
             render_replay(release, None, out / _REPLAY_FILE)
     write_bytes(out / _PAGE_FILE, demo_page(table, steps, model=model).encode())
     click.echo(f"{columns_text(table)}\n\nNext steps:")
     for number, step in enumerate(steps, 1):
         click.echo(f"{number}. {step.sentence}\n   {step.command}")
-    click.echo(f"\nOpen this page in a browser, it shows all that was made: {out / _PAGE_FILE}")
+    click.echo(f"\nOpen {out / _PAGE_FILE} in a browser to see the results.")
 
 
 def demo_page(table: Sequence[Sequence[str]], steps: Sequence[NextStep], *, model: bool) -> str:
@@ -199,7 +199,7 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
 
     At that moment, the pictures show the five agents, ego's cameras and ego's labels.
     """
-    accident, before = _accident_and_before(release)
+    accident, before = _find_accident(release)
     ego = release.samples_of(before)[0]
     countdown = partial(
         release.render_accident, seconds=_COUNTDOWN, agents=("ego_vehicle", "infrastructure")
@@ -217,7 +217,7 @@ def draw_accident(release: DeepAccident, out: Path) -> None:
 
 
 def draw_model(release: DeepAccident, out: Path) -> bool:
-    """Draw the predictions of the shipped model a second before the impact, beside the truth.
+    """Draw the shipped model's predictions a second before the impact, next to the truth.
 
     One column shows the predictions from ego's LiDAR, the other from the LiDARs of all agents.
     Below is the road, and on top the pair at its true positions at each of the two moments.
@@ -235,7 +235,7 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
         model = load_model("tiny_lidar")
     except (MissingExtraError, MissingPluginError):
         return False
-    accident, before = _accident_and_before(release)
+    accident, before = _find_accident(release)
     token = release.samples_of(before)[0]["token"]
     label = motion_labels(release, token, model.config.labels)
     road = release.load_bev(token)
@@ -272,43 +272,50 @@ def _draw_pair(
     pair_ids = collision["ids"] if collision else []
     boxes = scenario_tracks(release, scenario).at(index)
     boxes = boxes.select(np.isin(boxes.actor_id, pair_ids))
-    boxes = boxes.transform(release.world_from(sample, "ego").inverse(), "ego")
+    ego_from_world = release.world_from(sample, "ego").inverse()
+    boxes = boxes.transform(ego_from_world, "ego")
     draw_boxes_from_above(boxes, ax, [COLLIDER_COLOR] * len(boxes), fill=0, linewidths=2)
     recorders = recorders_of(release, scenario)
-    for (x, y, _), actor in zip(boxes.center.tolist(), boxes.actor_id.tolist(), strict=True):
-        write_beside(ax, short_name(recorders[actor]), (x, y), COLLIDER_COLOR)
+    centers = boxes.center[:, :2].tolist()
+    for (x, y), actor_id in zip(centers, boxes.actor_id.tolist(), strict=True):
+        write_beside(ax, short_name(recorders[actor_id]), (x, y), COLLIDER_COLOR)
 
 
-def _accident_and_before(release: DeepAccident) -> tuple[ScenarioRecord, FrameRecord]:
+def _find_accident(release: DeepAccident) -> tuple[ScenarioRecord, FrameRecord]:
     """Return the first accident's scenario, and its frame a second before the impact."""
     accident = next(scenario for scenario in release.scenario if scenario["collision"])
-    impact = release.getind("frame", accident["last_frame_token"])
-    return accident, release.frame[impact - round(_SECONDS_BEFORE / FRAME_PERIOD)]
+    impact_row = release.getind("frame", accident["last_frame_token"])
+    num_frames = round(_SECONDS_BEFORE / FRAME_PERIOD)
+    return accident, release.frame[impact_row - num_frames]
 
 
 @contextmanager
-def _step(bar: tqdm[Any], name: str) -> Iterator[None]:
-    """Show a step on the bar, and move the bar to its end; a log gets a line at its beginning."""
-    bar.set_description_str(name)
-    number = [*_STEP_SECONDS].index(name) + 1
+def _show_step(bar: tqdm[Any], name: str) -> Iterator[None]:
+    """Show a step on the bar, and move the bar to the end of the step.
+
+    A log gets a line at the beginning of the step.
+    """
+    number = list(_STEP_SECONDS).index(name) + 1
+    seconds = list(_STEP_SECONDS.values())
+    title = f"[{number}/{len(seconds)}] {name}"
+    bar.set_description_str(title)
     if _is_log(bar):
-        seconds = _STEP_SECONDS[name]
-        click.echo(f"{number} of {len(_STEP_SECONDS)}: {name}, which takes some {seconds:.0f} s")
-    end = sum(list(_STEP_SECONDS.values())[:number])
+        click.echo(f"{title} (about {seconds[number - 1]:.0f} s)")
+    end = sum(seconds[:number])
     yield
     bar.update(end - bar.n)
 
 
 def _is_log(bar: tqdm[Any]) -> bool:
-    """Return whether the output is no terminal, so that printed lines show the progress."""
+    """Return whether the output is not a terminal, so that printed lines show the progress."""
     return bar.disable or not sys.stdout.isatty()
 
 
-def _claim(out: Path) -> None:
-    """Mark a folder as the demo's, before anything else is written.
+def _claim_folder(out: Path) -> None:
+    """Mark a folder as one of the demo, before anything else is written.
 
     Raises:
-        ConfigError: It contains something, and no demo of this version made it.
+        ConfigError: The folder is not empty, and was not made by a demo of this version.
     """
     marker = out / _MARKER_FILE
     version = f"{__version__}\n".encode()
@@ -317,8 +324,8 @@ def _claim(out: Path) -> None:
     remove_leftovers(out)  # of a demo that was killed before it had marked the folder
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(
-            f"{out}: exists, and was not made by the demo of version {__version__}; "
-            "name a folder that does not exist yet: deepaccident demo OTHER_FOLDER"
+            f"{out}: already exists, and was not made by the demo of version {__version__}; "
+            "choose a new folder: deepaccident demo OTHER_FOLDER"
         )
     write_bytes(marker, version)
 
@@ -337,7 +344,7 @@ def _make_release(out: Path, workers: int | None, bar: tqdm[Any]) -> None:
         nonlocal recorded
         previous = recorded
         recorded = recorded + share
-        bar.update(share * _STEP_SECONDS["recording"])
+        bar.update(share * _STEP_SECONDS[_RECORDING])
         if _is_log(bar) and int(10 * recorded) > int(10 * previous):
             click.echo(f"  {100 * recorded:.0f} % recorded")
 
@@ -349,7 +356,7 @@ def demo_table(release: DeepAccident) -> list[list[str]]:
     """Return a table of how well ego and five agents foresee crashes.
 
     Returns:
-        A heading, and a line of text for each of the two.
+        Rows of texts: a heading, and a row for each of the two.
     """
     tokens = _SELECTION.tokens(release)
     heading = [""]
@@ -388,7 +395,7 @@ def _evaluate(release: DeepAccident, out: Path) -> None:
     save_run(run, bundle, include_results=True, overwrite=True)
 
 
-def _next_steps(out: Path) -> tuple[NextStep, ...]:
+def _list_next_steps(out: Path) -> tuple[NextStep, ...]:
     """Return the suggestions for what to try next, with the paths of the demo's folder."""
     names = (
         "release",
@@ -399,35 +406,36 @@ def _next_steps(out: Path) -> tuple[NextStep, ...]:
         "five_agents/evaluation",
     )
     paths = [shlex.quote(str(out / name)) for name in names]
-    root, five, own, scenario, bundle, evaluation = paths
+    release, predictions, own_release, scenario, bundle, evaluation = paths
     selection = (
         f"--split {_SELECTION.split} --scope {_SELECTION.scope} --horizon {_SELECTION.horizon:g}"
     )
     return (
-        NextStep("See what the release holds:", f"deepaccident info {root} --where collision=true"),
         NextStep(
-            "See in your browser which predictions were right; this needs the extra: "
-            "pip install '.[explore]'",
-            f"deepaccident explore {root} --results {bundle}",
+            "See what the release contains:", f"deepaccident info {release} --where collision=true"
         ),
         NextStep(
-            "Check its files, as you would check your download:",
-            f"deepaccident validate {root} --deep",
+            "See in your browser which predictions were right; first run: pip install '.[explore]'",
+            f"deepaccident explore {release} --results {bundle}",
+        ),
+        NextStep(
+            "Check the files, as you would check your download:",
+            f"deepaccident validate {release} --deep",
         ),
         NextStep(
             "Let five agents predict together:",
-            f"deepaccident predict constant_velocity {root} {selection} --task accident "
-            f"--agents all --out {five}",
+            f"deepaccident predict constant_velocity {release} {selection} --task accident "
+            f"--agents all --out {predictions}",
         ),
         NextStep(
-            "Evaluate that, and compare it with the report:",
-            f"deepaccident evaluate accident {root} --results {five}/accident.json {selection} "
-            f"--protocol boxes --agents ego_vehicle --allow-partial --out {evaluation} "
-            f"&& deepaccident evaluate compare {bundle} {evaluation}",
+            "Evaluate these predictions, and compare them with the report:",
+            f"deepaccident evaluate accident {release} --results {predictions}/accident.json "
+            f"{selection} --protocol boxes --agents ego_vehicle --allow-partial "
+            f"--out {evaluation} && deepaccident evaluate compare {bundle} {evaluation}",
         ),
         NextStep(
             "Edit the scenario file of the accident, such as its weather, and see what happens "
             "in it:",
-            f"deepaccident synth {own} --design {scenario} --scenarios 2 --sensors none",
+            f"deepaccident synth {own_release} --design {scenario} --scenarios 2 --sensors none",
         ),
     )

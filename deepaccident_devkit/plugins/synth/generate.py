@@ -1,7 +1,7 @@
-"""The making of a synthetic release, in a folder beside its place.
+"""Making a synthetic release, in a hidden folder next to its final place.
 
 A later call can continue after an interruption. Several processes and hosts may record parts of the
-scenarios at once. The one that has the folder to itself puts them together.
+scenarios at the same time. The last of them to finish assembles the parts.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ if TYPE_CHECKING:
 
 _CONFIG_FILE = "config.json"
 _MADE_NOTE = "made"
-# Approximate number of frames of a scenario if the configuration does not give it.
+# Approximate number of frames of a scenario if the configuration gives none.
 _USUAL_FRAMES = 70
-# Smallest number of frames that are worth several workers; a frame with sensors takes up to a
-# second.
+# Smallest numbers of frames that are worth several workers, with sensors and without; a frame with
+# sensors takes up to a second.
 _MIN_PARALLEL_FRAMES = 20
 _MIN_PARALLEL_FRAMES_WITHOUT_SENSORS = 400
 
@@ -77,8 +77,8 @@ class Unfinished:
 
     @property
     def store(self) -> Store:
-        """The store that notes made parts, and prevents others from recording the same."""
-        return Store(self.folder, self.out, "makes the release", ConfigError)
+        """The store that notes complete parts, and prevents others from recording the same part."""
+        return Store(self.folder, self.out, "is making the release", ConfigError)
 
     @property
     def release(self) -> Path:
@@ -95,22 +95,23 @@ class Unfinished:
 
     def is_made(self, name: str) -> bool:
         """Return whether a part is complete."""
-        return self.store.kept(name, _MADE_NOTE) is not None
+        return self.store.read_result(name, _MADE_NOTE) is not None
 
     def note(self, name: str) -> None:
-        """Note that a part is complete; raises ConfigError if it was removed meanwhile."""
+        """Note that a part is complete; raise ConfigError if it was removed meanwhile."""
         if not (self.folder / _CONFIG_FILE).exists():
             raise ConfigError(
-                f"{self.folder}: was removed while parts of the release were recorded; "
-                "make it again"
+                f"{self.folder}: was removed while the release was being made; run the command "
+                "again"
             )
-        self.store.keep(name, _MADE_NOTE, b"")
+        self.store.write_result(name, _MADE_NOTE, b"")
 
     def gather(self, names: Iterable[str]) -> None:
-        """Move the files of a scenario's parts into the release, unless they are already there."""
+        """Move the files of scenarios' parts into the release, unless they are already there."""
         for name in names:
-            if self.part(name).is_dir():
-                _merge(self.part(name), self.release)
+            folder = self.part(name)
+            if folder.is_dir():
+                _move_files(folder, self.release)
 
     def complete(self) -> None:
         """Move the release into its place, and remove the folder."""
@@ -122,15 +123,17 @@ class Unfinished:
 
 @contextmanager
 def unfinished_release(unfinished: Unfinished, config: SynthConfig) -> Iterator[Callable[[], bool]]:
-    """Work on a release in the block; if nothing of it is made, the folder is removed at the end.
+    """Work on a release in the block.
+
+    If no part is complete at the end, the folder is removed.
 
     Yields:
         A function that waits until this process has the folder to itself, and returns whether no
         other one has completed the release.
 
     Raises:
-        ConfigError: Its place is taken, the unfinished release is of another configuration or
-            version, or something cannot be written.
+        ConfigError: The place of the release is taken, the unfinished release is of another
+            configuration or version, or something cannot be written.
     """
     store = unfinished.store
     config_path = unfinished.folder / _CONFIG_FILE
@@ -152,64 +155,73 @@ def unfinished_release(unfinished: Unfinished, config: SynthConfig) -> Iterator[
 
 
 def _write_or_compare(path: Path, config: SynthConfig) -> None:
-    """Write a configuration, or compare it with the written one.
+    """Write a configuration, or compare it with the one that was written before.
 
     Raises:
         ConfigError: They differ, or the file cannot be read.
     """
-    settings = _as_json(config)
+    settings = _list_settings(config)
     if not path.exists():
         write_bytes(path, json.dumps(settings, indent=1).encode())
         return
-    written_settings = _parsed(path)
+    written_settings = _read_settings(path)
     if written_settings.get("spec") != settings["spec"]:
         difference = "spec"
     else:
         difference = differing_text(written_settings, settings)
     if difference:
         raise ConfigError(
-            f"{path.parent}: holds an unfinished release of another configuration ({difference}); "
-            "ask for the same to finish it, or remove the folder"
+            f"{path.parent}: contains an unfinished release with other settings ({difference}); "
+            "use the same settings to finish it, or remove the folder"
         )
 
 
-def _parsed(path: Path) -> dict[str, Any]:
-    """Read a JSON object, an empty one if the file has another value; raises ConfigError."""
+def _read_settings(path: Path) -> dict[str, Any]:
+    """Read a JSON object; raise ConfigError if the file cannot be read.
+
+    Returns:
+        The object; an empty dictionary if the file contains another JSON value.
+    """
     text = file_text(path)
     try:
         settings = parsed_json(text.encode())
     except ValueError as error:
         raise ConfigError(f"{path}: {error}; remove its folder") from error
-    return settings if isinstance(settings, dict) else {}
+    if not isinstance(settings, dict):
+        return {}
+    return settings
 
 
 def file_text(path: Path) -> str:
-    """Read a text file; raises ConfigError."""
+    """Read a text file; raise ConfigError if it cannot be read."""
     try:
         return read_bytes(path, "spec").decode()
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: {fault_text(error)}; make it readable, or remove it") from error
 
 
-def _as_json(config: SynthConfig) -> dict[str, Any]:
+def _list_settings(config: SynthConfig) -> dict[str, Any]:
     """Return all settings that the bytes of a release depend on, as they are read from JSON.
 
-    Instead of the path of the scenario file they have its text.
+    They contain the scenario file's text instead of its path.
     """
-    text = None if config.spec is None else file_text(config.spec)
+    text = None
+    if config.spec is not None:
+        text = file_text(config.spec)
     fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
     settings: dict[str, Any] = json.loads(json.dumps(fields))
     return settings
 
 
-def _merge(part: Path, release: Path) -> None:
-    """Move a part's files to their places, and remove the part.
+def _move_files(part: Path, release: Path) -> None:
+    """Move a part's files to their places in the release, and remove the part.
 
     Temporary files are removed with it: they come only from processes with locks that do not
     exclude others, and the part is complete.
     """
     for folder, _, names in os.walk(part):
-        target = place_in(release, Path(folder).relative_to(part), opened=True)
+        relative_folder = Path(folder).relative_to(part)
+        target = place_in(release, relative_folder, opened=True)
         target.mkdir(parents=True, exist_ok=True)
         for name in names:
             if temporary_of(name) is None:
@@ -225,9 +237,9 @@ def make_release(
     executor: Executor | None = None,
     progress: Progress = False,
 ) -> Path:
-    """Write a complete synthetic release; returns its folder.
+    """Make a complete synthetic release, and return its folder.
 
-    The release is made in a hidden folder beside `out`, `.NAME.unfinished`, and renamed when it is
+    The release is made in a hidden folder next to `out`, `.NAME.unfinished`, and renamed when it is
     complete. After an interruption (a full disk, a kill) the same call makes only the missing
     parts; several processes that make the same call share the scenarios.
 
@@ -236,7 +248,8 @@ def make_release(
         config: Settings of the release; `SynthConfig()` if None.
         workers: Number of processes; several may record one scenario. With None the generator
             chooses. The files depend neither on it nor on interruptions.
-        executor: Any executor of `concurrent.futures` to run on, instead of own workers.
+        executor: Any executor of `concurrent.futures` to run on, instead of workers that this call
+            starts.
         progress: Whether to show a progress bar; or a function that is called after each part of
             the work, with its share of the total work.
 
@@ -244,11 +257,12 @@ def make_release(
         ConfigError: `out` is a file, is not empty or cannot be made; an unfinished release of
             another configuration is there; the scenario file cannot be read or simulated; or
             something cannot be written.
-        OutputFolderError: A link in the hidden folder leads out of it; nothing is written there.
+        OutputFolderError: A link in the hidden folder points outside it; nothing is written there.
         ChoiceError: `workers` is less than 1.
         MissingExtraError: The release has files of sensors and the package embreex is not
             installed.
-        SomeFailedError: Some parts cannot be recorded; the others are, and the same call continues.
+        SomeFailedError: Some parts cannot be recorded. All others are, and a repeated call tries
+            only the missing ones.
         WorkerError: A worker was killed, or cannot do the work.
     """
     config = config or SynthConfig()
@@ -263,16 +277,18 @@ def make_release(
     with unfinished_release(unfinished, config) as wait_until_alone:
         parts: dict[str, RecordingJob] = {}
         for plan in plans:
-            parts.update(_parts(unfinished, config, plan))
+            parts.update(_list_parts(unfinished, config, plan))
         engine: dict[str, Any] = {
             "workers": workers or _worker_count(config, len(plans)),
             "executor": executor,
             "progress": progress,
         }
-        record = partial(_record, unfinished)
+        record = partial(_record_part, unfinished)
         places = Places(writes=(unfinished.folder,))
         try:
-            unfinished.store.run(record, parts, label="recording", places=places, **engine)
+            unfinished.store.run(
+                record, parts, label="Recording parts of scenarios", places=places, **engine
+            )
         finally:
             forget_scenario()
         if wait_until_alone():
@@ -291,7 +307,7 @@ def _save_splits(release: Path, config: SynthConfig, plans: Sequence[ScenarioPla
         splits.save(place_in(release, SPLIT_FILE_FOLDER, opened=True), overwrite=True)
 
 
-def _parts(
+def _list_parts(
     unfinished: Unfinished, config: SynthConfig, plan: ScenarioPlan
 ) -> dict[str, RecordingJob]:
     """Return the parts of a scenario by their names."""
@@ -301,11 +317,12 @@ def _parts(
     jobs = {}
     for first_frame in range(1, count + 1):
         name = f"{plan.scenario_type}_{plan.name}_{first_frame}of{count}"
-        jobs[name] = RecordingJob(unfinished.part(name), config, plan, first_frame, count)
+        folder = unfinished.part(name)
+        jobs[name] = RecordingJob(folder, config, plan, first_frame, count)
     return jobs
 
 
-def _record(unfinished: Unfinished, job: RecordingJob) -> None:
+def _record_part(unfinished: Unfinished, job: RecordingJob) -> None:
     """Record a part of a scenario into the folder of an unfinished release, unless it is made."""
     name = job.root.name
     if not unfinished.is_made(name):
@@ -316,8 +333,10 @@ def _record(unfinished: Unfinished, job: RecordingJob) -> None:
 
 def _worker_count(config: SynthConfig, scenarios: int) -> int:
     """Return the number of workers: one for each core, or 1 if the work is too short for it."""
-    frames = scenarios * (config.frames or _USUAL_FRAMES)
+    num_frames = scenarios * (config.frames or _USUAL_FRAMES)
     min_frames = _MIN_PARALLEL_FRAMES
     if config.sensors == "none":
         min_frames = _MIN_PARALLEL_FRAMES_WITHOUT_SENSORS
-    return usable_cores() if frames >= min_frames else 1
+    if num_frames < min_frames:
+        return 1
+    return usable_cores()

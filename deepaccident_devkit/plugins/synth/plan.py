@@ -1,4 +1,4 @@
-"""The settings of a release, and its scenarios: accidents, their twins, their names and splits."""
+"""The settings of a release, and the plan of its scenarios with their names and splits."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from deepaccident_devkit.plugins.synth.traffic.lifelike import (
     MISFILED,
     TRAFFICS,
     AccidentKind,
-    as_kind,
+    apply_kind,
     draw_kind,
     paths_join,
 )
@@ -44,27 +44,30 @@ IMAGE_SIZE: Final = (480, 270)
 RELEASED_IMAGE_SIZE: Final = (1600, 900)
 """The size of the real images, pixels. The released code does not read the size: it assumes it."""
 DESIGN_ROUND: Final = (1, 7, 2, 8, 3, 9, 4, 10, 5, 11, 6, 12)
-"""All designs in the order of use: with and without traffic lights by turns."""
+"""All designs in the order of use: with and without traffic lights in turn."""
 HIDDEN_DESIGN_ROUND: Final = (1, 7)
 """The designs in which a house on a corner can hide the colliders from each other to the end."""
 OFFICIAL_FROM_PAIRS: Final = 12
 """Smallest number of pairs that the official procedure splits without empty val and test splits."""
-# The fractional parts of its multiples fill [0, 1) evenly, for any number of them.
-_GOLDEN_RATIO: Final = 0.6180339887498949
-# The same is true of this number, independently.
-_ROOT_OF_2: Final = 1.4142135623730951
+# The fractional parts of any number of its multiples fill [0, 1) evenly.
+_GOLDEN_RATIO = 0.6180339887498949
+# So do the multiples of this number, independently of the first.
+_ROOT_OF_2 = 1.4142135623730951
 # The largest share of its split that a mini split may hold.
-_MINI_SHARE: Final = Fraction(1, 5)
-_PLAN_STREAM: Final = 1
+_MINI_SHARE = Fraction(1, 5)
+_PLAN_STREAM = 1
 # Makes the plan's random numbers independent of the random numbers of the pair's scene.
-_KIND_STREAM: Final = 2
-# With a house on the kerb between them, slower cars would see each other earlier, m/s.
-_HIDDEN_SPEEDS: Final = (12.0, 14.0)
+_KIND_STREAM = 2
+# Lowest and highest speed with a house on the kerb between ego and other, m/s; if they were slower,
+# they would see each other earlier.
+_HIDDEN_SPEEDS = (12.0, 14.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SynthConfig:
-    """A synthetic release; checked when made, raises ConfigError.
+    """The settings of a synthetic release.
+
+    They are checked on construction; a wrong one raises ConfigError.
 
     Attributes:
         scenarios: How many; they alternate between an accident and its normal twin.
@@ -89,8 +92,8 @@ class SynthConfig:
             little faster than with the view `open`. They see each other only about a second before
             they meet; the infrastructure sees both all the time. With None the scenario files
             decide.
-        designs: Numbers of the paper's designs that are used by turns, in this order; empty for all
-            twelve (with the view `hidden`, for all in which a house can hide the two from each
+        designs: Numbers of the paper's designs, which are used in turn, in this order; empty for
+            all twelve (with the view `hidden`, for all in which a house can hide the two from each
             other).
         designed: Whether accidents are clean: the accidents of the designs, between drivers who err
             in nothing but the design. If not, accidents and traffic are as the real release has
@@ -172,7 +175,7 @@ class SynthConfig:
             )
         if self.spec is not None and self.designs:
             raise ConfigError(
-                "spec, designs: a release is made of a scenario file or of designs; "
+                "spec, designs: a release is made either from a scenario file or from designs; "
                 "choose one of the two"
             )
         if self.for_released_code:
@@ -193,7 +196,7 @@ class SynthConfig:
 
     @property
     def design_round(self) -> tuple[int, ...]:
-        """The designs that are used by turns."""
+        """The designs that are used in turn."""
         if self.designs:
             return self.designs
         return HIDDEN_DESIGN_ROUND if self.view == "hidden" else DESIGN_ROUND
@@ -209,12 +212,12 @@ class SynthConfig:
             if value != expected:
                 raise ConfigError(
                     f"{name}, for_released_code: the released code needs {expected}, found {value} "
-                    "(docs/synth.md says why); leave one of the two out"
+                    "(docs/synth.md explains why); remove one of the two"
                 )
 
 
 def _check_range(name: str, value: int, minimum: int, maximum: int | None) -> None:
-    """Check that a number is within its limits; raises ConfigError."""
+    """Raise ConfigError unless a number is within its limits."""
     if value < minimum or (maximum is not None and value > maximum):
         span = f"of at least {minimum}"
         if maximum is not None:
@@ -266,9 +269,9 @@ class ScenarioPlan:
 
     @property
     def grazes(self) -> bool:
-        """Whether a vehicle scrapes along another one beside the accident.
+        """Whether a vehicle sideswipes another one in addition to the accident.
 
-        It is the same in both scenarios of a pair.
+        The value is the same for both scenarios of a pair.
         """
         if self.kind is None:
             return False
@@ -278,7 +281,10 @@ class ScenarioPlan:
     @property
     def scenario_type(self) -> str:
         """Type, such as `type1_subtype1_accident`."""
-        outcome = "accident" if self.accident else "normal"
+        if self.accident:
+            outcome = "accident"
+        else:
+            outcome = "normal"
         return f"type1_subtype{self.traits.subtype}_{outcome}"
 
     @property
@@ -295,8 +301,10 @@ class ScenarioPlan:
         while not self._fits(spec):
             spec = draw(self.template, rng)
         if self.view is not None:
-            spec = _with_view(spec, self.view, rng)
-        return spec if self.kind is None else as_kind(rng, spec, self.kind)
+            spec = _change_view(spec, self.view, rng)
+        if self.kind is None:
+            return spec
+        return apply_kind(rng, spec, self.kind)
 
     def _fits(self, spec: ScenarioSpec) -> bool:
         """Return whether a draw has the plan's traits, and paths that fit its kind of accident."""
@@ -337,15 +345,17 @@ class Traits:
 
 
 def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
-    """Plan the scenarios of a release: each accident, then its twin, with the designs by turns.
+    """Plan a release's scenarios: each accident, then its twin, with one design after another.
 
-    A scenario file in which nobody is timed to meet gives only normal scenarios.
+    A scenario file without a pair that is timed to meet gives only normal scenarios.
 
     Raises:
         ConfigError: The scenario file cannot be read or simulated, or the release asks for a hidden
             view where it is impossible.
     """
-    own_template = None if config.spec is None else read_spec(config.spec)
+    own_template = None
+    if config.spec is not None:
+        own_template = read_spec(config.spec)
     has_twins = own_template is None or own_template.meets
     plans = []
     for number in range(config.scenarios):
@@ -356,7 +366,7 @@ def plan_scenarios(config: SynthConfig) -> list[ScenarioPlan]:
             accident = number % 2 == 0
         designs = config.design_round
         template = own_template or read_design(designs[pair % len(designs)])
-        plans.append(_plan(config, pair, template, accident=accident))
+        plans.append(_plan_scenario(config, pair, template, accident=accident))
     split_by_token = {}
     for name, tokens in plan_splits(plans).by_name().items():
         if name in SPLITS:
@@ -377,22 +387,21 @@ def plan_splits(plans: Sequence[ScenarioPlan]) -> Splits:
     pair, so that a loader of the mini splits finds something.
     """
     if len({plan.pair for plan in plans}) >= OFFICIAL_FROM_PAIRS:
-        splits = split_records([_record(plan) for plan in plans])
+        splits = split_records([_make_record(plan) for plan in plans])
     else:
-        tokens_by_split = {
-            split: tuple(sorted(plan.token for plan in plans if _small_split(plan.pair) == split))
-            for split in SPLITS
-        }
-        train, val, test = tokens_by_split.values()
+        tokens_by_split: dict[str, list[str]] = {split: [] for split in SPLITS}
+        for plan in plans:
+            tokens_by_split[_choose_small_split(plan.pair)].append(plan.token)
+        train, val, test = (tuple(sorted(tokens)) for tokens in tokens_by_split.values())
         splits = Splits(train=train, val=val, test=test, train_mini=train, val_mini=val)
     return replace(
         splits,
-        train_mini=_mini(plans, splits.train, splits.train_mini),
-        val_mini=_mini(plans, splits.val, splits.val_mini),
+        train_mini=_choose_mini_split(plans, splits.train, splits.train_mini),
+        val_mini=_choose_mini_split(plans, splits.val, splits.val_mini),
     )
 
 
-def _plan(
+def _plan_scenario(
     config: SynthConfig, pair: int, template: SpecTemplate, *, accident: bool
 ) -> ScenarioPlan:
     """Plan one scenario; its split is still open."""
@@ -434,7 +443,7 @@ def _plan(
     )
 
 
-def _with_view(spec: ScenarioSpec, view: View, rng: np.random.Generator) -> ScenarioSpec:
+def _change_view(spec: ScenarioSpec, view: View, rng: np.random.Generator) -> ScenarioSpec:
     """Return a scenario with another view.
 
     Where a house hides ego and other, they drive faster, on a narrow road.
@@ -451,7 +460,7 @@ def _with_view(spec: ScenarioSpec, view: View, rng: np.random.Generator) -> Scen
     return replace(spec, view=view, actors=tuple(actors), road=narrow_road)
 
 
-def _small_split(pair: int) -> str:
+def _choose_small_split(pair: int) -> str:
     """Return the split of both scenarios of a pair in a small release.
 
     Each split gets one pair; of the later ones about 70, 15 and 15 %.
@@ -464,7 +473,7 @@ def _small_split(pair: int) -> str:
     return "val" if share < 0.85 else "test"
 
 
-def _mini(
+def _choose_mini_split(
     plans: Sequence[ScenarioPlan], split: Sequence[str], candidates: Collection[str]
 ) -> tuple[str, ...]:
     """Choose the pairs of a mini split.
@@ -484,9 +493,10 @@ def _mini(
     for plan in plans:
         if plan.token in members:
             tokens_by_pair.setdefault(plan.pair, []).append(plan.token)
+    max_tokens = _MINI_SHARE * len(split)
     mini: list[str] = []
     for tokens in tokens_by_pair.values():
-        fits = len(mini) + len(tokens) <= _MINI_SHARE * len(split)
+        fits = len(mini) + len(tokens) <= max_tokens
         if candidates.issuperset(tokens) and fits:
             mini += tokens
     if not mini and tokens_by_pair:
@@ -494,7 +504,7 @@ def _mini(
     return tuple(sorted(mini))
 
 
-def _record(plan: ScenarioPlan) -> ScenarioRecord:
+def _make_record(plan: ScenarioPlan) -> ScenarioRecord:
     """Return the fields of a scenario's later record that the split procedure reads."""
     pair = None
     if plan.kind:

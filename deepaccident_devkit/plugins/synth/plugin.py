@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import click
 
 
-def _demo() -> click.Command:
+def _load_demo() -> click.Command:
     """Return the command `demo`."""
     need_plugin("baselines", "demo")
     from deepaccident_devkit.plugins.synth.demo import demo
@@ -18,7 +18,7 @@ def _demo() -> click.Command:
     return demo
 
 
-def _synth() -> click.Command:
+def _load_synth() -> click.Command:
     """Return the command `synth`."""
     from deepaccident_devkit.plugins.synth.cli import synth
 
@@ -29,7 +29,7 @@ PLUGIN: Final = Plugin(
     name="synth",
     protocol_version=PROTOCOL_VERSION,
     verbs={
-        "demo": LazyVerb("Make a small synthetic release, and a page on it.", _demo),
-        "synth": LazyVerb("Make a synthetic release.", _synth),
+        "demo": LazyVerb("Make a small synthetic release, and a page that shows it.", _load_demo),
+        "synth": LazyVerb("Make a synthetic release.", _load_synth),
     },
 )

@@ -1,4 +1,4 @@
-"""A scenario: made so that it goes as planned, and recorded frame by frame as files of a release.
+"""A scenario that is drawn until it goes as planned, then recorded frame by frame as files.
 
 It is recorded in parts; each part takes every nth frame, so that several processes can share a
 scenario.
@@ -26,21 +26,21 @@ from deepaccident_devkit.plugins.synth.spec import ScenarioSpec
 from deepaccident_devkit.plugins.synth.spec.model import Role
 from deepaccident_devkit.plugins.synth.traffic.accidents import (
     Performance,
-    Recorded,
+    Recording,
     Stage,
-    lasts,
+    add_graze,
+    draw_duration,
+    is_long_enough,
     latest_end,
     perform_twin,
-    recorded_accident,
-    recorded_normal,
+    record_accident,
+    record_normal,
     set_stage,
     try_accident,
-    usual_duration,
-    with_graze,
 )
 from deepaccident_devkit.plugins.synth.traffic.driving import PERIOD
 from deepaccident_devkit.plugins.synth.traffic.lifelike import ON_FOOT
-from deepaccident_devkit.plugins.synth.traffic.placement import unplanned
+from deepaccident_devkit.plugins.synth.traffic.placement import replan_accident
 from deepaccident_devkit.plugins.synth.traffic.rights import SignalPlan
 from deepaccident_devkit.plugins.synth.world import World, random_world
 from deepaccident_devkit.release import (
@@ -74,8 +74,8 @@ AGENT_OF_ROLE: Mapping[Role, AgentName] = {
 }
 MAX_DRAWS = 40
 """Number of draws without a collision after which a scenario is given up."""
-# Parts of a scenario with sensors. Without sensors it has one: simulating it takes longer than
-# writing a frame.
+# Number of parts of a scenario with sensors. Without sensors it has one part, because simulating it
+# takes longer than writing a frame.
 _NUM_PARTS = 8
 
 
@@ -112,29 +112,30 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     If two actors are timed to meet, the scene is drawn again until they touch.
 
     Raises:
-        ConfigError: They do not touch in `MAX_DRAWS` draws; the message has the distance to which
-            they came, and the fields to change.
+        ConfigError: They do not touch in `MAX_DRAWS` draws; the message tells how close they came
+            and which fields to change.
     """
     seeds = [config.seed, plan.pair]
     if plan.misfiled:
-        seeds.append(1)  # it shows other scenes than its twin
+        seeds.append(1)  # its scenes differ from its twin's
     # One stream for each part of the scene, so that a change to one part leaves the others.
     streams = [np.random.default_rng(seed) for seed in np.random.SeedSequence(seeds).spawn(4)]
     world_rng, traffic_rng, id_rng, end_rng = streams
-    recorded: Recorded | None
+    recording: Recording | None
     while True:
-        stage, accident, draws = _first_good_draw(traffic_rng, config, plan)
+        stage, accident, draws = _draw_stage(traffic_rng, config, plan)
         if accident and plan.collides:
-            recorded = recorded_accident(end_rng, stage, accident, config.frames)
+            recording = record_accident(end_rng, stage, accident, config.frames)
         else:
-            recorded = _twin(end_rng, stage, config, plan)
-        if recorded is not None:
+            recording = _record_twin(end_rng, stage, config, plan)
+        if recording is not None:
             break
     if plan.grazes:
-        recorded = with_graze(stage, recorded)
+        recording = add_graze(stage, recording)
     spec = stage.spec
-    ego_arm, other_arm = (spec.actor(role).from_arm or "west" for role in ("ego", "other"))
-    ids = _Ids.of(id_rng, stage)
+    ego_arm = spec.actor("ego").from_arm or "west"
+    other_arm = spec.actor("other").from_arm or "west"
+    ids = _ActorIds.draw(id_rng, stage)
     world = random_world(
         world_rng,
         stage.junction,
@@ -144,54 +145,55 @@ def build_scenario(config: SynthConfig, plan: ScenarioPlan) -> Scenario:
     )
     signals = None
     if stage.signals is not None:
-        signals = stage.signals.shifted(-recorded.start)
+        signals = stage.signals.shifted(-recording.start)
     return Scenario(
         plan=plan,
         spec=spec,
         world=world,
-        actors=Actors.of(_actors(stage, recorded, ids)),
+        actors=Actors.of(_make_actors(stage, recording, ids)),
         agents=ids.agents,
-        meta=_meta(plan, stage, recorded, ids, config.decimals),
-        frames=recorded.frames,
+        meta=_make_meta(plan, stage, recording, ids, config.decimals),
+        frames=recording.frames,
         signals=signals,
         draws=draws,
     )
 
 
-def _first_good_draw(
+def _draw_stage(
     rng: np.random.Generator, config: SynthConfig, plan: ScenarioPlan
 ) -> tuple[Stage, Performance | None, int]:
-    """Draw scenes until the pair touches.
+    """Draw stages until the pair touches.
 
     Returns:
-        The scene, the course of it (None if nobody is timed to meet), and the number of draws.
+        The stage, its simulation (None if no pair is timed to meet), and the number of draws.
 
     Raises:
         ConfigError: The pair does not touch in the largest number of draws.
     """
+    kind = plan.kind
     min_distance = np.inf
-    max_draws = MAX_DRAWS if plan.kind is None else 10 * MAX_DRAWS
+    max_draws = MAX_DRAWS if kind is None else 10 * MAX_DRAWS
     for draws in range(1, max_draws + 1):
         spec = plan.draw(rng)
         junction = Junction(spec.road)
         if plan.unplanned:
             on_foot = None
-            if plan.kind is not None:
-                on_foot = plan.kind.labelled and rng.random() < ON_FOOT
-            spec = unplanned(rng, spec, junction, on_foot=on_foot)
-        duration = usual_duration(rng, config.frames, plan.kind)
-        stage = set_stage(rng, spec, junction, duration, plan.kind)
+            if kind is not None:
+                on_foot = kind.labelled and rng.random() < ON_FOOT
+            spec = replan_accident(rng, spec, junction, on_foot=on_foot)
+        duration = draw_duration(rng, config.frames, kind)
+        stage = set_stage(rng, spec, junction, duration, kind)
         if spec.meet is None:
             return stage, None, draws
         attempt = try_accident(stage)
         if not isinstance(attempt, Performance):
             min_distance = min(min_distance, attempt)
-        elif lasts(stage, attempt, config.frames):
+        elif is_long_enough(stage, attempt, config.frames):
             return stage, attempt, draws
     if min_distance == np.inf:
         reason = (
-            "their paths do not cross, or others touch before; change from or turn, "
-            "or the others' gap or lane"
+            "their paths do not cross, or other road users collide first; change from or turn, "
+            "or gap or lane of the others"
         )
     else:
         reason = (
@@ -204,9 +206,9 @@ def _first_good_draw(
     )
 
 
-def _twin(
+def _record_twin(
     rng: np.random.Generator, stage: Stage, config: SynthConfig, plan: ScenarioPlan
-) -> Recorded | None:
+) -> Recording | None:
     """Record a normal scenario.
 
     Returns:
@@ -217,7 +219,7 @@ def _twin(
     """
     normal = perform_twin(stage, latest_end(stage, config.frames))
     if normal is not None:
-        return recorded_normal(rng, stage, normal, config.frames)
+        return record_normal(rng, stage, normal, config.frames)
     if plan.kind is not None:
         return None
     condition = "in the normal twin too" if stage.spec.meet else "although all obey the rules"
@@ -227,15 +229,21 @@ def _twin(
     )
 
 
-class _Ids(NamedTuple):
-    """The ids of all actors of a stage: first the moving ones, then the parked ones."""
+class _ActorIds(NamedTuple):
+    """The ids of all actors of a stage.
+
+    Attributes:
+        actor: Ids in labels, of the moving actors and then of the parked ones.
+        camera: Ids of the BEV camera, in the same order.
+        agents: Actor ids of the four vehicle agents.
+    """
 
     actor: tuple[int, ...]
     camera: tuple[int, ...]
     agents: dict[AgentName, int]
 
     @classmethod
-    def of(cls, rng: np.random.Generator, stage: Stage) -> "_Ids":
+    def draw(cls, rng: np.random.Generator, stage: Stage) -> "_ActorIds":
         """Draw the ids of a stage's actors.
 
         Moving actors get ids from 1000 on, parked ones from 20000 on, in the order in which they
@@ -243,22 +251,24 @@ class _Ids(NamedTuple):
         """
         num_moving = len(stage.users)
         count = num_moving + len(stage.parked)
-        actor = (rng.integers(1000, 2000) + rng.integers(1, 4, num_moving).cumsum()).tolist()
-        actor += [STATIC_ACTOR_ID + row for row in range(num_moving, count)]
-        camera = rng.choice(np.arange(1, 2**16), count, replace=False).tolist()
-        agents = {}
-        for row, user in enumerate(stage.users):
-            if user.role in AGENT_OF_ROLE:
-                agents[AGENT_OF_ROLE[user.role]] = actor[row]
-        return cls(tuple(actor), tuple(camera), {agent: agents[agent] for agent in VEHICLE_AGENTS})
+        moving_ids = rng.integers(1000, 2000) + rng.integers(1, 4, num_moving).cumsum()
+        actor_ids = moving_ids.tolist()
+        actor_ids += [STATIC_ACTOR_ID + row for row in range(num_moving, count)]
+        camera_ids = rng.choice(np.arange(1, 2**16), count, replace=False).tolist()
+        id_by_role = {}
+        for user, actor_id in zip(stage.users, actor_ids, strict=False):
+            id_by_role[user.role] = actor_id
+        role_by_agent = {agent: role for role, agent in AGENT_OF_ROLE.items()}
+        agents = {agent: id_by_role[role_by_agent[agent]] for agent in VEHICLE_AGENTS}
+        return cls(tuple(actor_ids), tuple(camera_ids), agents)
 
 
-def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
-    """Return the actors of a recording: road users that labels name, then parked vehicles."""
-    simulation = recorded.performance.simulation
-    start = float(simulation.time[0]) - recorded.start
+def _make_actors(stage: Stage, recording: Recording, ids: _ActorIds) -> list[Actor]:
+    """Make the actors of a recording: road users that labels name, then parked vehicles."""
+    simulation = recording.performance.simulation
+    start = float(simulation.time[0]) - recording.start
     actors = []
-    for column, row in enumerate(recorded.performance.present):
+    for column, row in enumerate(recording.performance.present):
         if row == stage.unlabelled:
             continue
         motion = SampledMotion(
@@ -267,7 +277,7 @@ def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
             samples=simulation.poses[:, column],
             sample_velocities=simulation.velocities[:, column],
         )
-        actors.append(_actor(ids, row, stage.users[row].body, motion))
+        actors.append(_make_actor(ids, row, stage.users[row].body, motion))
     for row, vehicle in enumerate(stage.parked, start=len(stage.users)):
         motion = SampledMotion(
             start=0.0,
@@ -275,12 +285,12 @@ def _actors(stage: Stage, recorded: Recorded, ids: _Ids) -> list[Actor]:
             samples=np.array([vehicle.pose]),
             sample_velocities=np.zeros((1, 2)),
         )
-        actors.append(_actor(ids, row, vehicle.body, motion))
+        actors.append(_make_actor(ids, row, vehicle.body, motion))
     return actors
 
 
-def _actor(ids: _Ids, row: int, body: Body, motion: SampledMotion) -> Actor:
-    """Return the actor of a row of the stage."""
+def _make_actor(ids: _ActorIds, row: int, body: Body, motion: SampledMotion) -> Actor:
+    """Make the actor of a row of the stage."""
     return Actor(
         actor_id=ids.actor[row],
         object_id=ids.camera[row],
@@ -292,22 +302,23 @@ def _actor(ids: _Ids, row: int, body: Body, motion: SampledMotion) -> Actor:
     )
 
 
-def _meta(
-    plan: ScenarioPlan, stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
+def _make_meta(
+    plan: ScenarioPlan, stage: Stage, recording: Recording, ids: _ActorIds, decimals: int | None
 ) -> Meta:
     """Return the contents of a scenario's meta file."""
     spec = stage.spec
-    collision = _collision(stage, recorded, ids, decimals)
-    pair_agents = _pair_agents(stage)
+    collision = _make_collision(stage, recording, ids, decimals)
+    pair_agents = _find_pair_agents(stage)
     ego, ego_behind, other, other_behind = (ids.agents[agent] for agent in VEHICLE_AGENTS)
     planned_agents: tuple[AgentName | None, AgentName | None] | None = pair_agents
+    # In lifelike releases, half of the normal scenarios do not name the planned agents.
     if collision or pair_agents == (None, None) or (stage.kind and ego % 2):
         planned_agents = None
     return Meta(
         weather=spec.weather,
         time_of_day=spec.time_of_day,
         collision=collision,
-        simulated_frames=recorded.frames + WARM_UP_FRAMES,
+        simulated_frames=recording.frames + WARM_UP_FRAMES,
         agent_ids=(ego, ego_behind, other, other_behind),
         road_type=plan.traits.road_type,
         spawn_side=plan.traits.spawn_side,
@@ -317,37 +328,40 @@ def _meta(
     )
 
 
-def _collision(
-    stage: Stage, recorded: Recorded, ids: _Ids, decimals: int | None
+def _make_collision(
+    stage: Stage, recording: Recording, ids: _ActorIds, decimals: int | None
 ) -> Collision | None:
     """Return the collision in the meta file; None if there is none."""
-    impact = recorded.impact
+    impact = recording.impact
     pair = stage.cast.pair
     if impact is None or pair is None:
         return None
-    user, other_user = (stage.users[row] for row in pair)
+    row, other_row = pair
     strength = impact.strength
     if decimals is not None:
         strength = round(strength, decimals)
-    other_id = 0 if pair[1] == stage.unlabelled else ids.actor[pair[1]]
+    other_id = 0
+    if other_row != stage.unlabelled:
+        other_id = ids.actor[other_row]
     return Collision(
-        ids=(ids.actor[pair[0]], other_id),
-        classes=(user.body.category, other_user.body.category),
+        ids=(ids.actor[row], other_id),
+        classes=(stage.users[row].body.category, stage.users[other_row].body.category),
         impact=strength,
         spawn_relation=impact.relation,
         contact_side=impact.side,
-        agents=_pair_agents(stage),
+        agents=_find_pair_agents(stage),
     )
 
 
-def _pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
-    """Return the agents of the two that are timed to meet.
+def _find_pair_agents(stage: Stage) -> tuple[AgentName | None, AgentName | None]:
+    """Return the agents of the two road users that are timed to meet.
 
-    They are None for a road user that is no agent, or if nobody is timed.
+    The entry is None for a road user that is not an agent; both are None if no pair is timed.
     """
     if not stage.cast.pair:
         return None, None
-    agent, other_agent = (AGENT_OF_ROLE.get(stage.users[row].role) for row in stage.cast.pair)
+    roles = [stage.users[row].role for row in stage.cast.pair]
+    agent, other_agent = (AGENT_OF_ROLE.get(role) for role in roles)
     return agent, other_agent
 
 
@@ -388,7 +402,7 @@ def part_count(config: SynthConfig) -> int:
 def record_scenario(job: RecordingJob) -> None:
     """Make a scenario and write all its files, or the files of a part of it."""
     _limit_opencv_threads()
-    scenario, rig = _CACHE.scenario_and_rig(_Task(job.config, job.plan))
+    scenario, rig = _CACHE.scenario_and_rig(_ScenarioTask(job.config, job.plan))
     labelled = job.plan.split != "test" or not job.config.unlabelled_test
     recorder = _Recorder(
         folder=job.folder,
@@ -420,14 +434,14 @@ def _limit_opencv_threads() -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
+class _ScenarioTask:
     """A scenario to make."""
 
     config: SynthConfig
     plan: ScenarioPlan = field(hash=False)
 
 
-def _scenario_and_rig(task: _Task) -> tuple[Scenario, Rig]:
+def _make_scenario_and_rig(task: _ScenarioTask) -> tuple[Scenario, Rig]:
     """Make a scenario and its sensors."""
     config = task.config
     plan = task.plan
@@ -450,13 +464,13 @@ def _scenario_and_rig(task: _Task) -> tuple[Scenario, Rig]:
 
 
 class _ScenarioCache(threading.local):
-    """A thread's last scenario, for the next part of it.
+    """The last scenario of a thread, for the next part of it.
 
     Threads share no scenario: a rig remembers the rays that it casts.
     """
 
     def __init__(self) -> None:
-        self.scenario_and_rig = lru_cache(maxsize=1)(_scenario_and_rig)
+        self.scenario_and_rig = lru_cache(maxsize=1)(_make_scenario_and_rig)
 
 
 _CACHE = _ScenarioCache()
@@ -464,7 +478,15 @@ _CACHE = _ScenarioCache()
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Recorder:
-    """Writer of the files of one scenario."""
+    """A writer of the files of one scenario.
+
+    Attributes:
+        folder: Folder of the files.
+        scenario: The scenario.
+        rig: Sensors of the scenario.
+        labelled: Whether labels are written.
+        sensor_step: Step between frames with sensors' files, counted back from the last frame.
+    """
 
     folder: ScenarioFolder
     scenario: Scenario
@@ -479,24 +501,26 @@ class _Recorder:
         if (self.scenario.frames - frame) % self.sensor_step:
             rig = replace(rig, clouds=False, studio=None)
         scene = rig.scene(time)
-        surroundings = rig.surroundings(scene, self._signals(time))
+        surroundings = rig.surroundings(scene, self._find_signal_states(time))
         folder = self.folder
         for agent in rig.agents:
             sighting = rig.sighting(scene, agent, frame)
-            write_calib(real_path(folder.calib_path(agent.name, frame)), sighting.calib)
+            calib_path = real_path(folder.calib_path(agent.name, frame))
+            write_calib(calib_path, sighting.calib)
             if self.labelled:
-                write_label(real_path(folder.label_path(agent.name, frame)), sighting.labels)
+                label_path = real_path(folder.label_path(agent.name, frame))
+                write_label(label_path, sighting.labels)
             if rig.clouds:
                 self._record_arrays(scene, sighting.points, agent, frame)
             if surroundings:
                 for channel, image in rig.images(scene, surroundings, agent, frame):
-                    image_path = folder.channel_path(agent.name, channel, frame)
-                    write_image(real_path(image_path), image)
+                    image_path = real_path(folder.channel_path(agent.name, channel, frame))
+                    write_image(image_path, image)
 
     def _record_arrays(self, scene: Scene, points: Scan, agent: Agent, frame: int) -> None:
-        """Write the point cloud, and if all sensors are recorded and labelled also the BEV array.
+        """Write the point cloud of an agent, and the BEV array where it is recorded.
 
-        The instances of the BEV array are labels.
+        The BEV array is recorded with all sensors and labels, because its instances are labels.
         """
         cloud_path = real_path(self.folder.channel_path(agent.name, LIDAR, frame))
         write_lidar(cloud_path, points.xyz, intensity(points, self.rig.air))
@@ -505,10 +529,10 @@ class _Recorder:
             bev_path = real_path(self.folder.channel_path(agent.name, BEV_CAMERA, frame))
             write_bev(bev_path, bev.semantic, bev.instance)
 
-    def _signals(self, time: float) -> Mapping[Arm, int]:
-        """Return the states of the traffic lights by arm."""
+    def _find_signal_states(self, time: float) -> Mapping[Arm, int]:
+        """Return the states of the traffic lights at a time, by arm."""
         signals = self.scenario.signals
         if signals is None:
             return {}
-        heads = self.scenario.world.signals
-        return {head.arm: int(signals.state(head.arm, time)) for head in heads}
+        arms = [head.arm for head in self.scenario.world.signals]
+        return {arm: int(signals.state(arm, time)) for arm in arms}

@@ -5,8 +5,6 @@ the index. Opening it takes milliseconds for millions of files: only folders are
 searched on request among the sorted files of its folder.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import zlib
@@ -14,7 +12,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,13 +27,15 @@ SPLIT_FOLDERS: Final = SPLITS
 SPLIT_FILE_FOLDER: Final = "split_txt_files"
 SCENARIO_TYPE: Final = re.compile(r"type\d+_subtype\d+_(?:accident|normal)")
 SPLIT_FILES: Final = tuple(f"{split}.txt" for split in (*SPLITS, *MINI_SPLITS))
+# Size of a file in bytes, and a text that changes with the file.
+FileState: TypeAlias = tuple[int, str]
 # The folder that macOS adds to its archives.
-_MACOS_FOLDER: Final = "__MACOSX"
+_MACOS_FOLDER = "__MACOSX"
 # The form increases whenever the file's form or its meaning changes.
 FORM: Final = 3
-_METADATA_KEY: Final = b"deepaccident_members"
+_METADATA_KEY = b"deepaccident_members"
 # Stored form of a `Member`.
-_MEMBER_TYPE: Final = np.dtype(
+_MEMBER_TYPE = np.dtype(
     [
         ("archive", "<i4"),
         ("offset", "<i8"),
@@ -46,18 +46,18 @@ _MEMBER_TYPE: Final = np.dtype(
     ]
 )
 # Position of the number in the name of a frame's file.
-_FRAME_NUMBER: Final = slice(-7, -4)
-_REMEDY: Final = "remove it with: deepaccident index DATAROOT --clear"
+_FRAME_NUMBER = slice(-7, -4)
+_REMEDY = "remove it with: deepaccident index DATAROOT --clear"
 
 
 def release_folder(parts: Sequence[str]) -> str | None:
-    """Return the folder of a release that a folder stands for.
+    """Return the folder of a release that the parts of a path stand for.
 
-    It begins with the scenario type, or with the split folder if there is one.
+    It begins with the scenario type, or with the split folder if there is one:
     `DeepAccident/train/type1_subtype1_accident/meta` stands for
     `train/type1_subtype1_accident/meta`. The folders that lead to it do not matter, so that an
-    archive may hold any part of a release, below any folders. Empty for the release's own folder;
-    None for a folder that holds files of no release.
+    archive may hold any part of a release, below any folders. It is empty for the release's own
+    folder, and None for a folder with files of no release.
     """
     # Hidden folders, or folders that lead out of an archive.
     if any(name.startswith(".") or name == _MACOS_FOLDER for name in parts):
@@ -67,7 +67,8 @@ def release_folder(parts: Sequence[str]) -> str | None:
         return ""
     last_type = type_positions[-1]
     splits = [name for name in parts[:last_type] if name in (*SPLIT_FOLDERS, MINI_FOLDER)]
-    return "/".join([*splits[-1:], *parts[last_type:]])
+    names = [*splits[-1:], *parts[last_type:]]
+    return "/".join(names)
 
 
 def is_release_file(folder: str, name: str) -> bool:
@@ -83,7 +84,7 @@ class Member(NamedTuple):
 
     Attributes:
         archive: Position in `Members.archives`.
-        offset: Position of its head in the archive; −1 where the archive is the file's folder.
+        offset: Position of its header in the archive; −1 where the archive is the file's folder.
         stored: Size in the archive, bytes.
         size: Size of the file, bytes.
         version: CRC-32 in a zip; elsewhere another number that changes with the file.
@@ -100,7 +101,7 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Listing:
-    """N files of one archive that belong to a release.
+    """The N files of one archive that belong to a release.
 
     Attributes:
         archive: Path of the archive from the store's base.
@@ -118,34 +119,33 @@ class Listing:
 
 
 class Members:
-    """Files of a store, by folder and name.
+    """The files of a store, by folder and name.
 
     Attributes:
         archives: Paths of the archives from the store's base.
-        states: States of all existing archives: size in bytes, and a text that changes with the
-            archive.
+        states: Existing archive → its size in bytes, and a text that changes with it.
         lacking: Archives that could not be listed.
     """
 
     def __init__(self, path: Path) -> None:
-        """Map the file of `write_members`; raises IndexStoreError if it cannot be read."""
+        """Map the file that `write_members` wrote; raises IndexStoreError if it cannot be read."""
         import pyarrow as pa
 
         try:
             batch = pa.ipc.open_file(mapped_file(path)).get_batch(0)
-            head = json.loads(batch.schema.metadata[_METADATA_KEY])
-            if head["form"] != FORM:
-                raise ValueError("of another version of the devkit")
+            header = json.loads(batch.schema.metadata[_METADATA_KEY])
+            if header["form"] != FORM:
+                raise ValueError("made by another version of the devkit")
             names = batch.column("name")
             _, offsets, content = names.buffers()
-            self.archives: tuple[str, ...] = tuple(map(str, head["archives"]))
-            self.states: dict[str, tuple[int, str]] = {}
-            for name, (size, text) in head["states"].items():
+            self.archives: tuple[str, ...] = tuple(map(str, header["archives"]))
+            self.states: dict[str, FileState] = {}
+            for name, (size, text) in header["states"].items():
                 self.states[str(name)] = (int(size), str(text))
             self.lacking = [archive for archive in self.states if archive not in self.archives]
             self._rows: dict[str, tuple[int, int]] = {}
-            for folder, begin, end in head["folders"]:
-                self._rows[str(folder)] = (int(begin), int(end))
+            for folder, start, stop in header["folders"]:
+                self._rows[str(folder)] = (int(start), int(stop))
             self._starts = np.frombuffer(offsets, np.int64) if offsets else np.zeros(1, np.int64)
             self._content = memoryview(content) if content else memoryview(b"")
             member_buffer = batch.column("member").buffers()[1] or b""
@@ -179,11 +179,11 @@ class Members:
         frame = file_name[_FRAME_NUMBER]
         # In a complete recording the rows follow the frame numbers.
         row = low + int(frame) - 1 if frame.isdigit() else high
-        if not (low <= row < high and self._name(row) == file_name):
-            row = bisect_left(range(high), file_name, low, high, key=self._name)
-            if row == high or self._name(row) != file_name:
+        if not (low <= row < high and self._read_name(row) == file_name):
+            row = bisect_left(range(high), file_name, low, high, key=self._read_name)
+            if row == high or self._read_name(row) != file_name:
                 return None
-        return self._member(row)
+        return self._read_member(row)
 
     def has_folder(self, folder: str) -> bool:
         """Return whether a folder of the release has any content."""
@@ -194,23 +194,26 @@ class Members:
         return [*self._children.get(folder, ())]
 
     def files_in(self, folder: str) -> list[tuple[str, Member]]:
-        """Return the names and positions of a folder's files, in order."""
+        """Return the names of a folder's files with their members, in order."""
         files = []
         for row in range(*self._rows.get(folder, (0, 0))):
-            name = self._name(row).decode(errors="surrogateescape")
-            files.append((name, self._member(row)))
+            name = self._read_name(row).decode(errors="surrogateescape")
+            files.append((name, self._read_member(row)))
         return files
 
     def number_of(self, member: Member) -> int:
-        """Return a number that changes with a file, and with its archive."""
-        state = self.states.get(self.archives[member.archive])
-        return member.version << 32 | zlib.crc32(repr(state).encode())
+        """Return a number that changes with a file and with its archive."""
+        archive = self.archives[member.archive]
+        state_text = repr(self.states.get(archive))
+        return member.version << 32 | zlib.crc32(state_text.encode())
 
-    def _name(self, row: int) -> bytes:
+    def _read_name(self, row: int) -> bytes:
         """Return the name of the file in a row."""
-        return bytes(self._content[self._starts.item(row) : self._starts.item(row + 1)])
+        start = self._starts.item(row)
+        stop = self._starts.item(row + 1)
+        return bytes(self._content[start:stop])
 
-    def _member(self, row: int) -> Member:
+    def _read_member(self, row: int) -> Member:
         """Return the file in a row."""
         return Member._make(self._numbers.item(row))
 
@@ -225,10 +228,8 @@ class Members:
             siblings[name] = None
 
 
-def write_members(
-    path: Path, listings: Sequence[Listing], states: Mapping[str, tuple[int, str]]
-) -> None:
-    """Write the list of some archives' files, which `Members` reads.
+def write_members(path: Path, listings: Sequence[Listing], states: Mapping[str, FileState]) -> None:
+    """Write the list of all archives' files, which `Members` reads.
 
     Raises DatarootError for a file that occurs twice.
     """
@@ -236,25 +237,28 @@ def write_members(
 
     folders = sorted({folder for listing in listings for folder in listing.folders})
     folder_numbers = {folder: number for number, folder in enumerate(folders)}
-    parts = []
-    for archive, listing in enumerate(listings):
-        parts.append(_listing_table(listing, archive, folder_numbers))
+    tables = [
+        _make_listing_table(listing, archive, folder_numbers)
+        for archive, listing in enumerate(listings)
+    ]
     order = [("folder", "ascending"), ("name", "ascending")]
-    table = pa.concat_tables(parts).sort_by(order).combine_chunks()
+    table = pa.concat_tables(tables).sort_by(order).combine_chunks()
     archives = [listing.archive for listing in listings]
     folder = table["folder"].to_numpy()
     _check_unique(table, folder, folders, archives)
-    ends = np.cumsum(np.bincount(folder, minlength=len(folders))).tolist()
-    rows = list(zip(folders, [0, *ends], ends, strict=False))
-    head = json.dumps({"form": FORM, "archives": archives, "folders": rows, "states": states})
-    table = table.select(["name", "member"]).replace_schema_metadata({_METADATA_KEY: head.encode()})
+    stops = np.cumsum(np.bincount(folder, minlength=len(folders))).tolist()
+    rows = list(zip(folders, [0, *stops], stops, strict=False))
+    header = json.dumps({"form": FORM, "archives": archives, "folders": rows, "states": states})
+    table = table.select(["name", "member"]).replace_schema_metadata(
+        {_METADATA_KEY: header.encode()}
+    )
     with replacing(path) as temporary, pa.ipc.new_file(str(temporary), table.schema) as writer:
-        columns = [_single_chunk(column) for column in table.columns]
+        columns = [_take_single_chunk(column) for column in table.columns]
         writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=table.schema))
 
 
-def _listing_table(listing: Listing, archive: int, folder_numbers: Mapping[str, int]) -> Any:
-    """Return a table of an archive's files, with the number of the archive and of the folders."""
+def _make_listing_table(listing: Listing, archive: int, folder_numbers: Mapping[str, int]) -> Any:
+    """Return a table of an archive's files, with the numbers of the archive and of the folders."""
     import pyarrow as pa
 
     members = np.zeros(len(listing.names), _MEMBER_TYPE)
@@ -275,17 +279,19 @@ def _listing_table(listing: Listing, archive: int, folder_numbers: Mapping[str, 
     )
 
 
-def _single_chunk(column: Any) -> Any:
-    """Return a column's only chunk; an empty column has none."""
+def _take_single_chunk(column: Any) -> Any:
+    """Return a column's only chunk, or an empty array if it has none."""
     import pyarrow as pa
 
-    return column.chunk(0) if column.num_chunks else pa.array([], column.type)
+    if column.num_chunks:
+        return column.chunk(0)
+    return pa.array([], column.type)
 
 
 def _check_unique(
     table: Any, folder: AnyArray, folders: Sequence[str], archives: Sequence[str]
 ) -> None:
-    """Raise DatarootError if two rows have the same file; sorted rows of a file are neighbours."""
+    """Raise DatarootError if a file occurs twice; in the sorted rows it does so in neighbours."""
     import pyarrow.compute as pc
 
     if len(folder) < 2:
@@ -300,9 +306,12 @@ def _check_unique(
             member = np.frombuffer(table["member"][number].as_py(), _MEMBER_TYPE)
             archive_names.append(archives[int(member["archive"][0])])
         first, second = archive_names
-        location = f"in {first} and in {second}" if first != second else f"twice in {first}"
-        num_repeated = is_repeated.sum()
-        more = f", and so are {num_repeated - 1:,} more" if num_repeated > 1 else ""
+        location = f"twice in {first}"
+        if first != second:
+            location = f"in {first} and in {second}"
+        num_others = is_repeated.sum() - 1
+        others_text = f", and so are {num_others:,} more" if num_others else ""
         raise DatarootError(
-            f"{folders[folder[row]]}/{name}: is {location}{more}; keep one of them in this folder"
+            f"{folders[folder[row]]}/{name}: is {location}{others_text}; "
+            "keep one of them in this folder"
         )

@@ -24,6 +24,7 @@ from deepaccident_devkit.release.store.members import (
     SPLIT_FILE_FOLDER,
     SPLIT_FILES,
     SPLIT_FOLDERS,
+    FileState,
     Listing,
     Members,
     is_release_file,
@@ -40,8 +41,8 @@ from deepaccident_devkit.release.store.paths import (
 from deepaccident_devkit.release.store.sources import UrlSource, call_library, list_zip
 from deepaccident_devkit.release.store.store import opened_store
 from deepaccident_devkit.support.files import is_writable_folder
-from deepaccident_devkit.support.reading import fault_text, open_file
-from deepaccident_devkit.support.text import path_text
+from deepaccident_devkit.support.reading import fault_text, open_file, reason_text
+from deepaccident_devkit.support.text import PathType, counted, path_text
 from deepaccident_devkit.taxonomy import OnError
 
 if TYPE_CHECKING:
@@ -49,16 +50,16 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.support.parallel import Engine, Failure
 
-# File → its size in bytes, and a text that changes with it.
-_States: TypeAlias = Mapping[str, tuple[int, str]]
+# File → its state.
+_States: TypeAlias = Mapping[str, FileState]
 INDEX_FOLDER: Final = ".deepaccident"
-_ARCHIVE_ENDING: Final = ".zip"
+_ARCHIVE_ENDING = ".zip"
 # Archives may lie in folders of this depth below a dataroot.
-_MAX_DEPTH: Final = 3
+_MAX_DEPTH = 3
 # Begin of the name of a list of a store's files.
-_LIST_PREFIX: Final = "files-"
-_SKIP_REMEDY: Final = (
-    "\nThe others can be read without them: move them out of the folder, "
+_LIST_PREFIX = "files-"
+_SKIP_REMEDY = (
+    "\nThe other archives can be read: move the broken ones out of the folder, "
     "or pass on_error='skip' (--on-error skip)."
 )
 _logger = logging.getLogger(__name__)
@@ -76,8 +77,8 @@ def open_dataroot(
     """Return the path at which the files of a release are read.
 
     A folder that holds a release is read directly. The files of a zip, a folder of zips or a URL
-    are listed once, beside the index; archives are listed again when they change or are replaced, a
-    URL's files when `refresh` is set.
+    are listed once, beside the index. Archives are listed again when they change or are replaced,
+    and a URL's files when `refresh` is set.
 
     Args:
         dataroot: A folder, a zip, a folder with zips (each of any part of a release), or a URL that
@@ -94,31 +95,32 @@ def open_dataroot(
         The folder's absolute path, which need not exist; or the release's folder in a store.
 
     Raises:
-        DatarootError: Archives cannot be read, two hold the same file, or the URL cannot be listed.
-        IndexStoreError: The list cannot be written or read.
-        MissingExtraError: The URL needs fsspec, or one of its file systems.
+        DatarootError: If archives cannot be read, if two hold the same file, or if the URL cannot
+            be listed.
+        IndexStoreError: If the list cannot be written or read.
+        MissingExtraError: If the URL needs fsspec, or one of its file systems.
     """
     if isinstance(dataroot, StorePath):
         if not (refresh and dataroot.store.is_remote):
             return dataroot
         dataroot = dataroot.store.place
-    location = _location(dataroot)
+    location = _resolve_location(dataroot)
     folders = list(index_places(location, index_dir))
     if outside:
         folders.reverse()
     if isinstance(location, str):
-        return _opened_url(UrlSource(location), folders, on_error, refresh=refresh)
-    archives = _archives(location)
+        return _open_url(UrlSource(location), folders, on_error, refresh=refresh)
+    archives = _find_archives(location)
     if not archives:
         return location
-    return _opened_archives(location, archives, folders, on_error, **engine)
+    return _open_archives(location, archives, folders, on_error, **engine)
 
 
 def refused_archives(root: ReleasePath) -> list[str]:
-    """Return a sentence for each archive left out of a store: its name, fault and remedy."""
+    """Return a sentence for each archive that a store lacks, with its name, fault and remedy."""
     if isinstance(root, Path):
         return []
-    results = _listings(root.store.base, root.store.members.lacking)
+    results = _list_archives(root.store.base, root.store.members.lacking)
     return [result.message for result in results if not isinstance(result, Listing)]
 
 
@@ -127,7 +129,9 @@ def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[
     if index_dir is not None:
         yield index_dir
         return
-    location = _location(dataroot.store.place if isinstance(dataroot, StorePath) else dataroot)
+    location = _resolve_location(
+        dataroot.store.place if isinstance(dataroot, StorePath) else dataroot
+    )
     identity = os.fsencode(location)
     if isinstance(location, Path):
         if location.is_file():
@@ -142,12 +146,12 @@ def index_places(dataroot: Dataroot, index_dir: Path | None = None) -> Iterator[
 
 
 def list_files_in(folder: Path) -> list[Path]:
-    """Return the lists of stores' files in a folder of indexes."""
+    """Return the paths of the lists of files in a folder of indexes."""
     return sorted(folder.glob(f"{_LIST_PREFIX}*"))
 
 
-def _location(dataroot: str | os.PathLike[str]) -> Path | str:
-    """Return the absolute path of a dataroot with its symbolic links; or the URL."""
+def _resolve_location(dataroot: PathType) -> Path | str:
+    """Return the absolute path of a dataroot, with its symbolic links, or its URL."""
     text = path_text(dataroot, "dataroot: expected a path or a URL", error=DatarootError)
     if "://" in text:
         parts = urlsplit(text)
@@ -157,16 +161,16 @@ def _location(dataroot: str | os.PathLike[str]) -> Path | str:
     return Path(os.path.abspath(Path(text).expanduser()))  # noqa: PTH100
 
 
-def _archives(path: Path) -> list[Path]:
+def _find_archives(path: Path) -> list[Path]:
     """Return the archives of a path: itself, or the archives in a folder that holds no release.
 
-    Other paths have none.
+    There are none for other paths.
     """
     if path.suffix.lower() == _ARCHIVE_ENDING and path.is_file():
         return [path]
-    release_folders = [path, *(path / name for name in (*SPLIT_FOLDERS, MINI_FOLDER))]
-    if any(_has_scenarios(folder) for folder in release_folders):
-        return []
+    for name in ("", *SPLIT_FOLDERS, MINI_FOLDER):
+        if _has_scenarios(path / name):
+            return []
     archives: list[Path] = []
     folders = [(path, 0)]
     while folders:
@@ -183,7 +187,7 @@ def _archives(path: Path) -> list[Path]:
 
 
 def _is_archive(name: str) -> bool:
-    """Return whether a file name or URL is that of an archive."""
+    """Return whether a file name or a URL names an archive."""
     return name.lower().endswith(_ARCHIVE_ENDING)
 
 
@@ -196,20 +200,20 @@ def _has_scenarios(folder: Path) -> bool:
     return False
 
 
-def _opened_archives(
+def _open_archives(
     path: Path,
     archives: Sequence[Path],
     folders: Sequence[Path],
     on_error: OnError,
     **engine: Unpack[Engine],
 ) -> StorePath:
-    """Return the release in archives at or below a path; `folders` may hold its list of files."""
+    """Open the release in archives at or below a path; `folders` may hold its list of files."""
     base = path.parent if archives == [path] else path
     split_files = []
     for split_folder in (path, path / SPLIT_FILE_FOLDER):
         split_files += [split_folder / name for name in SPLIT_FILES]
-    states = _states(base, archives)
-    split_states = _states(base, filter(Path.is_file, split_files))
+    states = _read_states(base, archives)
+    split_states = _read_states(base, filter(Path.is_file, split_files))
     all_states = sorted({**states, **split_states}.items())
     name = list_name(all_states)
     for folder in folders:
@@ -217,18 +221,18 @@ def _opened_archives(
         if list_file.is_file():
             with suppress(IndexStoreError):  # a damaged list is made again
                 return StorePath(opened_store(str(path), str(base), list_file))
-    results = _listings(str(base), states, (base,), **engine)
-    listings = _with_loose_files(_accepted(str(path), results, on_error), split_states)
+    results = _list_archives(str(base), states, (base,), **engine)
+    listings = _add_loose_files(_accept_listings(str(path), results, on_error), split_states)
     list_file = _write_list(folders, all_states, listings, states)
     return StorePath(opened_store(str(path), str(base), list_file))
 
 
-def _states(base: Path, files: Iterable[Path]) -> _States:
-    """Return the states of files by their paths below a base folder."""
+def _read_states(base: Path, files: Iterable[Path]) -> _States:
+    """Return path below a base folder → state of the file."""
     return {file.relative_to(base).as_posix(): state_of(file) for file in files}
 
 
-def state_of(file: Path) -> tuple[int, str]:
+def state_of(file: Path) -> FileState:
     """Return a file's size in bytes, and a text that changes with it.
 
     The text also changes if the file's time is reset.
@@ -237,79 +241,84 @@ def state_of(file: Path) -> tuple[int, str]:
     return status.st_size, f"{status.st_mtime_ns} {status.st_ctime_ns}"
 
 
-def _opened_url(
+def _open_url(
     source: UrlSource, folders: Sequence[Path], on_error: OnError, *, refresh: bool
 ) -> StorePath:
-    """Return the release at a URL; `folders` may hold its list of files."""
+    """Open the release at a URL; `folders` may hold its list of files."""
     url = source.url
     base = UrlSource(url.rpartition("/")[0]) if _is_archive(url) else source
     with _dataroot_errors(url):
-        list_file = None if refresh else _known_list(base, folders)
+        list_file = None if refresh else _find_known_list(base, folders)
         if list_file is None:
-            archives, loose_files = _files_at(base, url)
-            results = _listings(base.url, archives, workers=1)
-            listings = _with_loose_files(_accepted(url, results, on_error), loose_files)
+            archives, loose_files = _list_url_files(base, url)
+            results = _list_archives(base.url, archives, workers=1)
+            listings = _add_loose_files(_accept_listings(url, results, on_error), loose_files)
             if on_error == "raise" and not any(listing.names for listing in listings):
                 raise DatarootError(
-                    f"{url}: no file of a release found; give the URL that the release lies below"
+                    f"{url}: no file of a release found; give the URL of the folder that "
+                    "contains the release"
                 )
             states = [*archives.items(), *loose_files.items()]
             list_file = _write_list(folders, states, listings, archives)
     return StorePath(opened_store(url, base.url, list_file))
 
 
-def _listings(
+def _list_archives(
     base: str, archives: Iterable[str], read_paths: tuple[Path, ...] = (), **engine: Unpack[Engine]
 ) -> list[Listing | Failure]:
-    """List archives by their paths from the base, a folder or a URL.
+    """List archives, which are paths from the base, a folder or a URL.
 
     A Failure has the reason why an archive cannot be listed.
     """
     # Imported late, since few dataroots are archives.
     from deepaccident_devkit.support.parallel import Places, Tried, run_batch
 
-    work = Tried(partial(_listing_of, base))
+    work = Tried(partial(_list_archive, base))
     places = Places(reads=read_paths)
-    return run_batch(work, list(archives), label="listing archives", places=places, **engine)
+    return run_batch(work, list(archives), label="Listing archives", places=places, **engine)
 
 
-def _listing_of(base: str, name: str) -> Listing:
-    """Return the listing of an archive, or raise DatarootError."""
+def _list_archive(base: str, name: str) -> Listing:
+    """List the release's files in an archive, or raise DatarootError."""
     path = f"{base}/{name}"
 
-    def listing() -> Listing:
-        with UrlSource(base).opened(name) if "://" in base else open_file(Path(path)) as file:
+    def read_listing() -> Listing:
+        with UrlSource(base).open_archive(name) if "://" in base else open_file(Path(path)) as file:
             return list_zip(file, name, path)
 
     try:
-        return call_library(listing)
+        return call_library(read_listing)
+    except DatarootError:
+        raise
     except OSError as error:
-        if isinstance(error, DatarootError):
-            raise
         raise DatarootError(
-            f"{path}: {fault_text(error)}; make it readable, or fetch it again"
+            f"{path}: {fault_text(error)}; make it readable, or download it again"
         ) from error
 
 
-def _accepted(
+def _accept_listings(
     location: str, results: Sequence[Listing | Failure], on_error: OnError
 ) -> list[Listing]:
-    """Return the listings of archives.
+    """Return the listings of the archives that can be listed.
 
-    Archives that cannot be listed are logged, or DatarootError names all of them.
+    The others are logged, or DatarootError names all of them.
     """
+    listings = [result for result in results if isinstance(result, Listing)]
     refused = [result.message for result in results if not isinstance(result, Listing)]
-    title = f"{location}: {len(refused)} of {len(results)} archives cannot be read:"
+    archives = counted(len(results), "archive")
+    title = f"{location}: {len(refused)} of {archives} cannot be read:"
     text = "\n  ".join([title, *refused])
     if refused and on_error == "raise":
-        raise DatarootError(text + _SKIP_REMEDY * (len(refused) < len(results)))
+        if listings:
+            text += _SKIP_REMEDY
+        raise DatarootError(text)
     if refused:
-        _logger.warning("left out: %s", escaped(text))
-    return [result for result in results if isinstance(result, Listing)]
+        _logger.warning("excluded archives: %s", escaped(text))
+    return listings
 
 
-def _known_list(base: UrlSource, folders: Sequence[Path]) -> Path | None:
-    """Return the list of all of a URL's files, if its archives have not changed since.
+def _find_known_list(base: UrlSource, folders: Sequence[Path]) -> Path | None:
+    """Return the path of a list of all of a URL's files, if its archives have not changed since.
 
     The states of other files are not requested.
     """
@@ -323,15 +332,18 @@ def _known_list(base: UrlSource, folders: Sequence[Path]) -> Path | None:
 
 
 def _has_states(base: UrlSource, states: _States) -> bool:
-    """Return whether files at a URL have these states."""
-    return all(base.state_of(name) == state for name, state in states.items())
+    """Return whether files at a URL still have these states."""
+    for name, state in states.items():
+        if base.state_of(name) != state:
+            return False
+    return True
 
 
-def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
+def _list_url_files(base: UrlSource, url: str) -> tuple[_States, _States]:
     """Return the states of the archives at a URL, and of the other files that are read.
 
-    The other files are split files beside archives, or all files if there are no archives. The
-    states are by the paths from the base.
+    The other files are split files beside archives, or all files if there are no archives. The keys
+    are the paths from the base.
     """
     if base.url != url:
         name = PurePosixPath(url).name
@@ -341,7 +353,8 @@ def _files_at(base: UrlSource, url: str) -> tuple[_States, _States]:
     folders = {path.rpartition("/")[0] for path in files}
     if not archives or any(release_folder(folder.split("/")) for folder in folders):
         return {}, files
-    return archives, {name: state for name, state in files.items() if _is_split_file(name)}
+    split_files = {name: state for name, state in files.items() if _is_split_file(name)}
+    return archives, split_files
 
 
 def _is_split_file(path: str) -> bool:
@@ -350,25 +363,22 @@ def _is_split_file(path: str) -> bool:
     return name in SPLIT_FILES and folder in ("", SPLIT_FILE_FOLDER)
 
 
-def _with_loose_files(listings: Sequence[Listing], files: _States) -> list[Listing]:
-    """Return the listings of archives, and of files beside them.
+def _add_loose_files(listings: Sequence[Listing], files: _States) -> list[Listing]:
+    """Return the listings of archives and of the files beside them.
 
     A split file in an archive takes precedence over one beside the archives.
     """
-    packed: set[str] = set()
+    archived_files: set[str] = set()
     for listing in listings:
-        packed.update(name for name in listing.names if name in SPLIT_FILES)
-    loose_files = {}
-    for path, state in files.items():
-        if path.rpartition("/")[2] not in packed:
-            loose_files[path] = state
-    return [*listings, *_loose_listings(loose_files)]
+        archived_files.update(name for name in listing.names if name in SPLIT_FILES)
+    loose_paths = [path for path in files if path.rpartition("/")[2] not in archived_files]
+    return [*listings, *_list_loose_files({path: files[path] for path in loose_paths})]
 
 
-def _loose_listings(files: _States) -> list[Listing]:
+def _list_loose_files(files: _States) -> list[Listing]:
     """Return a listing for each folder of files that are in no archive.
 
-    The base folder has one even if it has no files.
+    There is one for the base folder even if it has no files.
     """
     folders: dict[str, list[str]] = {"": []}
     for path in files:
@@ -405,8 +415,16 @@ def _loose_listings(files: _States) -> list[Listing]:
     return listings
 
 
+def unwritable_error(folders: Sequence[Path]) -> IndexStoreError:
+    """Return the error for an index if none of its possible folders can be written to."""
+    names = " or ".join(map(str, folders))
+    return IndexStoreError(
+        f"{names}: no place to write the index; give a writable folder with index_dir="
+    )
+
+
 def list_name(states: Sequence[Any]) -> str:
-    """Return the name of the list of a store with files of these states."""
+    """Return the file name of the list of a store, which follows from the states of its files."""
     content = json.dumps([FORM, states]).encode()
     digest = hashlib.blake2b(content, digest_size=8).hexdigest()
     return f"{_LIST_PREFIX}{digest}.arrow"
@@ -420,40 +438,37 @@ def _write_list(
 ) -> Path:
     """Write the list of a store's files into the first writable folder, and remove older lists.
 
-    The name follows from the states of all files, unless archives could not be listed: they are
-    tried each time.
+    The name follows from the states of all files. If archives could not be listed it also has
+    theirs, so that they are tried again each time.
     """
     refused = states.keys() - {listing.archive for listing in listings}
     name = list_name([*all_states, *sorted(refused)])
-    folder = next((folder for folder in folders if is_writable_folder(folder)), None)
+    folder = next(filter(is_writable_folder, folders), None)
     if folder is None:
-        names = " or ".join(map(str, folders))
-        raise IndexStoreError(
-            f"{names}: no place to write the index; give a writable folder with index_dir="
-        )
+        raise unwritable_error(folders)
     list_file = folder / name
     try:
         write_members(list_file, listings, states)
         for path in list_files_in(folder):
             if path.name != name:
                 path.unlink(missing_ok=True)
+    except DeepAccidentError:
+        raise
     except OSError as error:
-        if isinstance(error, DeepAccidentError):
-            raise
         raise IndexStoreError(
-            f"{list_file}: cannot be written ({fault_text(error)}); make room there"
+            f"{list_file}: cannot be written ({reason_text(error)}); free space there"
         ) from error
     return list_file
 
 
 @contextmanager
 def _dataroot_errors(url: str) -> Iterator[None]:
-    """Turn errors of a URL's files into DatarootError."""
+    """Turn errors of a URL's files, raised within the block, into DatarootError."""
     try:
         yield
+    except DeepAccidentError:
+        raise
     except OSError as error:
-        if isinstance(error, DeepAccidentError):
-            raise
         if isinstance(error, FileNotFoundError):
             fault = "does not exist, or may not be listed"
         else:

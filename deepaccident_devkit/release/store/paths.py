@@ -1,4 +1,4 @@
-"""`StorePath`: a path of a release in archives or at a URL, with the part of Path that is used."""
+"""`StorePath`: a path of a release in archives or at a URL, with the methods of Path in use."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.release.store.store import COMPARES, READ_BEFORE, ReleaseStore
 from deepaccident_devkit.support.reading import FileKind, fault_text, read_bytes
+from deepaccident_devkit.support.text import PathType
 
 REMEDY: Final = "restore the file from its archive"
 
@@ -36,7 +37,7 @@ class StoreStatus:
 @total_ordering
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
 class StorePath:
-    """A path in a store; equal to another one with the same text.
+    """A path in a store; paths with the same text are equal.
 
     Attributes:
         store: Store of the path.
@@ -49,17 +50,24 @@ class StorePath:
     def __truediv__(self, relative: str | PurePath) -> StorePath:
         """Return a path below this one."""
         text = relative if isinstance(relative, str) else relative.as_posix()
-        return StorePath(self.store, f"{self.inside}/{text}".strip("/") if text else self.inside)
+        inside = self.inside
+        if text:
+            inside = f"{inside}/{text}".strip("/")
+        return StorePath(self.store, inside)
 
     def __str__(self) -> str:
         """Return the store's location and the path in it."""
-        return f"{self.store.place}/{self.inside}" if self.inside else self.store.place
+        if self.inside:
+            return f"{self.store.place}/{self.inside}"
+        return self.store.place
 
     def __repr__(self) -> str:
         return f"StorePath({str(self)!r})"
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, StorePath) and str(self) == str(other)
+        if isinstance(other, StorePath):
+            return str(self) == str(other)
+        return False
 
     def __lt__(self, other: StorePath) -> bool:
         return str(self) < str(other)
@@ -69,7 +77,7 @@ class StorePath:
 
     @property
     def name(self) -> str:
-        """Last name; for the release's folder the name of the archive or the end of the URL."""
+        """Last name; for the release's folder, the name of the archive or the end of the URL."""
         return PurePosixPath(str(self)).name
 
     @property
@@ -99,7 +107,7 @@ class StorePath:
         return self.store.members.has_folder(self.inside)
 
     def stat(self) -> StoreStatus:
-        """Return size and kind; raises FileNotFoundError."""
+        """Return the size and the kind of the file or folder; raises FileNotFoundError."""
         members = self.store.members
         member = members.find(self.inside)
         if member is not None:
@@ -109,7 +117,7 @@ class StorePath:
         raise FileNotFoundError(str(self))
 
     def local_path(self) -> Path:
-        """Return a real path with the file's content; raises as `ReleaseStore.local_path` does."""
+        """Return a real path of the file's content; raises as `ReleaseStore.local_path` does."""
         return self.store.local_path(self.inside)
 
     def content(self, kind: FileKind) -> bytes:
@@ -120,25 +128,29 @@ class StorePath:
 # A path of a release: a real path, or a path in a store.
 ReleasePath: TypeAlias = Path | StorePath
 # A caller's name for a release: its folder, an archive, a folder of archives, a URL.
-Dataroot: TypeAlias = str | os.PathLike[str] | ReleasePath
+Dataroot: TypeAlias = PathType | ReleasePath
 
 
 def places_of(root: ReleasePath) -> tuple[Path, ...]:
-    """Return the paths that workers must be able to read for a release."""
-    return (root,) if isinstance(root, Path) else root.store.places
+    """Return the real paths that a worker must be able to read to use a release."""
+    if isinstance(root, Path):
+        return (root,)
+    return root.store.places
 
 
 def read_content(
     path: ReleasePath, kind: FileKind, fault: type[ReleaseError], remedy: str = REMEDY
 ) -> bytes:
-    """Return a file's bytes.
+    """Read a file's bytes.
 
-    Raises MissingFileError, and `fault` if it cannot be read or is too large for its kind.
+    Raises MissingFileError, and `fault` if the file cannot be read or is too large for its kind.
     """
     try:
         return read_bytes(path, kind)
     except FileNotFoundError:
-        raise MissingFileError(f"{path}: no such file; unpack the archive that holds it") from None
+        raise MissingFileError(
+            f"{path}: no such file; unpack the archive that contains it"
+        ) from None
     except OSError as error:
         raise fault(f"{path}: {fault_text(error)}; {remedy}") from error
 
@@ -151,17 +163,17 @@ def read_lines(
     *,
     errors: str = "strict",
 ) -> list[str]:
-    """Return the lines of a UTF-8 file, without line ends.
+    """Read the lines of a UTF-8 file, without line ends.
 
     Args:
         path: The file.
         kind: Kind of the file, which limits its size.
-        fault: Error for a file that cannot be read or is no text.
+        fault: Error for a file that cannot be read or is not text.
         remedy: Remedy in the error.
         errors: What to do with bytes that are not UTF-8, as in `bytes.decode`.
 
     Raises:
-        ReleaseError: As in `read_content`, and `fault` if the file is no text.
+        ReleaseError: As in `read_content`, and `fault` if the file is not text.
     """
     content = read_content(path, kind, fault, remedy)
     try:
@@ -171,14 +183,14 @@ def read_lines(
 
 
 def real_path(path: ReleasePath) -> Path:
-    """Return a path of the file system, which other programs can write to.
+    """Return the same path if it is one of the file system, which other programs can use.
 
     Raises NotAvailableError for a path in a store.
     """
     if isinstance(path, Path):
         return path
     raise NotAvailableError(
-        f"{path}: lies in an archive or at a URL, and has no path of its own; unpack it first"
+        f"{path}: is in an archive or at a URL, and has no local path; unpack it first"
     )
 
 
@@ -206,7 +218,7 @@ FolderEntry: TypeAlias = os.DirEntry[str] | StoreEntry
 
 
 def folder_entries(folder: ReleasePath) -> list[FolderEntry]:
-    """Return the entries of a folder, in no order.
+    """Return the entries of a folder, in any order.
 
     Raises OSError, which may be a FileNotFoundError or a NotADirectoryError.
     """
@@ -230,19 +242,21 @@ def folder_entries(folder: ReleasePath) -> list[FolderEntry]:
 def is_folder(entry: FolderEntry, *, loops: bool = False) -> bool:
     """Return whether an entry is a folder, or a link with a target that cannot be accessed.
 
-    Listing such a link raises the reason. Links that lead back (`leads_back`) are no folders,
-    unless `loops`.
+    Listing such a link raises the reason. Links that lead back (`leads_back`) are not folders,
+    except with `loops`.
     """
     try:
-        return (loops or not leads_back(entry)) and entry.is_dir()
+        if not loops and leads_back(entry):
+            return False
+        return entry.is_dir()
     except OSError:
         return True
 
 
 def leads_back(entry: FolderEntry) -> bool:
-    """Return whether an entry is a link that leads nowhere.
+    """Return whether an entry is a link that leads nowhere or back.
 
-    Its target does not exist, or is the link itself or a folder that holds the link.
+    Its target does not exist, is the link itself, or is a folder that holds the link.
     """
     if isinstance(entry, StoreEntry) or not entry.is_symlink():
         return False
@@ -253,8 +267,8 @@ def leads_back(entry: FolderEntry) -> bool:
     return folder.is_relative_to(os.path.realpath(entry.path))
 
 
-def _fetched(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
-    """Read small files together; return None if there are none, or one is missing."""
+def _fetch_contents(paths: Sequence[StorePath]) -> dict[str, bytes] | None:
+    """Read small files together; return None if there are none, or if one is missing."""
     if not paths:
         return None
     store = paths[0].store
@@ -274,8 +288,9 @@ def fetched(paths: Iterable[ReleasePath]) -> Iterator[None]:
 
     This holds for the current thread. Raises DatarootError.
     """
-    remote = [path for path in paths if isinstance(path, StorePath) and path.store.is_remote]
-    token = READ_BEFORE.set(_fetched(remote))
+    remote_paths = [path for path in paths if isinstance(path, StorePath) and path.store.is_remote]
+    contents = _fetch_contents(remote_paths)
+    token = READ_BEFORE.set(contents)
     try:
         yield
     finally:

@@ -1,6 +1,4 @@
-"""Sources of archives, a local folder or a URL: parts of zips are read in place."""
-
-from __future__ import annotations
+"""Sources of archives: a local folder, or a URL. Parts of zips are read in place."""
 
 import errno
 import logging
@@ -18,8 +16,14 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from deepaccident_devkit.errors import MOST_TOLD, DatarootError, MissingExtraError, shortened
+from deepaccident_devkit.errors import (
+    MAX_REASON_LENGTH,
+    DatarootError,
+    MissingExtraError,
+    shortened,
+)
 from deepaccident_devkit.release.store.members import (
+    FileState,
     Listing,
     Member,
     is_release_file,
@@ -33,28 +37,29 @@ from deepaccident_devkit.support.reading import (
     check_end,
     fault_text,
     open_file,
+    reason_text,
 )
 
 _Result = TypeVar("_Result")
 # Parts of a URL in a library's message that may be secret: the query and the user.
-_SECRETS: Final = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")
+_SECRETS = re.compile(r"\?\S*|(?<=://)[^/@\s]+@")
 # Members with a gap of at most this many bytes are fetched together with the gap.
-_MAX_GAP_BYTES: Final = 1 << 16
-_MAX_RANGE_BYTES: Final = 64 << 20
+_MAX_GAP_BYTES = 1 << 16
+_MAX_RANGE_BYTES = 64 << 20
 # Archives that are open at once in a process; a system allows about 1,000 files.
 MAX_OPEN_ARCHIVES: Final = 256
 # An archive, its first byte and the byte after the last.
 ByteRange = tuple[str, int, int]
-# Bytes of a member's head before its name.
+# Bytes of a member's header before its name.
 HEAD_LENGTH: Final = 30
-# Bytes that are read at once for a head of unknown length: a name, and more fields than any program
-# adds.
+# Bytes that are read at once for a header of unknown length: a name, and more fields than any
+# program adds.
 LONGEST_HEAD: Final = HEAD_LENGTH + 512
-_HEAD: Final = struct.Struct("<4s22xHH")
-_SIGNATURE: Final = b"PK\x03\x04"
-_ENCRYPTED: Final = 1
-_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_REMEDY: Final = "fetch the archive again"
+_HEAD = struct.Struct("<4s22xHH")
+_SIGNATURE = b"PK\x03\x04"
+_ENCRYPTED = 1
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_REMEDY = "download the archive again"
 
 
 class Source(ABC):
@@ -62,13 +67,13 @@ class Source(ABC):
 
     @abstractmethod
     def read(self, archive: str, start: int, stop: int) -> bytes:
-        """Return bytes of an archive, fewer if it ends before `stop`.
+        """Read a part of an archive, which is shorter if the archive ends before `stop`.
 
-        Raises OSError, or FileNotFoundError for a missing file.
+        Raises OSError, which is a FileNotFoundError for a missing file.
         """
 
     def read_all(self, ranges: Sequence[ByteRange]) -> list[bytes]:
-        """Return several parts; raises OSError."""
+        """Read several parts of archives; raises OSError."""
         return [self.read(*byte_range) for byte_range in ranges]
 
 
@@ -84,7 +89,7 @@ class _Archive:
 
 
 class LocalSource(Source):
-    """A local folder. Several threads and forked processes read an open archive at once."""
+    """A local folder; several threads and forked processes may read an open archive at once."""
 
     def __init__(self, folder: Path) -> None:
         """Read below this folder."""
@@ -92,32 +97,26 @@ class LocalSource(Source):
         self._opened: dict[str, _Archive] = {}
 
     def read(self, archive: str, start: int, stop: int) -> bytes:
-        """Return bytes of an archive."""
-        opened = self._opened.get(archive) or self._open(archive)
-        descriptor = opened.descriptor
+        """Read a part of an archive."""
+        archive_file = self._opened.get(archive) or self._open(archive)
+        descriptor = archive_file.descriptor
         content = os.pread(descriptor, stop - start, start)
-        if len(content) == stop - start:
-            return content
-        return self._completed(descriptor, content, start, stop)
+        while len(content) < stop - start:  # a call returns at most 2 GiB
+            missing = stop - start - len(content)
+            next_bytes = os.pread(descriptor, missing, start + len(content))
+            if not next_bytes:
+                break
+            content += next_bytes
+        return content
 
     def _open(self, archive: str) -> _Archive:
         """Open an archive, and close the oldest one if too many are open."""
         with open_file(self._folder / archive) as file:
-            opened = self._opened[archive] = _Archive(os.dup(file.fileno()))
+            archive_file = _Archive(os.dup(file.fileno()))
+        self._opened[archive] = archive_file
         if len(self._opened) > MAX_OPEN_ARCHIVES:
             self._opened.pop(next(iter(self._opened)), None)
-        return opened
-
-    @staticmethod
-    def _completed(descriptor: int, content: bytes, start: int, stop: int) -> bytes:
-        """Return `content` with the bytes after it, since a call returns at most 2 GiB."""
-        while len(content) < stop - start:
-            missing = stop - start - len(content)
-            part = os.pread(descriptor, missing, start + len(content))
-            if not part:
-                break
-            content += part
-        return content
+        return archive_file
 
 
 class UrlSource(Source):
@@ -132,63 +131,63 @@ class UrlSource(Source):
         self._opened: tuple[int, Any, str] | None = None
 
     def read(self, archive: str, start: int, stop: int) -> bytes:
-        """Return bytes of an archive, or of a file."""
-        files, root = self._files()
+        """Read a part of an archive, or of another file."""
+        files, root = self._open_file_system()
         path = f"{root}/{archive}"
-        return cast("bytes", call_library(lambda: files.cat_file(path, start=start, end=stop)))
+        content = call_library(lambda: files.cat_file(path, start=start, end=stop))
+        return cast("bytes", content)
 
     def read_all(self, ranges: Sequence[ByteRange]) -> list[bytes]:
-        """Return several parts, read together: adjacent parts are read as one block."""
+        """Read several parts together; adjacent parts are read as one block."""
         from fsspec.utils import merge_offset_ranges
 
-        files, root = self._files()
+        files, root = self._open_file_system()
         names, starts, stops = (list(column) for column in zip(*ranges, strict=True))
         names, starts, stops = merge_offset_ranges(
             names, starts, stops, max_gap=_MAX_GAP_BYTES, max_block=_MAX_RANGE_BYTES, sort=True
         )
         paths = [f"{root}/{name}" for name in names]
         contents = call_library(lambda: files.cat_ranges(paths, starts, stops, on_error="raise"))
-        blocks = {}
-        for name, start, content in zip(names, starts, contents, strict=True):
-            blocks[name, start] = content
+        blocks = dict(zip(zip(names, starts, strict=True), contents, strict=True))
         block_starts: dict[str, list[int]] = {}
         for name, start in sorted(blocks):
             block_starts.setdefault(name, []).append(start)
         parts = []
         for name, start, stop in ranges:
             block_start = max(begin for begin in block_starts[name] if begin <= start)
-            parts.append(blocks[name, block_start][start - block_start : stop - block_start])
+            block = blocks[name, block_start]
+            parts.append(block[start - block_start : stop - block_start])
         return parts
 
-    def list_files(self) -> dict[str, tuple[int, str]]:
-        """Return the files below the URL; raises OSError.
+    def list_files(self) -> dict[str, FileState]:
+        """Return path from the URL → state of each file below it; raises OSError.
 
-        They are path from the URL → size in bytes, and a text that changes with the file.
+        The state is the file's size in bytes, and a text that changes with the file.
         """
-        files, root = self._files()
+        files, root = self._open_file_system()
         details = call_library(lambda: files.find(root, detail=True))
         states = {}
         for path, detail in details.items():
             if path != root:
-                states[path.removeprefix(f"{root}/")] = _state(detail)
+                states[path.removeprefix(f"{root}/")] = _read_state(detail)
         return states
 
-    def state_of(self, archive: str) -> tuple[int, str]:
+    def state_of(self, archive: str) -> FileState:
         """Return an archive's size in bytes, and a text that changes with it; raises OSError."""
-        files, root = self._files()
-        return _state(call_library(lambda: files.info(f"{root}/{archive}")))
+        files, root = self._open_file_system()
+        return _read_state(call_library(lambda: files.info(f"{root}/{archive}")))
 
     @contextmanager
-    def opened(self, archive: str) -> Iterator[Any]:
+    def open_archive(self, archive: str) -> Iterator[Any]:
         """Open an archive as a file with random access; raises OSError."""
-        files, root = self._files()
+        files, root = self._open_file_system()
         with call_library(lambda: files.open(f"{root}/{archive}", "rb")) as file:
             yield file
 
-    def _files(self) -> tuple[Any, str]:
-        """Return fsspec's file system, made again in a forked process, and the URL's path in it."""
+    def _open_file_system(self) -> tuple[Any, str]:
+        """Return fsspec's file system and the URL's path in it; both are made once in a process."""
         if self._opened is None or self._opened[0] != os.getpid():
-            fsspec = _fsspec(self.url)
+            fsspec = _import_fsspec(self.url)
             files, root = call_library(lambda: fsspec.core.url_to_fs(self.url))
             self._opened = (os.getpid(), files, root.rstrip("/"))
         return self._opened[1:]
@@ -197,96 +196,101 @@ class UrlSource(Source):
 def checked_url(url: str) -> str:
     """Return a URL without a slash at its end.
 
-    Raises DatarootError if the URL holds a secret, which the message does not show.
+    Raises DatarootError if the URL has a secret, which the message does not show.
     """
     parts = urlsplit(url)
     if parts.query or parts.password is not None or "@" in parts.netloc:
         raise DatarootError(
-            f"{parts.scheme}://{parts.hostname or ''}…: holds a name, a password or a signature, "
-            "which the index and messages would show; give it by fsspec's settings or the "
-            "environment (docs/reading.md)"
+            f"{parts.scheme}://{parts.hostname or ''}…: contains a name, a password or a "
+            "signature, which the index and messages would show; put the credentials into "
+            "fsspec's settings or the environment (docs/reading.md)"
         )
     return url.rstrip("/")
 
 
-def _fsspec(url: str) -> Any:
-    """Return the fsspec module, or raise MissingExtraError."""
+def _import_fsspec(url: str) -> Any:
+    """Import fsspec, or raise MissingExtraError."""
     try:
         import fsspec.core
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"{url}: needs fsspec: in a checkout, pip install '.[cloud]'"
+            f"{url}: needs fsspec; run pip install '.[cloud]' in a checkout"
         ) from error
     logging.getLogger("fsspec").addHandler(logging.NullHandler())
     return fsspec
 
 
 def call_library(call: Callable[[], _Result]) -> _Result:
-    """Return the result of a call of fsspec.
+    """Call a function of fsspec, and return its result.
 
-    Any error of an underlying library becomes an OSError with a message that holds no secret.
+    Any error of an underlying library becomes an OSError with a message that shows no secret.
     """
     try:
         return call()
     except FileNotFoundError:
         raise
     except ImportError as error:
-        raise MissingExtraError(f"{error}; in a checkout: pip install '.[cloud]'") from error
+        raise MissingExtraError(f"{error}; run pip install '.[cloud]' in a checkout") from error
     except Exception as error:  # noqa: BLE001 - each file system has errors of its own
         message = str(error)
         number = errno.EIO
         if isinstance(error, OSError):
             message = str(error.strerror) if error.strerror else message
             number = error.errno or number
-        message = shortened(_SECRETS.sub("", message) or type(error).__name__, MOST_TOLD)
+        message = shortened(_SECRETS.sub("", message) or type(error).__name__, MAX_REASON_LENGTH)
         raise RefusedFileError(number, f"cannot be read ({message})") from None
 
 
-def _state(detail: Any) -> tuple[int, str]:
+def _read_state(detail: Any) -> FileState:
     """Return the size of a file, and a text that changes with it, from fsspec's details."""
+    size = int(detail.get("size") or 0)
     for name in ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "created"):
         if detail.get(name) is not None:
-            return int(detail.get("size") or 0), str(detail[name])
-    return int(detail.get("size") or 0), ""
+            return size, str(detail[name])
+    return size, ""
 
 
 def source_of(base: str) -> Source:
     """Return the source of a URL or of a folder's absolute path."""
-    return UrlSource(base) if "://" in base else LocalSource(Path(base))
+    if "://" in base:
+        return UrlSource(base)
+    return LocalSource(Path(base))
 
 
 def list_zip(file: BinaryIO, archive: str, location: str) -> Listing:
-    """Return the files of a release in an archive; only its directory is read.
+    """List the files of a release in an archive; only the archive's directory is read.
 
     Args:
         file: The open archive.
-        archive: Path of the archive from the store's base: the folders on it and its name without
-            `.zip` count as folders that lead to the members.
+        archive: Path of the archive from the store's base. Its folders, and its name without
+            `.zip`, count as folders that lead to the members.
         location: Name of the archive in messages.
 
     Raises:
-        DatarootError: The archive cannot be read, or a member is encrypted or compressed by an
-            unknown method.
+        DatarootError: If the archive cannot be read, or if a member is encrypted or compressed by
+            an unknown method.
     """
     size = file.seek(0, os.SEEK_END)
     try:
         check_end(file, byte_limit("archive"))
-        with zipfile.ZipFile(file) as opened:
-            entries = opened.infolist()
-    except RefusedFileError as error:  # by the gate, or by a URL
+        with zipfile.ZipFile(file) as zip_file:
+            entries = zip_file.infolist()
+    except RefusedFileError as error:  # by `check_end`, or by a URL
         remedy = ""
         if error.errno == errno.EFBIG:
-            remedy = f"; if the archive is sound, set {LIMITS_VARIABLE}=archive=4G"
+            remedy = f"; if the archive is correct, set {LIMITS_VARIABLE}=archive=4G"
         raise DatarootError(f"{location}: {fault_text(error)}{remedy}") from error
     except DAMAGED_ARCHIVE as error:
-        fault = shortened(fault_text(error), MOST_TOLD)
+        fault = shortened(reason_text(error), MAX_REASON_LENGTH)
         raise DatarootError(
             f"{location}: not a readable zip archive ({fault}; {size:,} bytes); {_REMEDY}"
         ) from error
     leading_folders = PurePosixPath(archive).with_suffix("").parts
     release_folders: dict[str, str | None] = {}
     folder_numbers: dict[str, int] = {}
-    folder, names, rows = [], [], []
+    folder = []
+    names = []
+    rows = []
     for entry in entries:
         # Old tools of Windows write backslashes.
         zip_folder, _, name = entry.filename.replace("\\", "/").rpartition("/")
@@ -304,9 +308,7 @@ def list_zip(file: BinaryIO, archive: str, location: str) -> Listing:
             (entry.header_offset, entry.compress_size, entry.file_size, entry.CRC, deflated)
         )
     columns = zip(*rows, strict=True) if rows else ((),) * 5
-    numbers = {}
-    for field, column in zip(Member._fields[1:], columns, strict=True):
-        numbers[field] = np.array(column)
+    numbers = dict(zip(Member._fields[1:], map(np.array, columns), strict=True))
     return Listing(
         archive=archive,
         folders=[*folder_numbers],
@@ -328,21 +330,21 @@ def member_bytes(content: bytes, member: Member) -> bytes:
         except zlib.error as error:
             raise damaged_member_error(f"cannot be decompressed ({error})") from error
     if len(content) != member.size:
-        raise damaged_member_error(f"{len(content):,} bytes in place of {member.size:,}")
+        raise damaged_member_error(f"{len(content):,} bytes instead of {member.size:,}")
     return content
 
 
 def head_length(head: bytes) -> int:
-    """Return the number of bytes before a member's content, from the beginning of its head.
+    """Return the length of a member's header, which precedes its content, from its first bytes.
 
-    Raises RefusedFileError if there is no head.
+    Raises RefusedFileError if there is no header.
     """
     if len(head) < HEAD_LENGTH:
-        raise damaged_member_error("the archive ends before it")
-    signature, name, extra = _HEAD.unpack_from(head)
+        raise damaged_member_error("the archive ends before this file")
+    signature, name_length, extra_length = _HEAD.unpack_from(head)
     if signature != _SIGNATURE:
         raise damaged_member_error("no head at its place")
-    return HEAD_LENGTH + int(name) + int(extra)
+    return HEAD_LENGTH + int(name_length) + int(extra_length)
 
 
 def damaged_member_error(fault: str) -> RefusedFileError:
@@ -361,7 +363,7 @@ def _check_entry(entry: zipfile.ZipInfo, location: str, size: int) -> None:
             "or pack it again as an ordinary zip"
         )
     elif not 0 <= entry.header_offset <= size - HEAD_LENGTH - entry.compress_size:
-        fault = f"said to lie beyond the archive; {_REMEDY}"
+        fault = f"listed at a place outside the archive; {_REMEDY}"
     elif entry.compress_type == zipfile.ZIP_STORED and entry.compress_size != entry.file_size:
         fault = f"stored with two sizes; {_REMEDY}"
     if fault:

@@ -36,16 +36,17 @@ from deepaccident_devkit.support.reading import (
     bytes_of,
     check_size,
     fault_text,
+    reason_text,
 )
 
 FOLDER_VARIABLE: Final = "DEEPACCIDENT_CACHE"
 SIZE_VARIABLE: Final = "DEEPACCIDENT_CACHE_SIZE"
-_DEFAULT_SIZE: Final = "20G"
+_DEFAULT_SIZE = "20G"
 # A process may add this share of the size before it checks the full folder again.
-_RECHECK_SHARE: Final = 0.05
+_RECHECK_SHARE = 0.05
 # An eviction reduces the folder to this share of the size.
-_EVICTION_SHARE: Final = 0.9
-_SENSOR_KINDS: Final[tuple[FileKind, ...]] = ("image", "lidar", "bev")
+_EVICTION_SHARE = 0.9
+_SENSOR_KINDS: tuple[FileKind, ...] = ("image", "lidar", "bev")
 # Whether the bytes of archives' members are compared with their checksums; set by
 # `paths.checksums_compared`.
 COMPARES: ContextVar[bool] = ContextVar("compares", default=False)
@@ -88,13 +89,13 @@ class FileCache:
         return cls(folder.absolute(), max_bytes)
 
     def path_of(self, identity: str, name: str) -> Path:
-        """Return the path for the copy of a file with an identity; raises OutputFolderError."""
+        """Return the path of the copy of a file, by its identity; raises OutputFolderError."""
         content = identity.encode(errors="surrogateescape")
         digest = hashlib.blake2b(content, digest_size=16).hexdigest()
         return place_in(self.folder, f"{digest[:2]}/{digest[2:]}/{name}", opened=True)
 
     def has_copy(self, path: Path, size: int) -> bool:
-        """Return whether a complete copy exists; it then counts as used now."""
+        """Return whether a complete copy exists, which then counts as used now."""
         try:
             if path.stat().st_size != size:
                 return False
@@ -104,24 +105,24 @@ class FileCache:
         return True
 
     def put(self, path: Path, content: bytes) -> None:
-        """Store a copy; if there is no room, raises OSError with the folder and the remedy."""
+        """Store a copy; without room, raise OSError with the folder and the remedy."""
         try:
             self._make_room(len(content))
             write_bytes(path, content)
         except OSError as error:
             raise OSError(
                 error.errno,
-                f"cannot be kept in {self.folder}: {fault_text(error)}; make room there, or name "
-                f"another folder by {FOLDER_VARIABLE} or fewer bytes by {SIZE_VARIABLE}",
+                f"cannot be cached in {self.folder}: {reason_text(error)}; free space there, or "
+                f"set another folder with {FOLDER_VARIABLE} or a smaller size with {SIZE_VARIABLE}",
             ) from error
 
     def _make_room(self, size: int) -> None:
-        """Evict copies if the folder would get too large by another file."""
+        """Evict copies if a file of this size would make the folder too large."""
         self._added += size
         if self._added <= _RECHECK_SHARE * self.max_bytes:
             return
         self._added = size
-        copies = self._copies()
+        copies = self._list_copies()
         total = sum(copy_bytes for _, copy_bytes, _ in copies) + size
         if total <= self.max_bytes:
             return
@@ -133,7 +134,7 @@ class FileCache:
                 path.parent.rmdir()
             total -= copy_bytes
 
-    def _copies(self) -> list[tuple[int, int, Path]]:
+    def _list_copies(self) -> list[tuple[int, int, Path]]:
         """Return the time of use, size and path of each copy that is not being written."""
         copies = []
         for path in self.folder.glob("??/*/*"):
@@ -145,7 +146,7 @@ class FileCache:
 
 
 class ReleaseStore:
-    """Files of one release that have no paths of their own.
+    """The files of one release that have no paths of their own.
 
     Cheap to pickle; safe in forks and threads.
 
@@ -182,42 +183,45 @@ class ReleaseStore:
     @property
     def places(self) -> tuple[Path, ...]:
         """Paths that workers must be able to read."""
-        return (self.list_file,) if self.is_remote else (Path(self.place), self.list_file)
+        if self.is_remote:
+            return (self.list_file,)
+        return Path(self.place), self.list_file
 
     def read(self, name: str, kind: FileKind) -> bytes:
-        """Return a file's bytes.
+        """Read a file's bytes.
 
         Copies of sensor files at a URL are stored in the user's cache (`FileCache`). Raises
-        FileNotFoundError, RefusedFileError if it is too large for its kind or damaged, or any other
-        OSError.
+        FileNotFoundError, RefusedFileError if the file is too large for its kind or damaged, or any
+        other OSError.
         """
         contents = READ_BEFORE.get()
         if contents is not None and name in contents:
             return contents[name]
-        member = self._member(name)
+        member = self._find_member(name)
         check_size(member.size, kind)
         if self.is_remote and kind in _SENSOR_KINDS:
             with suppress(FileNotFoundError):  # another process has just evicted it
-                return self._cached_path(name, member).read_bytes()
-        return self._bytes(name, member)
+                return self._cache_copy(name, member).read_bytes()
+        return self._read_member(name, member)
 
     def local_path(self, name: str) -> Path:
-        """Return a real path of a file's bytes, in the user's cache, from which it may be evicted.
+        """Return the path of a file's copy in the user's cache, which may evict it later.
 
-        Raises MissingFileError, SensorFileError, or ConfigError if the environment names a wrong
-        size of the cache.
+        Raises MissingFileError, SensorFileError, or ConfigError if the environment gives the cache
+        an invalid size.
         """
         try:
-            return self._cached_path(name, self._member(name))
+            member = self._find_member(name)
+            return self._cache_copy(name, member)
         except FileNotFoundError:
             raise MissingFileError(
-                f"{self.place}/{name}: no such file; add the archive that holds it"
+                f"{self.place}/{name}: no such file; add the archive that contains it"
             ) from None
         except OSError as error:
             raise SensorFileError(f"{self.place}/{name}: {fault_text(error)}") from error
 
     def fetch(self, names: Iterable[str]) -> dict[str, bytes]:
-        """Return small files by name, read together; raises OSError.
+        """Read small files together; return name → bytes. Raises OSError.
 
         Missing and damaged files are left out.
         """
@@ -228,11 +232,12 @@ class ReleaseStore:
                 members.append((name, member))
         if not members:
             return {}
-        parts = self._source.read_all([self._range(name, member) for name, member in members])
+        ranges = [self._locate_member(name, member) for name, member in members]
+        parts = self._source.read_all(ranges)
         contents = {}
         for (name, member), part in zip(members, parts, strict=True):
             with suppress(RefusedFileError):  # a separate read raises the error
-                contents[name] = part if member.offset < 0 else _cut_out(part, member)
+                contents[name] = part if member.offset < 0 else _extract_member(part, member)
         return contents
 
     @cached_property
@@ -245,54 +250,56 @@ class ReleaseStore:
         """Cache for files at a URL."""
         return FileCache.of_user()
 
-    def _member(self, name: str) -> Member:
+    def _find_member(self, name: str) -> Member:
         """Return a file of the store, or raise FileNotFoundError."""
         member = self.members.find(name)
         if member is None:
             raise FileNotFoundError(f"{self.place}/{name}")
         return member
 
-    def _cached_path(self, name: str, member: Member) -> Path:
-        """Return the path of a copy in the cache, which is made if it does not exist."""
+    def _cache_copy(self, name: str, member: Member) -> Path:
+        """Return the path of a file's copy in the cache; make the copy if it does not exist."""
         identity = f"{self.place}\n{name}\n{self.members.number_of(member)}"
         path = self._cache.path_of(identity, name.rpartition("/")[2])
         if not self._cache.has_copy(path, member.size):
-            self._cache.put(path, self._bytes(name, member))
+            self._cache.put(path, self._read_member(name, member))
         return path
 
-    def _range(self, name: str, member: Member) -> ByteRange:
-        """Return the part of an archive that surely holds a file."""
+    def _locate_member(self, name: str, member: Member) -> ByteRange:
+        """Return the part of an archive that is sure to hold a whole file."""
         archive = self.members.archives[member.archive]
-        if member.offset < 0:
-            return f"{archive}/{name.rpartition('/')[2]}".lstrip("/"), 0, member.size
+        if member.offset < 0:  # the archive is a folder
+            file_name = name.rpartition("/")[2]
+            return f"{archive}/{file_name}".lstrip("/"), 0, member.size
         return archive, member.offset, member.offset + LONGEST_HEAD + member.stored
 
-    def _bytes(self, name: str, member: Member) -> bytes:
+    def _read_member(self, name: str, member: Member) -> bytes:
         """Read the bytes of a file."""
-        archive, start, stop = self._range(name, member)
+        archive, start, stop = self._locate_member(name, member)
         if member.offset < 0:
             return self._source.read(archive, start, stop)
         if self.is_remote:  # a second request would cost more than the superfluous bytes
-            return _cut_out(self._source.read(archive, start, stop), member)
+            content = self._source.read(archive, start, stop)
+            return _extract_member(content, member)
         head = self._source.read(archive, start, start + HEAD_LENGTH)
         content_start = member.offset + head_length(head)
         content = self._source.read(archive, content_start, content_start + member.stored)
-        return _decoded(content, member)
+        return _decode_member(content, member)
 
 
-def _cut_out(content: bytes, member: Member) -> bytes:
-    """Return a member's bytes from the bytes of an archive, which begin with the member's head."""
+def _extract_member(content: bytes, member: Member) -> bytes:
+    """Return a member's bytes from the bytes of an archive that begin with the member's header."""
     start = head_length(content[:HEAD_LENGTH])
-    return _decoded(content[start : start + member.stored], member)
+    return _decode_member(content[start : start + member.stored], member)
 
 
-def _decoded(content: bytes, member: Member) -> bytes:
-    """Return a member's bytes from its stored bytes; raises RefusedFileError."""
+def _decode_member(content: bytes, member: Member) -> bytes:
+    """Return a member's bytes from the bytes stored in the archive; raises RefusedFileError."""
     if len(content) < member.stored:
-        raise damaged_member_error("the archive ends before it")
+        raise damaged_member_error("the archive ends before this file")
     content = member_bytes(content, member)
     if COMPARES.get() and zlib.crc32(content) != member.version:
-        raise damaged_member_error("its bytes do not agree with its checksum")
+        raise damaged_member_error("its bytes do not match its checksum")
     return content
 
 

@@ -1,6 +1,6 @@
-"""Figures of an evaluation, and the report with all of them.
+"""Figures of an evaluation, and the report that contains all of them.
 
-The function of a panel takes `ax=` and returns the Axes.
+Functions that render one panel take `ax=` and return the Axes.
 """
 
 from deepaccident_devkit.render.evaluation.figures import draw_motion_outcome

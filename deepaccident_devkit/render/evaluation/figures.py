@@ -1,4 +1,4 @@
-"""The figures of a run, with its worst and best samples, and their files."""
+"""The figures of a run, including its worst and best samples, and their files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,11 @@ from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, WITHIN_RECORDI
 from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.planning.evaluator import BY_LEAD
-from deepaccident_devkit.evaluation.predictions import MotionOutput, frames_there, labels_at_present
+from deepaccident_devkit.evaluation.predictions import (
+    MotionOutput,
+    labels_at_present,
+    num_recorded_frames,
+)
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import extra_result
@@ -25,13 +29,17 @@ from deepaccident_devkit.evaluation.runs.setups import SampleLoader
 from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.render.captions import draw_legend_of_fills, set_scene_title, set_title
+from deepaccident_devkit.render.captions import (
+    draw_legend_of_fills,
+    set_scene_title,
+    set_title,
+    titled_from_above,
+)
 from deepaccident_devkit.render.evaluation import tasks
-from deepaccident_devkit.render.evaluation.panels import PANEL, UNKNOWN, render_breakdown
+from deepaccident_devkit.render.evaluation.panels import PANEL, render_breakdown
 from deepaccident_devkit.render.figures import (
     axes_or_new,
-    report_figure,
-    titled_from_above,
+    detached_figure,
     write_report_figure,
 )
 from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
@@ -41,8 +49,11 @@ from deepaccident_devkit.render.styles import (
     WARNING_COLOR,
     current_style,
     in_own_settings,
+    size_in_style,
 )
 from deepaccident_devkit.support.arrays import BoolArray
+from deepaccident_devkit.support.human_names import human_name, metric_name, rules_name
+from deepaccident_devkit.support.text import with_minus
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -50,19 +61,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DPI: Final = 160
-# Inches: least height of a bar.
-_MIN_BAR_HEIGHT_IN: Final = 0.38
-# Inches of a title, ticks and labels.
-_FRAME_HEIGHT_IN: Final = 1.1
-# Marks the words on a figure's origin. They are for copying and not for reading, so they may be
-# small.
-_ORIGIN_GID: Final = "token"
-_TIME_ATTRIBUTE: Final = "time_to_impact"
-# Number of the worst, and of the best, samples with a figure.
-_SAMPLES_PER_KIND: Final = 3
-# Inches of a view from above with its title.
-_VIEW_HEIGHT_IN: Final = 5.6
+_DPI = 160
+# Height of a bar, and of a title, ticks and labels, in lines of letters.
+_BAR_LINES = 2.2
+_FRAME_LINES = 7.5
+# Minimum height of curves with a legend below, in lines of letters.
+_CURVE_LINES = 20
+# Label of the words about a figure's origin. They are for copying rather than reading, so they may
+# be small.
+_ORIGIN_GID = "token"
+_TIME_ATTRIBUTE = "time_to_impact"
+# How many of the worst samples, and of the best, have a figure.
+_SAMPLES_PER_KIND = 3
+# Height of a view from above including its title, in inches.
+_VIEW_HEIGHT_IN = 5.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,11 +82,12 @@ class RunFigure:
     """One figure of a run.
 
     Attributes:
-        name: Name of its file, without the ending.
+        name: Name of its file, without the suffix.
         caption: Description of the figure, for the reader of the report.
-        alt: The same in words and numbers, for readers who cannot see it.
-        draw: Function that renders it on `ax=`, axes.
+        alt: Content of the figure in words and numbers, for readers who cannot see it.
+        draw: Function that renders the figure on the axes `ax`.
         height: Height in inches.
+        lines: Minimum height, in lines of the figure's smallest letters.
     """
 
     name: str
@@ -82,28 +95,31 @@ class RunFigure:
     alt: str
     draw: Callable[..., Axes]
     height: float = PANEL[1]
+    lines: float = 0
 
 
 def save_figure(run: EvaluationRun, run_figure: RunFigure, folder: Path) -> Path:
-    """Render a figure of a run into a PNG file of a folder, as `write_report_figure` does.
+    """Write a figure of a run into a PNG file in a folder, as `write_report_figure` does.
 
     An existing file is replaced.
     """
-    parts = (_partial_text(run), _origin_text(run))
-    words = {"Title": run_figure.name, "Description": " ".join(part for part in parts if part)}
+    description = f"{_partial_text(run)} {_origin_text(run)}".strip()
+    words = {"Title": run_figure.name, "Description": description}
     path = folder / f"{run_figure.name}.png"
-    return write_report_figure(complete_figure(run, run_figure), path, dpi=_DPI, words=words)
+    draw = partial(complete_figure, run, run_figure)
+    return write_report_figure(draw, path, dpi=_DPI, words=words)
 
 
 @in_own_settings
 def complete_figure(run: EvaluationRun, run_figure: RunFigure) -> Figure:
-    """Return a figure with the gaps of a partial run as its title.
+    """Render a complete figure; for a partial run, its title states what the run lacks.
 
-    Its task, protocol, devkit and release are below, unless it is for a paper or a slide.
+    The task, protocol, devkit and release are named at the bottom, except in papers and on slides.
     """
-    figure = report_figure((PANEL[0], run_figure.height), panels="one")
+    size = (PANEL[0], run_figure.height)
+    figure = detached_figure(size_in_style(size, panels="one", lines=run_figure.lines))
     run_figure.draw(ax=figure.add_subplot())
-    if not current_style().few:
+    if not current_style().shows_few_panels:
         figure.supxlabel(_origin_text(run), fontsize=6, color=MUTED_COLOR, gid=_ORIGIN_GID)
     partial_text = _partial_text(run)
     if partial_text:
@@ -113,7 +129,7 @@ def complete_figure(run: EvaluationRun, run_figure: RunFigure) -> Figure:
 
 def _origin_text(run: EvaluationRun) -> str:
     return (
-        f"{run.setup.task}, protocol {run.setup.protocol}, "
+        f"{rules_name(run.setup.task, run.setup.protocol)}, "
         f"devkit {__version__}, release {run.release.fingerprint}"
     )
 
@@ -125,9 +141,9 @@ def _partial_text(run: EvaluationRun) -> str:
 
 
 def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
-    """Return the figures of a run's task, of further results, and of breakdowns.
+    """Return the figures of a run's task, of its further results, and of its breakdowns.
 
-    A breakdown has a figure if it has several groups and a number.
+    A breakdown only has a figure if it has several groups and a number to draw.
     """
     figures: list[RunFigure] = []
     if run.setup.task in _FIGURES:
@@ -135,15 +151,19 @@ def run_figures(run: EvaluationRun) -> tuple[RunFigure, ...]:
     for name, further in run.further.items():
         figures += extra_result(name).figures(further.groups[0].result)
     for path, broken in _breakdown_numbers(run):
-        if _has_numbers(broken, path):
-            figures.append(_breakdown_figure(broken, path))
+        for group in broken.groups:
+            headline = _find_headline(group.result, path)
+            if headline is not None and headline.value is not None:
+                figures.append(_breakdown_figure(broken, path))
+                break
     return tuple(figures)
 
 
 def _breakdown_numbers(run: EvaluationRun) -> list[tuple[str, Breakdown[Any]]]:
-    """Return the numbers with breakdowns: the first by all attributes, the others only by time.
+    """Return (path of a main number, breakdown) for each breakdown to draw.
 
-    The breakdowns by time of the other numbers follow the first breakdown of the first number.
+    The first number is drawn for each attribute; the other numbers are only drawn by time, after
+    the first number's first breakdown.
     """
     evaluator = run.evaluator
     left_out = [EVERYTHING]
@@ -153,15 +173,18 @@ def _breakdown_numbers(run: EvaluationRun) -> list[tuple[str, Breakdown[Any]]]:
     for broken in run.breakdowns:
         if broken.by not in left_out and len(broken.groups) > 1:
             breakdowns[broken.by] = broken
-    paths = [path for path in evaluator.main_numbers if _headline(run.result, path) is not None]
+    paths = [
+        path for path in evaluator.main_numbers if _find_headline(run.result, path) is not None
+    ]
     pairs = [(path, broken) for path in paths[:1] for broken in breakdowns.values()]
     if _TIME_ATTRIBUTE in breakdowns:
         pairs[1:1] = [(path, breakdowns[_TIME_ATTRIBUTE]) for path in paths[1:]]
     return pairs
 
 
-def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
-    evaluator, result = run.evaluator, run.result
+def _accident_figures(run: EvaluationRun) -> Iterator[RunFigure]:
+    evaluator = run.evaluator
+    result = run.result
     if not isinstance(evaluator, AccidentEvaluator):
         return
     remark = ""
@@ -190,7 +213,7 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
     )
     yield RunFigure(
         name="time_errors",
-        caption="How late the predicted moments are, in samples before an accident.",
+        caption="Timing errors of the predictions in samples before an accident; late is positive.",
         alt="Histogram of time errors in seconds.",
         draw=partial(tasks.render_errors, evaluator, "time"),
     )
@@ -198,39 +221,43 @@ def _accident(run: EvaluationRun) -> Iterator[RunFigure]:
         average = listed([("average precision", result.average_precision)])
         yield RunFigure(
             name="alarms",
-            caption="Precision over recall of the alarms, beginning with the surest alarm.",
+            caption="Precision–recall curve of the alarms, beginning with the highest score.",
             alt=f"Precision over recall of alarms; {average}.",
             draw=partial(tasks.render_alarms, evaluator),
         )
 
 
-def _detection(run: EvaluationRun) -> Iterator[RunFigure]:
+def _detection_figures(run: EvaluationRun) -> Iterator[RunFigure]:
     result = run.result
     if not isinstance(run.evaluator, DetectionEvaluator):
         return
     unit = "share of overlap"
     if run.setup.rules.measure.startswith("distance"):
         unit = "metres"
-    several = len(result.ranges) > 1
     for row, ring in np.argwhere(result.truths).tolist():
-        name, (low, high) = result.classes[row], result.ranges[ring].tolist()
-        suffix, range_text = "", ""
-        if several:
-            suffix, range_text = f"_{low:g}_{high:g}m", f" from {low:g} to {high:g} m"
+        name = result.classes[row]
+        suffix = ""
+        range_text = ""
+        if len(result.ranges) > 1:
+            low, high = result.ranges[ring].tolist()
+            suffix = f"_{low:g}_{high:g}m"
+            range_text = f" from {low:g} to {high:g} m"
         thresholds = [f"{threshold:g}" for threshold in result.thresholds[row].tolist()]
         averages = result.average_precision[row, ring].tolist()
         values = listed(zip(thresholds, averages, strict=True))
         yield RunFigure(
             name=f"precision_recall_{name}{suffix}",
             caption=(
-                f"Precision over recall: {name}{range_text}, one line for each threshold ({unit})."
+                f"Precision over recall of {human_name(name)}{range_text}, with one line for each "
+                f"threshold ({unit})."
             ),
-            alt=f"{name}{range_text}, average precision in percent: {values}.",
+            alt=f"{human_name(name)}{range_text}, average precision in percent: {values}.",
             draw=partial(tasks.render_precision_recall, result, name, ring=ring),
+            lines=_CURVE_LINES,
         )
 
 
-def _motion(run: EvaluationRun) -> Iterator[RunFigure]:
+def _motion_figures(run: EvaluationRun) -> Iterator[RunFigure]:
     if not isinstance(run.evaluator, MotionEvaluator):
         return
     form = run.results.form or {}
@@ -239,17 +266,18 @@ def _motion(run: EvaluationRun) -> Iterator[RunFigure]:
         caption="Panoptic quality frame by frame, from the present to the horizon.",
         alt="Panoptic quality in percent over seconds from the present.",
         draw=partial(tasks.render_quality_by_time, run.evaluator, form.get("step", 0.5)),
+        lines=_CURVE_LINES,
     )
 
 
-def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
+def _warning_figures(run: EvaluationRun) -> Iterator[RunFigure]:
     result = run.result
     if isinstance(result, AnticipationResult):
         yield RunFigure(
             name="predictors",
             caption=(
-                "How well accidents are distinguished from other recordings, also by predictors "
-                "that know nothing or only the present."
+                "How well accidents are distinguished from other recordings, by this model and by "
+                "predictors that know nothing or only the present."
             ),
             alt=(
                 "Chance that an accident's score is above another recording's at the same moment, "
@@ -259,14 +287,14 @@ def _warning(run: EvaluationRun) -> Iterator[RunFigure]:
         )
 
 
-def _planning(run: EvaluationRun) -> Iterator[RunFigure]:
+def _planning_figures(run: EvaluationRun) -> Iterator[RunFigure]:
     if BY_LEAD[0] in run.result.means:
         yield RunFigure(
             name="plans",
             caption=(
-                "Accidents that plans avoid, over the progress that they lose in twins, where "
-                "nothing happens, with those that need no planner. "
-                "Each line goes from the longest lead to the shortest."
+                "Accidents avoided vs. progress lost in normal twins, for this model's plans and "
+                "for plans that need no planner. Each line goes from the longest lead (large dot) "
+                "to the shortest."
             ),
             alt=(
                 "Share of accidents avoided over the share of progress lost in twins, "
@@ -276,52 +304,55 @@ def _planning(run: EvaluationRun) -> Iterator[RunFigure]:
         )
 
 
-_FIGURES: Final[dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]]] = {
-    "accident": _accident,
-    "detection": _detection,
-    "motion": _motion,
-    "planning": _planning,
-    "warning": _warning,
+_FIGURES: dict[str, Callable[[EvaluationRun], Iterator[RunFigure]]] = {
+    "accident": _accident_figures,
+    "detection": _detection_figures,
+    "motion": _motion_figures,
+    "planning": _planning_figures,
+    "warning": _warning_figures,
 }
 
 
 def _breakdown_figure(broken: Breakdown[Any], path: str) -> RunFigure:
-    name, values = None, []
+    """Return the figure that shows one number (by its path) for each group of a breakdown."""
+    name = path
+    values = []
     for group in broken.groups:
-        headline, text = _headline(group.result, path), "–"
+        headline = _find_headline(group.result, path)
+        text = "–"
         if headline is not None:
-            name, text = name or headline.name, headline.text()
-        values.append(f"{group.value or UNKNOWN} {text}")
-    by, percent = broken.by.replace("_", " "), 100 * broken.resampling.confidence
+            name = metric_name(headline.name)
+            text = with_minus(headline.text())
+        values.append(f"{human_name(group.value)} {text}")
+    attribute = human_name(broken.by, "attributes")
+    percent = 100 * broken.resampling.confidence
     return RunFigure(
         name=f"{path.rsplit('/', 1)[-1]}_by_{broken.by}",
         caption=(
-            f"{name} by {by}; whiskers: {percent:g} % intervals over clusters of scenarios, "
+            f"{name} by {attribute}; whiskers: {percent:g} % intervals over clusters of scenarios, "
             "if there are enough."
         ),
-        alt=f"{name} by {by}: {', '.join(values)}.",
+        alt=f"{name} by {attribute}: {', '.join(values)}.",
         draw=partial(render_breakdown, broken, path),
-        height=max(PANEL[1], _MIN_BAR_HEIGHT_IN * len(broken.groups) + _FRAME_HEIGHT_IN),
+        lines=_BAR_LINES * len(broken.groups) + _FRAME_LINES,
     )
 
 
-def _has_numbers(broken: Breakdown[Any], path: str) -> bool:
-    for group in broken.groups:
-        headline = _headline(group.result, path)
-        if headline is not None and headline.value is not None:
-            return True
-    return False
-
-
-def _headline(result: Any, path: str) -> Headline | None:
-    return next((headline for headline in headlines(result) if headline.path == path), None)
+def _find_headline(result: Any, path: str) -> Headline | None:
+    """Return the headline number that a result has at a path; None if it has none there."""
+    for headline in headlines(result):
+        if headline.path == path:
+            return headline
+    return None
 
 
 def listed(values: Iterable[tuple[str, float | None]]) -> str:
-    """Return names with their values, with three digits, as the words of a figure."""
+    """List names and their values (three digits) in words that describe a figure."""
     words = []
     for name, value in values:
-        text = "–" if value is None or math.isnan(value) else f"{value:.3g}"
+        text = "–"
+        if value is not None and not math.isnan(value):
+            text = f"{value:.3g}"
         words.append(f"{name} {text}")
     return ", ".join(words)
 
@@ -329,19 +360,19 @@ def listed(values: Iterable[tuple[str, float | None]]) -> str:
 def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:
     """Return figures of the worst and the best samples by the main number, the worst first.
 
-    Samples with nothing to count are left out. Only motion, accidents and detections can be drawn
-    from above.
+    Samples in which nothing is counted are left out. The tasks without a view from above have no
+    such figures; only motion, accident and detection have one.
     """
     if not isinstance(run.evaluator, (MotionEvaluator, AccidentEvaluator, DetectionEvaluator)):
         return ()
     ranked = _ranked(run)
     count = min(_SAMPLES_PER_KIND, len(ranked) // 2)
     # no sample is among the worst if all numbers are equal
-    worst = [sample for sample in ranked[:count] if sample[1] != ranked[-1][1]]
-    best = ranked[max(len(ranked) - _SAMPLES_PER_KIND, len(worst)) :]
+    worst_samples = [sample for sample in ranked[:count] if sample[1] != ranked[-1][1]]
+    best_samples = ranked[max(len(ranked) - _SAMPLES_PER_KIND, len(worst_samples)) :]
     load = SampleLoader(dataset, results, run.setup)
     figures = []
-    for kind, samples in (("worst", worst), ("best", best[::-1])):
+    for kind, samples in (("worst", worst_samples), ("best", best_samples[::-1])):
         for number, (token, text) in enumerate(samples, 1):
             figures.append(
                 RunFigure(
@@ -351,7 +382,7 @@ def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tu
                         f"Seen from above: the prediction for sample {token} over the truth; "
                         f"{text}."
                     ),
-                    draw=partial(_draw, load, token, text),
+                    draw=partial(_draw_sample, load, token, text),
                     height=_VIEW_HEIGHT_IN,
                 )
             )
@@ -366,29 +397,31 @@ def draw_motion_outcome(
     frame: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Render a frame's cells: actors that are predicted, predicted falsely, and missed.
+    """Render the cells of a frame: correctly predicted, falsely predicted and missed actors.
 
     Args:
         prediction: Output of a model; the last of several predictions is rendered.
-        label: Ground truth, on the same grid; frames in their own ego frames are warped to the
-            present.
-        frame: Number of the frame, 0 for the present; None for the last recorded one.
+        label: Ground truth, on the same grid; frames that are in the ego frames of their own times
+            are warped to t = 0.
+        frame: Index of the frame, 0 for the current one; None for the last recorded one.
         ax: Axes to render on; new ones if None.
 
     Returns:
-        The axes, in metres of the present ego frame: forward to the right, left up.
+        The axes, in metres, in the ego frame at t = 0: forward to the right, left up.
 
     Raises:
-        EvaluationError: The present is not recorded.
+        EvaluationError: The current frame is not recorded.
     """
     from matplotlib.colors import to_rgba
 
-    ax, truth, grid = axes_or_new(ax, PANEL), labels_at_present(label), label.config.grid
+    ax = axes_or_new(ax, PANEL)
+    truth = labels_at_present(label)
+    grid = label.config.grid
     if frame is None:
-        frame = frames_there(label) - 1
-    predicted = prediction.grid.reorient(_actors(prediction, frame), "devkit")
+        frame = num_recorded_frames(label) - 1
+    predicted = prediction.grid.reorient(_actor_cells(prediction, frame), "devkit")
     true = grid.reorient(truth.segmentation[frame] == 1, "devkit")
-    picture = np.zeros((*true.shape, 4))  # transparent where nobody is
+    picture = np.zeros((*true.shape, 4))  # transparent where there is no actor
     picture[predicted & true] = to_rgba(OUTCOME_COLORS["right"])
     picture[predicted & ~true] = to_rgba(OUTCOME_COLORS["false"])
     picture[true & ~predicted] = to_rgba(OUTCOME_COLORS["missed"])
@@ -406,7 +439,8 @@ def draw_motion_outcome(
     return titled_from_above(ax, title, grid=True)
 
 
-def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:
+def _draw_sample(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:
+    """Draw a sample's prediction over the truth, with `text` (its main number) in the title."""
     prediction, truth, *contexts = load(token)
     if isinstance(prediction, MotionOutput):
         draw_motion_outcome(prediction, truth, ax=ax)
@@ -421,22 +455,25 @@ def _draw(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:
 
 
 def _ranked(run: EvaluationRun) -> list[tuple[str, str]]:
-    """Return tokens with their main number in words, the worst first."""
+    """Return (token, main number in words) for each sample, the worst first."""
     numbers: list[tuple[float, str, str]] = []
     path = run.evaluator.main_numbers[0]
     for token in sorted(run.evaluator.tokens):
-        headline = _headline(run.evaluator.compute([token]), path)
+        result = run.evaluator.compute([token])
+        headline = _find_headline(result, path)
         if headline is not None and headline.value is not None:
-            numbers.append((headline.value, token, f"{headline.name} {headline.text()}"))
+            text = f"{metric_name(headline.name)} {with_minus(headline.text())}"
+            numbers.append((headline.value, token, text))
     return [(token, text) for _, token, text in sorted(numbers)]
 
 
-def _actors(prediction: MotionOutput, frame: int) -> BoolArray:
-    """Return which cells have an actor by the last prediction, shape (H, W).
+def _actor_cells(prediction: MotionOutput, frame: int) -> BoolArray:
+    """Return which cells contain an actor in the last prediction, shape (H, W).
 
-    The orientation is the prediction's own.
+    The cells are in the prediction's own orientation.
     """
     if prediction.instances is not None:
         return np.asarray(prediction.instances[-1, frame] > 0)
-    background, actor = (prediction.heads or ())[-1].segmentation[frame]
+    last_heads = (prediction.heads or ())[-1]
+    background, actor = last_heads.segmentation[frame]
     return np.asarray(actor > background)

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from deepaccident_devkit.evaluation.runs import BytesPoint, OverBytes
-from deepaccident_devkit.render.captions import set_title
-from deepaccident_devkit.render.chips import keep_free, place_chips
+from deepaccident_devkit.render.captions import set_note, set_title
+from deepaccident_devkit.render.chips import DOT_MARGIN_PT, keep_free, place_chips
 from deepaccident_devkit.render.evaluation.panels import PANEL
 from deepaccident_devkit.render.figures import figure_or_new, hide_axes, with_light_grid
 from deepaccident_devkit.render.styles import (
     ESTIMATE_COLOR,
-    MUTED_COLOR,
     current_style,
     in_own_settings,
-    text_size,
 )
+from deepaccident_devkit.support.human_names import metric_name, rules_name, with_unit
 from deepaccident_devkit.support.text import counted
 
 if TYPE_CHECKING:
@@ -29,30 +29,27 @@ if TYPE_CHECKING:
 def render_over_bytes(report: OverBytes, *, fig: Figure | None = None) -> Figure:
     """Render headline numbers over the bytes per sample that partners send, with intervals.
 
-    Whiskers are the intervals.
-
     Args:
         report: Result of `evaluation.runs.over_bytes`.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
-        The figure, with a panel for each headline (at most two in a paper's column), in which
-        evaluations are named at their dots. Where partners send nothing they are at the left edge.
+        The figure, with a panel for each headline (at most two in a paper's column). Each
+        evaluation is a dot with its name; runs whose partners send nothing are at the left edge.
     """
     columns = 2
-    if current_style().room == "column":
+    if current_style().layout == "column":
         columns = 1
-    names = list(dict.fromkeys(point.headline for point in report.points))[: 2 * columns]
+    all_names = dict.fromkeys(point.headline for point in report.points)
+    names = list(all_names)[: 2 * columns]
     rows = -(-len(names) // columns) or 1
-    fig = figure_or_new(fig, (PANEL[0] * columns, PANEL[1] * rows + 0.7), column=0.75 * rows)
-    samples = counted(report.samples, "sample")
-    set_title(fig, f"{report.task}, protocol {report.protocol}: {samples}")
+    width, height = PANEL
+    fig = figure_or_new(fig, (width * columns, height * rows + 0.7), column=0.75 * rows)
+    if current_style().titled:
+        samples = counted(report.samples, "sample")
+        set_title(fig, f"{rules_name(report.task, report.protocol)}; {samples}")
     percent = 100 * report.resampling.confidence
-    fig.supxlabel(
-        f"bytes a sample, as powers of 2\nwhiskers: {percent:g} % intervals",
-        fontsize=text_size(),
-        color=MUTED_COLOR,
-    )
+    set_note(fig, f"bytes per sample, of all partners; whiskers: {percent:g} % intervals")
     axes = fig.subplots(rows, columns, squeeze=False).ravel()
     for ax, name in zip(axes, names, strict=False):
         _draw([point for point in report.points if point.headline == name], ax)
@@ -61,20 +58,14 @@ def render_over_bytes(report: OverBytes, *, fig: Figure | None = None) -> Figure
 
 
 def _draw(points: Sequence[BytesPoint], ax: Axes) -> None:
-    """Draw one panel; evaluations without bytes are two powers of 2 to the left of the others."""
-    powers = [math.log2(point.bytes) for point in points if point.bytes]
-    low_power, high_power = math.floor(min(powers, default=0)), math.ceil(max(powers, default=0))
-    ticks, labels = [], []
-    if len(powers) < len(points):
-        ticks.append(low_power - 2)
-        labels.append("none")
-    if powers:
-        step = max((high_power - low_power) // 4, 1)
-        shown_powers = range(low_power, high_power + 1, step)
-        ticks += shown_powers
-        labels += map(str, shown_powers)
+    """Draw one panel; evaluations that send nothing are two doublings left of the others."""
+    sizes = [point.bytes for point in points if point.bytes]
+    ticks = _byte_ticks(sizes)
+    position_of_none = min(ticks, default=2.0) - 2
+    if len(sizes) < len(points):
+        ticks[position_of_none] = "none"
     for point in points:
-        x: float = low_power - 2
+        x = position_of_none
         if point.bytes:
             x = math.log2(point.bytes)
         low = point.value if point.low is None else point.low
@@ -87,16 +78,24 @@ def _draw(points: Sequence[BytesPoint], ax: Axes) -> None:
             markersize=6.5,
             color=ESTIMATE_COLOR,
         )
-        keep_free(ax, [[(x, low), (x, high)]], margin=(-4, -4, 4, 4))
+        keep_free(ax, [[(x, low), (x, high)]], margin=DOT_MARGIN_PT)
         place_chips(ax, [(point.evaluation, (x, point.value))])
-    unit = ""
-    if points[0].unit != "share":
-        unit = f" ({points[0].unit})"
-    ax.set(
-        xticks=ticks,
-        xticklabels=labels,
-        ylabel=points[0].headline + unit,
-        xmargin=0.2,
-        ymargin=0.2,
-    )
+    ax.set_xticks(list(ticks), list(ticks.values()))
+    label = with_unit(metric_name(points[0].headline), points[0].unit)
+    ax.set(ylabel=label, xmargin=0.2, ymargin=0.2)
     with_light_grid(ax, "both")
+
+
+def _byte_ticks(sizes: Sequence[float]) -> dict[float, str]:
+    """Return the positions and labels of five ticks at most, such as 1 kB, 2 kB and 4 kB."""
+    if not sizes:
+        return {}
+    ticks = {}
+    for factor, unit in ((1.0, "B"), (1e3, "kB"), (1e6, "MB"), (1e9, "GB")):
+        for power in range(10):
+            ticks[2**power * factor] = f"{2**power} {unit}"
+    values = list(ticks)
+    first = max(bisect_right(values, min(sizes)) - 1, 0)
+    last = min(bisect_left(values, max(sizes)), len(values) - 1)
+    step = max(math.ceil((last - first) / 4), 1)
+    return {math.log2(value): ticks[value] for value in values[first : last + 1 : step]}

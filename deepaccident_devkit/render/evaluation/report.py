@@ -1,9 +1,6 @@
 """`save_report`: one HTML file with the whole evaluation, and its figures as PNG files."""
 
-from __future__ import annotations
-
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +9,7 @@ from typing import Any, Final
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, Breakdown, Group
 from deepaccident_devkit.evaluation.detection import DetectionResult
-from deepaccident_devkit.evaluation.intervals import LEAST_CLUSTERS
+from deepaccident_devkit.evaluation.intervals import MIN_CLUSTERS
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs import EvaluationRun
 from deepaccident_devkit.evaluation.runs.further import further_results
@@ -26,43 +23,46 @@ from deepaccident_devkit.render.evaluation.figures import (
     sample_figures,
     save_figure,
 )
-from deepaccident_devkit.render.evaluation.panels import UNKNOWN
 from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.files import place_in, writable_folder, write_bytes
+from deepaccident_devkit.support.human_names import column_name, human_name, metric_name, rules_name
 from deepaccident_devkit.support.pages import document, result_text, scalar
 from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.text import PathType, counted, with_minus
 
-# `higher_is_better` of a headline → word of the report.
-_BETTER_WORDS: Final = {True: "higher", False: "lower", None: ""}
-# Field of a result → heading of its table.
-_TABLE_HEADINGS: Final = {
-    "truths": "Actors in the samples' true accidents",
-    "within": "By the allowed distance (m)",
+# Word in the report for each value of a headline's `higher_is_better`.
+_BETTER_WORDS = {True: "higher", False: "lower", None: ""}
+# Heading of the table for each field of a result.
+_TABLE_HEADINGS = {
+    "truths": "Colliding pairs of the samples",
+    "within": "By the allowed distance",
     "ranges": "By range",
     "classes": "By class",
-    "beside": "With other choices, always reported as well",
+    "beside": "With other switches",
 }
-# Known values of a class without true boxes.
-_KNOWN_WITHOUT_TRUTH: Final = ("thresholds", "truths", "detections")
-# Fields of the results' own metadata that the header shows, if present.
-_HEADER_META: Final = ("method", "name", "authors", "url", "date")
+# Values that are known even for a class without true boxes.
+_KNOWN_WITHOUT_TRUTH = ("thresholds", "truths", "detections")
+# Fields of the results' metadata that the header shows, if present.
+_HEADER_META = ("method", "name", "authors", "url", "date")
 REPORT_FILE: Final = "report.html"
 FIGURES_FOLDER: Final = "figures"
 
 
 def report_context(run: EvaluationRun) -> dict[str, Any]:
-    """Return the data of a run for the template `evaluation_report.html`, without pictures."""
-    fields, summary = run.result.as_dict(), run.summary()
-    everything = next((item for item in run.breakdowns if item.by == EVERYTHING), None)
-    group, percent = None, ""
-    if everything is not None:
-        percent = f"{100 * everything.resampling.confidence:g} % "
-        group = next(iter(everything.groups), None)
-    common_values = {
-        item.by: item.groups[0].value or UNKNOWN for item in run.breakdowns if len(item.groups) == 1
-    }
+    """Collect a run's data for the template `evaluation_report.html`, without pictures."""
+    fields = run.result.as_dict()
+    summary = run.summary()
+    group = None
+    percent = ""
+    common_values = {}
+    for broken in run.breakdowns:
+        if broken.by == EVERYTHING:
+            percent = f"{100 * broken.resampling.confidence:g} % "
+            group = next(iter(broken.groups), None)
+        if len(broken.groups) == 1:
+            common_values[broken.by] = human_name(broken.groups[0].value)
     return {
-        "title": f"{run.setup.task.capitalize()}, protocol {run.setup.protocol}",
+        "title": rules_name(run.setup.task, run.setup.protocol),
         "partial": "" if run.partial is None else run.partial.text(),
         "header": _header(run, summary),
         "headlines": _headline_rows(run.result, group),
@@ -71,13 +71,15 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
         "predictors": [*predictor_tables(fields), *means_tables(summary).values()],
         "further": _further_tables(summary),
         "whole_numbers": {
-            name: result_text(value) for name, value in fields.items() if isinstance(value, int)
+            column_name(name): result_text(value)
+            for name, value in fields.items()
+            if isinstance(value, int)
         },
         "said": [*(fields.get("notes") or ()), *reading_notes(summary)],
         "counts": _counts(run.result, fields),
         "breakdowns": [_breakdown(item) for item in run.breakdowns if item.by not in common_values],
         "same": [
-            f"{name.replace('_', ' ')} {value}"
+            f"{human_name(name, 'attributes')}: {value}"
             for name, value in common_values.items()
             if name != EVERYTHING
         ],
@@ -91,7 +93,7 @@ def _headline_rows(result: Any, group: Group[Any] | None) -> list[list[str]]:
     for headline in _headlines(result):
         interval = _interval_text(headline, group)
         direction = _BETTER_WORDS[headline.higher_is_better]
-        rows.append([headline.name, headline.text(), interval, direction])
+        rows.append([metric_name(headline.name), headline.text(), interval, direction])
     return rows
 
 
@@ -99,13 +101,16 @@ def _further_tables(summary: Mapping[str, Any]) -> dict[str, tuple[Any, list[str
     tables = {}
     for extra, part in further_results(summary):
         notes = [*part["notes"], *part["interval_notes"]]
-        tables[extra.title.capitalize()] = (extra.tables(part), notes)
+        heading = extra.title.capitalize()
+        tables[heading] = (extra.tables(part), notes)
     return tables
 
 
 def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
-    """Return what was evaluated, and how."""
-    setup, results, counts = run.setup, run.results, summary["counts"]
+    """Return the rows of the header: what was evaluated, and how."""
+    setup = run.setup
+    results = run.results
+    counts = summary["counts"]
     protocol = setup.protocol
     changes = [f"{name} = {scalar(value)}" for name, value in setup.switches.items()]
     if changes:
@@ -113,7 +118,7 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
     header = {"task": setup.task, "protocol": protocol}
     header |= {name: scalar(results.meta[name]) for name in _HEADER_META if name in results.meta}
     header |= {
-        "samples": f"{counts['samples']:,} of {counts['scenarios']:,} scenarios",
+        "samples": f"{counts['samples']:,} from {counted(counts['scenarios'], 'scenario')}",
         "selection": run.selection.text(),
     }
     if run.evaluator.has_horizon:
@@ -121,7 +126,7 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
     header |= {"results": results.path, "results' hash": results.fingerprint}
     sent = sent_bytes(summary)
     if sent:
-        header["bytes"] = sent.text()
+        header["communication"] = sent.text()
     versions = [f"{name} {version}" for name, version in summary["environment"].items()]
     return header | {
         "release": f"{run.release.version}, {run.release.dataroot}",
@@ -132,89 +137,103 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _counts(result: object, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return heading → counts, in the form of `_columns`."""
+    """Return the counts of a result by heading, formatted by `_columns`."""
     for name in _absent_classes(result):
         row = fields["classes"][name]
-        row.update({key: None for key in row if key not in _KNOWN_WITHOUT_TRUTH})
+        for key in row.keys() - {*_KNOWN_WITHOUT_TRUTH}:
+            row[key] = None
     counts = {}
     for name, title in _TABLE_HEADINGS.items():
         if fields.get(name):
-            counts[title] = _columns(fields[name])
+            counts[title] = _columns(fields[name], name)
     return counts
 
 
-def _columns(value: Any) -> Any:
-    """Return the form of a value in the report.
+def _columns(value: Any, part: str) -> Any:
+    """Format a value of a part of a result for the report.
 
-    Pairs become a text of ranges, a mapping of numbers texts by name, and a mapping of mappings
-    rows with a heading.
+    Pairs become a text of ranges, a mapping of numbers becomes texts by name, and a mapping of
+    mappings becomes rows with a heading.
     """
     if not isinstance(value, Mapping):
-        return "; ".join(_range_text(low, high) for low, high in value)
+        ranges = []
+        for low, high in value:
+            end = "m and more" if high is None else f"to {high:g} m"
+            ranges.append(f"{low:g} {end}")
+        return "; ".join(ranges)
     if not all(isinstance(row, Mapping) for row in value.values()):
-        return {str(name): result_text(number) for name, number in value.items()}
-    columns: dict[str, bool] = {}  # name → whether its values are plain
+        return {column_name(str(name)): result_text(number) for name, number in value.items()}
+    is_plain: dict[str, bool] = {}  # whether all values of a column are plain, by column name
     for row in value.values():
         for name, cell in row.items():
-            columns[name] = columns.get(name, True) and not isinstance(cell, Mapping)
-    names = [name for name, is_plain in columns.items() if is_plain]
-    rows = [["", *names]]
+            is_plain[name] = is_plain.get(name, True) and not isinstance(cell, Mapping)
+    names = [name for name in is_plain if is_plain[name] and name != "distance"]
+    rows = [["", *map(column_name, names)]]
     for key, row in value.items():
-        rows.append([key, *(result_text(row.get(name)) for name in names)])
+        texts = [result_text(row.get(name)) for name in names]
+        rows.append([column_name(f"{part}/{key}"), *texts])
     return rows
 
 
-def _range_text(low: float, high: float | None) -> str:
-    if high is None:
-        return f"{low:g} m and more"
-    return f"{low:g} to {high:g} m"
-
-
 def _breakdown(broken: Breakdown[Any]) -> dict[str, Any]:
-    """Return a table for an attribute, and one of only the vehicles if sample numbers differ."""
-    groups, vehicle_groups = broken.groups, broken.without_infrastructure
+    """Make a table of an attribute's groups, and a table without the roadside if it differs."""
+    groups = broken.groups
+    vehicle_groups = broken.without_infrastructure
+    samples = sum(group.samples for group in groups)
     vehicle_samples = sum(group.samples for group in vehicle_groups)
     vehicles = None
-    if vehicle_samples != sum(group.samples for group in groups):
-        vehicles = _groups(broken, vehicle_groups, "without the roadside")
+    if vehicle_samples != samples:
+        vehicles = _group_table(broken, vehicle_groups, "without infrastructure")
     return {
-        "by": broken.by.replace("_", " "),
-        "all": _groups(broken, groups, "all agents"),
+        "by": human_name(broken.by, "attributes"),
+        "all": _group_table(broken, groups, "all agents"),
         "vehicles": vehicles,
     }
 
 
-def _groups(broken: Breakdown[Any], groups: Sequence[Group[Any]], agents: str) -> dict[str, Any]:
-    headlines_of_groups = [_headlines(group.result) for group in groups]
-    names = list(dict.fromkeys(item.name for row in headlines_of_groups for item in row))
+def _group_table(
+    broken: Breakdown[Any], groups: Sequence[Group[Any]], agents: str
+) -> dict[str, Any]:
+    """Make a table, with a caption, of the headline numbers of a breakdown's groups."""
+    names: dict[str, None] = {}
+    cells_of_groups = []
+    for group in groups:
+        cells = {}
+        for headline in _headlines(group.result):
+            name = metric_name(headline.name)
+            names[name] = None
+            cells[name] = (headline.text(), _interval_text(headline, group))
+        cells_of_groups.append(cells)
     rows = []
-    for group, group_headlines in zip(groups, headlines_of_groups, strict=True):
-        cells = {item.name: (item.text(), _interval_text(item, group)) for item in group_headlines}
-        label = UNKNOWN if group.value is None else group.value
+    for group, cells in zip(groups, cells_of_groups, strict=True):
+        numbers = [cells.get(name, "–") for name in names]
         counts = [f"{group.samples:,}", f"{group.scenarios:,}"]
-        rows.append([label, *counts, *(cells.get(name, "–") for name in names)])
+        rows.append([human_name(group.value), *counts, *numbers])
     percent = 100 * broken.resampling.confidence
     return {
-        "heading": [broken.by.replace("_", " "), "samples", "scenarios", *names],
+        "heading": [human_name(broken.by, "attributes"), "samples", "scenarios", *names],
         "rows": rows,
-        "caption": f"{agents}; {percent:g} % intervals, if there are {LEAST_CLUSTERS} clusters",
+        "caption": (
+            f"{agents}; {percent:g} % confidence intervals where there are at least {MIN_CLUSTERS} "
+            "scenario pairs"
+        ),
     }
 
 
 def _choices(run: EvaluationRun) -> Iterator[tuple[str, Any]]:
-    """Yield every switch of the protocol, and all other settings."""
+    """Yield the headings and values of the protocol's switches and of all other settings."""
     yield "Every switch of the protocol", run.setup.as_dict()["settings"]
     yield "Selection of samples", run.selection.as_dict()
     if run.results.form is not None:
         yield "Form of the results", run.results.form
     if run.results.meta:
-        yield "What the results say about themselves", run.results.meta
+        yield "Metadata of the results", run.results.meta
 
 
 def _headlines(result: Any) -> list[Headline]:
-    """Return the headlines as a report shows them.
+    """Return the headlines of a result as a report shows them.
 
-    A class without true boxes has no value, even if the rules count 0.
+    A class without true boxes has no value, even if the protocol counts it as 0.
     """
     paths = {f"class_average_precision/{name}" for name in _absent_classes(result)}
     shown_headlines = []
@@ -225,7 +244,7 @@ def _headlines(result: Any) -> list[Headline]:
 
 
 def _absent_classes(result: object) -> list[str]:
-    """Return classes without true boxes in a result of detection."""
+    """Return the classes that have no true boxes, if the result is one of detection."""
     if not isinstance(result, DetectionResult):
         return []
     truths = result.truths.sum(axis=1)
@@ -241,27 +260,27 @@ def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
     digits = 3
     if headline.unit == "%":
         digits = 2
-    return f"{low:.{digits}f} to {high:.{digits}f}"
+    return with_minus(f"{low:.{digits}f} to {high:.{digits}f}")
 
 
 def save_report(
     run: EvaluationRun,
-    folder: str | os.PathLike[str],
+    folder: PathType,
     *,
     dataset: Dataset | None = None,
     results: Results | None = None,
 ) -> Path:
-    """Write `report.html` and `figures/*.png` into a folder; the same run makes the same bytes.
+    """Write `report.html` and `figures/*.png` into a folder.
 
-    The report needs no other file and can be sent as it is. In a partial run each section and each
-    figure is marked as partial.
+    The same run always gives the same bytes. The report needs no other file, so it can be sent on
+    its own. For a partial run, each section and each figure is marked as partial.
 
     Args:
         run: Result of `evaluate_results`.
-        folder: Folder to write into; it is made if it does not exist, and files of an earlier
+        folder: Folder to write into. It is created if it does not exist; the files of an earlier
             report in it are replaced.
-        dataset: The release; with it and `results` the report also shows the worst and the best
-            samples.
+        dataset: The release. If `dataset` and `results` are both passed, the report also shows the
+            worst and the best samples.
         results: The predictions that were evaluated.
 
     Returns:
@@ -269,7 +288,7 @@ def save_report(
 
     Raises:
         ConfigError: The folder cannot be written to, or is a file.
-        OutputFolderError: Its `figures` is a link.
+        OutputFolderError: The folder `figures` in it is a link.
     """
     target = writable_folder(folder)
     unsaved_figures = [*run_figures(run)]
@@ -284,7 +303,7 @@ def save_report(
 
 
 def report_html(run: EvaluationRun, figures: Sequence[tuple[RunFigure, Path]]) -> str:
-    """Return the complete page, with the figures' PNG files as a part of it."""
+    """Return the complete page, in which the figures' PNG files are embedded."""
     pictures = []
     for figure, path in figures:
         pictures.append((read_bytes(path, "image"), figure.alt, figure.caption))

@@ -1,4 +1,4 @@
-"""A sample's prediction beside or over its label: right, false and missed parts."""
+"""A sample's prediction next to or on top of its label: right, false and missed parts."""
 
 from deepaccident_devkit.render.outcomes.above import (
     MotionOutcome,

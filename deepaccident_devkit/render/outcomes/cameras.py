@@ -1,4 +1,4 @@
-"""A prediction over the truth in cameras: boxes, cells on the ground, places of accidents."""
+"""A prediction on top of the truth in camera images: boxes, ground cells, accident positions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from deepaccident_devkit.render.boxes import (
 from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image
 from deepaccident_devkit.render.captions import draw_legend, has_sensor_file, set_scene_title
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, settled
+from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, lay_out_figure
 from deepaccident_devkit.render.motion_maps import MotionMaps
 from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
 from deepaccident_devkit.render.outcomes.verdicts import (
@@ -35,11 +35,12 @@ from deepaccident_devkit.render.outcomes.verdicts import (
     boxes_of,
     sample_verdict,
 )
-from deepaccident_devkit.render.samples import CAMERA_GRID
+from deepaccident_devkit.render.samples import CAMERA_GRID, TALL_CAMERA_GRID
 from deepaccident_devkit.render.styles import (
     CASING_COLOR,
     COLLIDER_COLOR,
     OUTCOME_COLORS,
+    current_style,
     in_own_settings,
 )
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray
@@ -52,35 +53,36 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Metres: the height of the posts at positions, since distant rings look flat.
-_POST_HEIGHT_M: Final = 1.5
-# Points around a post that no words cover: left, low, right and high.
-_MARK_MARGIN_PT: Final = (-6.0, -6.0, 6.0, 6.0)
-# Points by which the casing of a line is wider.
-_CASING_WIDTH_PT: Final = 1.4
-# Line colour → colour of its casing, for pale lines; other casings are white.
+# Height in metres of the posts that mark positions; without them, distant rings look flat.
+_POST_HEIGHT_M = 1.5
+# Margin in points around a post that words do not cover: left, below, right and above.
+_MARK_MARGIN_PT = (-6.0, -6.0, 6.0, 6.0)
+# How much wider than a line its casing is, in points.
+_CASING_WIDTH_PT = 1.4
+# Casing colour by line colour, for pale lines; all other casings are white.
 CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
-_FIGURE_SIZE_IN: Final = (14.7, 7.1125)
-_ANGLES_RAD: Final = np.linspace(0, 2 * np.pi, 33)
+_FIGURE_SIZE_IN = (14.7, 7.1125)
+_ANGLES_RAD = np.linspace(0, 2 * np.pi, 33)
 # The ring around a true position and the cross at a foreseen one, of a radius of 1 m.
-_RING: Final = [np.column_stack([np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)])]
-_CROSS: Final = [np.sqrt(0.5) * np.array(arm) for arm in ([[-1, -1], [1, 1]], [[-1, 1], [1, -1]])]
-# Points around the middle of a panel's upper edge, where the words about a missing image are:
-# left, low, right, high.
-_MISSING_WORDS_MARGIN_PT: Final = (-58.0, -48.0, 58.0, 0.0)
-# Opacity of the ground of instances.
-_GROUND_OPACITY: Final = 0.3
+_RING = [np.column_stack([np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)])]
+_CROSS = [np.sqrt(0.5) * np.array(arm) for arm in ([[-1, -1], [1, 1]], [[-1, 1], [1, -1]])]
+# Margin in points around the middle of a panel's upper edge, where the words about a missing image
+# are: left, below, right and above.
+_MISSING_WORDS_MARGIN_PT = (-58.0, -48.0, 58.0, 0.0)
+# Opacity of instances' cells on the ground.
+_GROUND_OPACITY = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraView:
-    """A camera's panel, and the ground in it.
+    """The panel of a camera, with the geometry to draw on the ground in it.
 
     The ground is flat: z = 0 in a vehicle's ego frame, `POLE_HEIGHT` below the infrastructure's.
 
     Attributes:
         camera: Token of the image (sample data).
-        sample: Token; the image is its own, or that of another agent at its moment.
+        sample: Token of the sample; the image is this sample's, or another agent's in the same
+            frame.
         lens: Intrinsics of the camera.
         optical_from_ego: Pose of the sample's ego frame in the optical frame.
         ground: Height z of the ground in the ego frame, metres.
@@ -95,37 +97,42 @@ class CameraView:
     ax: Axes
 
     def optical(self, positions: FloatArray, height: float = 0.0) -> FloatArray:
-        """Return points (N, 3) of the optical frame, above positions (N, 2) of the ego frame.
+        """Transform positions (N, 2) in the ego frame to points (N, 3) in the optical frame.
 
-        The height above the ground is in metres.
+        `height` is their height above the ground, metres.
         """
         z = np.full(len(positions), self.ground + height)
-        points = np.column_stack([positions, z])
-        return self.optical_from_ego.apply(points)
+        ego_points = np.column_stack([positions, z])
+        return self.optical_from_ego.apply(ego_points)
 
     def on_ground(self, lines: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return the visible parts (V, 2), pixels, of lines (P, 2) on the ground, in the ego frame.
+        """Project the parts of ground lines that are in front of the camera to pixels.
 
-        Visible parts are in front of the camera. The ends of a cut are far below the image, and so
-        is the line between two of them.
+        Where a line is cut, the new ends are far below the image, and so is the line between them.
+
+        Args:
+            lines: Lines in the ego frame, shape (P, 2) each, metres.
+
+        Returns:
+            The parts of each line that has any, shape (V, 2) each, pixels.
         """
         if not lines:
             return []
         points = self.optical(np.concatenate(lines))
         line_numbers = np.repeat(np.arange(len(lines)), [*map(len, lines)])
-        within_line = line_numbers[1:] == line_numbers[:-1]
-        segments = np.stack([points[:-1], points[1:]], axis=1)[within_line]
-        pixels, drawn = segments_in_image(segments, self.lens)
-        drawn_numbers = line_numbers[1:][within_line][drawn]
-        numbers, starts = np.unique(drawn_numbers, return_index=True)
+        is_within_line = line_numbers[1:] == line_numbers[:-1]
+        segments = np.stack([points[:-1], points[1:]], axis=1)[is_within_line]
+        segment_numbers = line_numbers[1:][is_within_line]
+        pixels, is_drawn = segments_in_image(segments, self.lens)
+        numbers, first_segments = np.unique(segment_numbers[is_drawn], return_index=True)
         if not len(numbers):
             return []
-        return np.split(pixels.reshape(-1, 2), 2 * starts[1:])
+        return np.split(pixels.reshape(-1, 2), 2 * first_segments[1:])
 
     def draw_lines(
         self, lines: Sequence[FloatArray], color: str, *, width: float, dashed: bool = False
     ) -> None:
-        """Render lines (V, 2) in pixels, on wider ones that set them off from the image."""
+        """Render lines (V, 2) in pixels, with a casing that sets them off from the image."""
         from matplotlib.collections import LineCollection
 
         casing_color = CASINGS.get(color, CASING_COLOR)
@@ -138,33 +145,37 @@ class CameraView:
         self.ax.add_collection(collection, autolim=False)
 
     def posts(self, positions: FloatArray) -> FloatArray:
-        """Return feet and tops (V, 2, 2), pixels, of posts at positions (N, 2) of the ego frame.
+        """Return the feet and tops, shape (V, 2, 2), pixels, of posts at positions (N, 2).
 
-        Only posts in front of the camera are returned.
+        Positions are in the ego frame; posts behind the camera are left out.
         """
-        ends = [self.optical(positions), self.optical(positions, _POST_HEIGHT_M)]
-        pixels, _ = segments_in_image(np.stack(ends, axis=1), self.lens)
+        feet = self.optical(positions)
+        tops = self.optical(positions, _POST_HEIGHT_M)
+        segments = np.stack([feet, tops], axis=1)
+        pixels, _ = segments_in_image(segments, self.lens)
         return pixels
 
     def write(self, words: str, positions: FloatArray, color: str) -> None:
-        """Write words beside positions (N, 2) of the ego frame.
+        """Write words near positions (N, 2) in the ego frame.
 
-        The words are between the feet of the posts in the image.
+        They are written at the mean position of the posts' feet in the image. If no foot is in the
+        image, nothing is written.
         """
         posts = self.posts(positions)
-        visible = posts[self.lens.in_image(posts[:, 0])]
-        if len(visible):
-            u, v = visible[:, 0].mean(axis=0).tolist()
-            keep_free(self.ax, visible, margin=_MARK_MARGIN_PT)
+        feet = posts[:, 0]
+        in_image = self.lens.in_image(feet)
+        if in_image.any():
+            u, v = feet[in_image].mean(axis=0).tolist()
+            keep_free(self.ax, posts[in_image], margin=_MARK_MARGIN_PT)
             write_beside(self.ax, words, (u, v), color)
 
 
 def view_of(
     dataset: Dataset, sample: str, camera: str, ax: Axes, *, image: bool = True
 ) -> CameraView:
-    """Return a panel with an image of a sample's moment, or with words on its absence.
+    """Render an image in a panel, or words about its absence, and return its `CameraView`.
 
-    The image is that of any agent; sample and camera are tokens.
+    The image may be of any agent in the sample's frame; `sample` and `camera` are tokens.
     """
     lens = camera_of(dataset, camera)
     draw_image(dataset, dataset.get("sample_data", camera), ax, image=image)
@@ -198,34 +209,36 @@ def render_outcome_in_cameras(
 ) -> Figure:
     """Render a prediction over the truth in the cameras of the sample's agent.
 
-    The outcome is that of a protocol's verdict. Detections: matched and false boxes, missed true
-    boxes dashed, and matched true boxes with thin lines. Motion: the cells of predicted instances
-    on the ground, right or false, and of missed true ones, dashed. Accidents: boxes of the pair,
-    red rings at the positions where two collide, black crosses at the foreseen positions, with
-    their times; posts of 1.5 m stand on both. What does not count, such as boxes and instances
-    beyond the protocol's range, is not rendered, nor is the agent's own box, which is around its
-    cameras.
+    A protocol decides what is right. For detections, matched and false boxes are shown, missed true
+    boxes (dashed), and matched true boxes (thin lines). For motion, the ground cells of predicted
+    instances are shown, right or false, and of missed true ones (dashed). For accidents, the
+    pair's boxes are shown, with red rings at the positions where they collide, and black crosses at
+    the foreseen positions, labelled with times; each position also has a post of 1.5 m. What does
+    not count, such as boxes and instances beyond the protocol's range, is not rendered. The agent's
+    own box is not rendered either, because its cameras are inside it.
 
-    The ground is assumed to be flat: the plane z = 0 of a vehicle's ego frame, and for the
-    infrastructure 4 m below its LiDAR. Occlusion is ignored: boxes and positions are rendered even
-    if other things hide them.
+    The ground is assumed to be flat: the plane z = 0 in a vehicle's ego frame, or 4 m below the
+    infrastructure's LiDAR. Occlusion is ignored: boxes and positions are rendered even if other
+    things hide them.
 
-    Arguments and errors are as for `render_evaluation`. The `frame` is one of motion (None: the
-    present): later ones show where instances will be, in the present image.
+    Arguments and errors are as for `render_evaluation`. `frame` is the index of the motion frame to
+    show (None: the current one); a later frame shows, in the current image, where instances will
+    be.
     """
     verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
     number = _checked_frame(verdict, frame)
-    seconds, words = 0.0, ""
+    words = ""
     if isinstance(verdict, MotionVerdict):
         seconds = number * verdict.outcome.true.step
-    if seconds:
-        words = f"instances in {seconds:.1f} s"
-    fig = figure_or_new(fig, _FIGURE_SIZE_IN)
-    for channel, ax in fig.subplot_mosaic([[*row] for row in CAMERA_GRID]).items():
+        if seconds:
+            words = f"instances in {seconds:.1f} s"
+    fig = figure_or_new(fig, _FIGURE_SIZE_IN, column=1.3)
+    grid = TALL_CAMERA_GRID if current_style().layout == "column" else CAMERA_GRID
+    for channel, ax in fig.subplot_mosaic([[*row] for row in grid]).items():
         draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
     draw_legend(fig, _handles(verdict))
     set_scene_title(fig, dataset, verdict.sample, words, below=verdict.words)
-    return settled(fig)
+    return lay_out_figure(fig)
 
 
 @in_own_settings
@@ -242,7 +255,8 @@ def draw_outcome_in_camera(
     Raises:
         ChoiceError: No such camera, or no such frame.
     """
-    channel, number = choice("camera", camera, CAMERAS), _checked_frame(verdict, frame)
+    channel = choice("camera", camera, CAMERAS)
+    number = _checked_frame(verdict, frame)
     ax = axes_or_new(ax, (8, 5))
     token = f"{verdict.sample}/{channel}"
     if isinstance(verdict, AccidentVerdict):
@@ -258,12 +272,14 @@ def draw_outcome_in_camera(
 def draw_accidents_in_camera(
     dataset: Dataset, verdict: AccidentVerdict, camera: str, ax: Axes, *, image: bool = True
 ) -> Axes:
-    """Render positions of accidents and boxes of the pair in an image (a token) of any agent.
+    """Render accident positions and the pair's boxes in an image (a token) of any agent.
 
-    The true accident is below the foreseen ones, and its words are placed first.
+    The true accident is drawn beneath the foreseen ones, but its words are placed first.
     """
-    view, true = view_of(dataset, verdict.sample, camera, ax, image=image), verdict.compared.true
-    record, boxes = dataset.get("sample_data", camera), boxes_of(dataset, verdict)
+    view = view_of(dataset, verdict.sample, camera, ax, image=image)
+    true = verdict.compared.true
+    record = dataset.get("sample_data", camera)
+    boxes = boxes_of(dataset, verdict)
     agent_token = dataset.get("sample", record["sample_token"])["agent_token"]
     own_actor = dataset.get("agent", agent_token)["actor_id"]
     optical_from_world = dataset.world_from(*camera.rsplit("/", 1)).inverse()
@@ -280,43 +296,52 @@ def draw_accidents_in_camera(
 
 
 def _checked_frame(verdict: Verdict, frame: int | None) -> int:
-    """Return the number of a frame of motion, 0 for None; raises ChoiceError."""
+    """Return the index of a motion frame, 0 for None; raise ChoiceError if there is none such."""
     if frame is None:
         return 0
     if not isinstance(verdict, MotionVerdict):
-        raise ChoiceError(f"frame: only motion has frames, found {frame!r}; leave it out")
+        raise ChoiceError(f"frame: only predicted motion has frames, found {frame!r}; leave it out")
     count = len(verdict.outcome.true.instance)
     if frame not in range(count):
-        raise ChoiceError(f"frame: expected a recorded one, from 0 to {count - 1}, found {frame!r}")
+        raise ChoiceError(
+            f"frame: expected a recorded frame, from 0 to {count - 1}, found {frame!r}"
+        )
     return frame
 
 
 def _draw_detection(verdict: DetectionVerdict, dataset: Dataset, view: CameraView) -> None:
-    """Draw matched true boxes below the detections, and these with the nearest on top.
+    """Draw matched true boxes beneath the detections; the nearest are on top.
 
     The agent's own box is left out.
     """
-    sample, channel, matches = view.sample, view.camera.rsplit("/", 1)[1], verdict.matches
+    matches = verdict.matches
+    channel = view.camera.rsplit("/", 1)[1]
     is_own = verdict.truth.actor_id == OWN_ACTOR_ID
-    counted = ~is_own[matches.truth]
-    missed = matches.missed[~is_own[matches.missed]]
-    optical_from_world = dataset.world_from(sample, channel).inverse()
-    optical = optical_from_world @ dataset.world_from(sample, verdict.rules.frame)
-    truth = verdict.truth.transform(optical, channel)
-    detected = verdict.detected.boxes.transform(optical, channel)
-    _draw_edges(truth.select(matches.truth[counted]), "black", view, width=0.7)
-    boxes = detected.select(np.concatenate([matches.detection[counted], matches.false]))
-    kinds = np.repeat(["right", "false"], [int(counted.sum()), len(matches.false)])
-    order = np.argsort(-boxes.center[:, 2], kind="stable")
+    is_counted = ~is_own[matches.truth]
+    optical_from_world = dataset.world_from(view.sample, channel).inverse()
+    world_from_truth = dataset.world_from(view.sample, verdict.rules.frame)
+    optical_from_truth = optical_from_world @ world_from_truth
+    truth = verdict.truth.transform(optical_from_truth, channel)
+    detected = verdict.detected.boxes.transform(optical_from_truth, channel)
+    matched_rows = matches.truth[is_counted]
+    missed_rows = matches.missed[~is_own[matches.missed]]
+    right_rows = matches.detection[is_counted]
+    boxes = detected.select(np.concatenate([right_rows, matches.false]))
+    kinds = np.repeat(["right", "false"], [len(right_rows), len(matches.false)])
+    depth = boxes.center[:, 2]
+    order = np.argsort(-depth, kind="stable")
     colors = [OUTCOME_COLORS[kind] for kind in kinds[order].tolist()]
+    _draw_edges(truth.select(matched_rows), "black", view, width=0.7)
     draw_boxes_in_image(boxes.select(order), view.lens, view.ax, colors)
-    _draw_edges(truth.select(missed), OUTCOME_COLORS["missed"], view, width=1.6, dashed=True)
+    missed_boxes = truth.select(missed_rows)
+    _draw_edges(missed_boxes, OUTCOME_COLORS["missed"], view, width=1.6, dashed=True)
 
 
 def _draw_edges(
     optical: Boxes, color: str, view: CameraView, *, width: float, dashed: bool = False
 ) -> None:
-    edges = optical.corners()[:, EDGES].reshape(-1, 2, 3)
+    corners = optical.corners()
+    edges = corners[:, EDGES].reshape(-1, 2, 3)
     pixels, _ = segments_in_image(edges, view.lens)
     view.draw_lines(list(pixels), color, width=width, dashed=dashed)
 
@@ -324,40 +349,44 @@ def _draw_edges(
 def _draw_motion(verdict: MotionVerdict, frame: int, view: CameraView) -> None:
     from matplotlib.collections import PolyCollection
 
+    """Draw the cells of predicted instances on the ground, and the outlines of missed true ones."""
     outcome = verdict.outcome
-    missed = outcome.judged("true", frame)["missed"]
-    for name, ids in outcome.judged("predicted", frame).items():
-        color = OUTCOME_COLORS[name]
+    missed_ids = outcome.judged("true", frame)["missed"]
+    for kind, ids in outcome.judged("predicted", frame).items():
+        color = OUTCOME_COLORS[kind]
         areas = view.on_ground(_outlines(outcome.predicted, frame, ids))
         polygons = PolyCollection(areas, facecolors=color, alpha=_GROUND_OPACITY, edgecolors="none")
         view.ax.add_collection(polygons, autolim=False)
         view.draw_lines(areas, color, width=1.6)
-    areas = view.on_ground(_outlines(outcome.true, frame, missed))
+    areas = view.on_ground(_outlines(outcome.true, frame, missed_ids))
     view.draw_lines(areas, OUTCOME_COLORS["missed"], width=1.6, dashed=True)
 
 
 def _outlines(maps: MotionMaps, frame: int, ids: AnyArray) -> list[FloatArray]:
-    """Return closed lines (P, 2), metres of the ego frame, around the cells of instances.
+    """Return closed lines (P, 2), metres in the ego frame, around the cells of instances.
 
-    Holes have no lines.
+    Holes are not outlined.
     """
-    low, _, size = np.array([maps.grid.x, maps.grid.y]).T
+    low, _, cell_size = np.array([maps.grid.x, maps.grid.y]).T
     lines = []
-    for identity in ids.tolist():
-        cells = maps.instance[frame] == identity
+    for instance_id in ids.tolist():
+        cells = maps.instance[frame] == instance_id
         for polygon in outlines(cells, np.zeros(2), 1.0).geoms:
-            lines.append(low + np.asarray(polygon.exterior.coords) * size)
+            corners = np.asarray(polygon.exterior.coords)
+            lines.append(low + corners * cell_size)
     return lines
 
 
 def _draw_positions(
     positions: FloatArray, mark: Sequence[FloatArray], color: str, view: CameraView
 ) -> None:
-    """Draw a mark and a post at each of two positions (2, 2), and a thin line between them."""
+    """Draw a mark and a post at each of two positions (2, 2), joined by a thin line."""
     thin_lines = [*view.on_ground([positions]), *view.posts(positions)]
     view.draw_lines(thin_lines, color, width=1.2)
-    marks = [position + line for position in positions for line in mark]
-    view.draw_lines(view.on_ground(marks), color, width=1.8)
+    mark_lines = []
+    for position in positions:
+        mark_lines += [position + line for line in mark]
+    view.draw_lines(view.on_ground(mark_lines), color, width=1.8)
 
 
 def _handles(verdict: Verdict) -> list[Artist]:
@@ -372,10 +401,10 @@ def _handles(verdict: Verdict) -> list[Artist]:
             marker="o",
             fillstyle="none",
             color=COLLIDER_COLOR,
-            label="accident to come",
+            label="actual collision",
             **style,
         )
-        cross = Line2D([], [], marker="x", color=FORESEEN_COLOR, label="foreseen", **style)
+        cross = Line2D([], [], marker="x", color=FORESEEN_COLOR, label="predicted", **style)
         return [ring, cross]
     is_detection = isinstance(verdict, DetectionVerdict)
     handles: list[Artist] = []

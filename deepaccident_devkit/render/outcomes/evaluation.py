@@ -1,4 +1,4 @@
-"""`render_evaluation`: a sample's truth beside a prediction, with the verdict of a protocol."""
+"""`render_evaluation`: a sample's truth next to a prediction, with the verdict of a protocol."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.render.bev import BevView, draw_bev
 from deepaccident_devkit.render.boxes import camera_name, collider_ids, draw_boxes_from_above
 from deepaccident_devkit.render.camera import best_view
-from deepaccident_devkit.render.captions import draw_legend, set_scene_title
-from deepaccident_devkit.render.chips import SMALLEST_TEXT
+from deepaccident_devkit.render.captions import (
+    draw_legend,
+    set_scene_title,
+    titled_from_above,
+)
 from deepaccident_devkit.render.figures import (
     Layer,
+    Layers,
     figure_or_new,
-    settled,
+    lay_out_figure,
     show_square,
-    titled_from_above,
 )
 from deepaccident_devkit.render.motion_maps import draw_edge, maps_of_labels
 from deepaccident_devkit.render.outcomes.above import (
@@ -33,7 +36,7 @@ from deepaccident_devkit.render.outcomes.above import (
     draw_detection_outcome,
     draw_motion_side,
     draw_true,
-    layers_but_ids,
+    layers_without_ids,
     shown_square,
 )
 from deepaccident_devkit.render.outcomes.cameras import draw_accidents_in_camera
@@ -42,25 +45,32 @@ from deepaccident_devkit.render.outcomes.verdicts import (
     DetectionVerdict,
     MotionVerdict,
     boxes_of,
-    judged_as,
+    check_judged_prediction,
     sample_verdict,
 )
-from deepaccident_devkit.render.styles import COLLIDER_COLOR, in_own_settings
+from deepaccident_devkit.render.styles import (
+    COLLIDER_COLOR,
+    current_style,
+    in_own_settings,
+    text_size,
+)
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, short_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_LAYERS_OF_TASK: Final[Mapping[str, tuple[Layer, ...]]] = {
+_LAYERS_OF_TASK: Mapping[str, Layers] = {
     "motion": MOTION_LAYERS,
     "accident": ("image", "bev", *ACCIDENT_LAYERS),
     "detection": DETECTION_LAYERS,
 }
-# Inches.
+# Width and height in inches of the figure for each task.
 FIGURE_SIZES: Final = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12.4, 6.9)}
-# Widths of a camera's panel and the panel beside it.
-_CAMERA_WIDTH_RATIOS: Final = (1.4, 1.0)
+# Relative widths of a camera's panel and the panel next to it, and relative heights of a camera's
+# panel and the panel below it.
+_CAMERA_WIDTH_RATIOS = (1.4, 1.0)
+_CAMERA_HEIGHT_RATIOS = (0.6, 1.0)
 
 
 @in_own_settings
@@ -75,45 +85,52 @@ def render_evaluation(
     layers: Iterable[Layer] | None = None,
     fig: Figure | None = None,
 ) -> Figure:
-    """Render a sample's truth beside a model's prediction, with a protocol's verdict.
+    """Render a sample's truth next to a model's prediction, with a protocol's verdict.
 
-    Motion: true instances are found or missed, predicted ones right or false, frame by frame.
-    Detections: matched, false and missed boxes. Accidents: the colliding pair in the camera, of any
-    agent, that shows it best, and from above the road, the actors, and the positions where two
-    collide, with the metres between foreseen and true positions. The true colliding pair is red.
+    For motion, true instances are found or missed, and predicted ones right or false, frame by
+    frame. For detections, boxes are matched, false or missed. For accidents, one panel shows the
+    colliding pair in the camera (of any agent) that shows it best; the other shows, from above, the
+    road, the actors, and the true and foreseen positions of the collision with their distances in
+    metres. The true colliding pair is red.
 
     Args:
         dataset: The release.
         sample: Token or record.
         prediction: Motion, explicit accidents (a list, empty for none), or detected boxes in any
             frame of the sample.
-        task: `motion`, `accident` or `detection`; None for the prediction's. Motion can be
-            evaluated as motion or as accident.
+        task: `motion`, `accident` or `detection`; None for the task that the prediction is for.
+            Motion can be evaluated as motion or as accident.
         protocol: Protocol of the task, by name, or your own; None for `released`, or `boxes` for
             explicit accidents.
-        label: Motion labels to compare motion with; None makes the labels that the protocol needs,
-            on the prediction's cells and half a second apart.
-        layers: For motion `labels`, `trajectories`, `ids`, `grid`; for accidents `image`,
-            `bev`, `boxes`, `trajectories`, `ids`, `grid`; for detections `boxes`, `ids`, `grid`.
-            All except `ids` are the default.
-        fig: An empty figure to render on; a new one if None.
+        label: Motion labels to compare motion with. None makes the labels that the protocol needs,
+            on the prediction's grid and half a second apart.
+        layers: For motion, any of `labels`, `trajectories`, `ids`, `grid`; for accidents, any of
+            `image`, `bev`, `boxes`, `trajectories`, `ids`, `grid`; for detections, any of `boxes`,
+            `ids`, `grid`. By default all except `ids`.
+        fig: Empty figure to render on; a new one if None.
 
     Returns:
-        The figure: truth to the left, prediction to the right, the verdict above; for accidents the
-        camera to the left.
+        The figure: truth on the left, prediction on the right, verdict at the top. For accidents,
+        the camera is on the left. In a paper's column, the left panel is above the right one.
 
     Raises:
         TokenError: No such sample.
-        NotAvailableError: The sample has no label, or its scenario no meta that an accident needs.
-        ChoiceError: No such task, protocol or layer, or the prediction is not of this task.
+        NotAvailableError: The sample has no label, or the task is `accident` and the scenario has
+            no meta.
+        ChoiceError: No such task, protocol or layer, or the prediction is for another task.
         EvaluationError: The protocol cannot evaluate such a prediction.
     """
-    checked, task = judged_as(prediction, task)
-    shown_layers = layers_but_ids(layers, _LAYERS_OF_TASK[task])
+    checked, task = check_judged_prediction(prediction, task)
+    shown_layers = layers_without_ids(layers, _LAYERS_OF_TASK[task])
     verdict = sample_verdict(dataset, sample, checked, task=task, protocol=protocol, label=label)
-    fig = figure_or_new(fig, FIGURE_SIZES[task])
-    width_ratios = _CAMERA_WIDTH_RATIOS if task == "accident" else None
-    left_ax, right_ax = fig.subplots(1, 2, width_ratios=width_ratios)
+    fig = figure_or_new(fig, FIGURE_SIZES[task], column=1.8)
+    has_camera = task == "accident"
+    if current_style().layout == "column":
+        height_ratios = _CAMERA_HEIGHT_RATIOS if has_camera else None
+        left_ax, right_ax = fig.subplots(2, 1, height_ratios=height_ratios)
+    else:
+        width_ratios = _CAMERA_WIDTH_RATIOS if has_camera else None
+        left_ax, right_ax = fig.subplots(1, 2, width_ratios=width_ratios)
     if isinstance(verdict, DetectionVerdict):
         pair_ids = collider_ids(dataset, verdict.sample)
         _draw_detection(verdict, pair_ids, shown_layers, left_ax, right_ax)
@@ -124,16 +141,19 @@ def render_evaluation(
             _draw_pair_edges(verdict.label, collider_ids(dataset, verdict.sample), left_ax)
     else:
         _draw_accident(dataset, verdict, shown_layers, left_ax, right_ax)
-    set_scene_title(fig, dataset, verdict.sample, below=verdict.words, fontsize=11)
-    return settled(fig)
+    set_scene_title(fig, dataset, verdict.sample, below=verdict.words)
+    return lay_out_figure(fig)
 
 
 def _draw_pair_edges(label: MotionLabels, ids: Collection[int], ax: Axes) -> None:
-    """Draw red edges around the present cells of the actors with these label ids."""
+    """Draw red edges around the cells of actors (by label id) in the current frame."""
     maps = maps_of_labels(labels_at_present(label))
-    for actor in ids:
-        key = OWN_BOX_ID if actor == OWN_ACTOR_ID else actor
-        draw_edge(maps, label.id_map.get(key, -1), ax, COLLIDER_COLOR)
+    for label_id in ids:
+        actor = label_id
+        if label_id == OWN_ACTOR_ID:
+            actor = OWN_BOX_ID
+        instance_id = label.id_map.get(actor, -1)
+        draw_edge(maps, instance_id, ax, COLLIDER_COLOR)
 
 
 def _draw_accident(
@@ -143,9 +163,9 @@ def _draw_accident(
     left_ax: Axes,
     right_ax: Axes,
 ) -> None:
-    """Draw the camera that shows the pair best, and from above the road, agents and positions."""
+    """Draw the image that shows the pair best; and, from above, the road, actors and positions."""
     center, half = shown_square(verdict.compared, verdict.truth)
-    view = BevView(agents=None, view_range=half, center=center, beside=True)
+    view = BevView(agents=None, view_range=half, center=center, surroundings_shown=True)
     draw_bev(dataset, verdict.sample, view, layers - {"trajectories"}, right_ax)
     accident_layers = layers & {"trajectories", "grid"}
     handles = draw_accidents(verdict.compared, verdict.truth, accident_layers, right_ax)
@@ -153,14 +173,14 @@ def _draw_accident(
     camera = best_camera(dataset, verdict)
     draw_accidents_in_camera(dataset, verdict, camera, left_ax, image="image" in layers)
     agent, _, channel = camera.rsplit("/", 3)[1:]
-    left_ax.set_title(f"{short_name(agent)}, {camera_name(channel)}", fontsize=SMALLEST_TEXT)
+    left_ax.set_title(f"{short_name(agent)}, {camera_name(channel)}", fontsize=text_size())
 
 
 def best_camera(dataset: Dataset, verdict: AccidentVerdict) -> str:
-    """Return the token of the image, of any agent, that shows the pair of an accident best.
+    """Return the token of the image, of any agent, that shows an accident's pair best.
 
-    The pair is the colliding one, or otherwise the one that the first alarm names. If no camera
-    shows it, the image is that of the front camera of the sample's agent.
+    The pair is the colliding one; without a collision, it is the one that the first alarm names. If
+    no camera shows the pair, the image is from the front camera of the sample's agent.
     """
     boxes = boxes_of(dataset, verdict)
     frame_token = dataset.get("sample", verdict.sample)["frame_token"]
@@ -180,7 +200,8 @@ def _draw_detection(
     left_ax: Axes,
     right_ax: Axes,
 ) -> None:
-    truth, matches = verdict.truth, verdict.matches
+    truth = verdict.truth
+    matches = verdict.matches
     draw_detection_outcome(verdict.detected, truth, verdict.rules, layers=layers, ax=right_ax)
     if "boxes" in layers:
         draw_true(truth, matches, left_ax)

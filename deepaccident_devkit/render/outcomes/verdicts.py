@@ -1,9 +1,7 @@
-"""The verdict of a protocol on a sample's prediction of motion, accidents or detections."""
-
-from __future__ import annotations
+"""The verdict of a protocol on a prediction of motion, accidents or detections for a sample."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -35,13 +33,14 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionLabelConfig, MotionLabels, motion_labels
 from deepaccident_devkit.render.outcomes.above import MotionOutcome, motion_outcome, verdict_words
 from deepaccident_devkit.support.arrays import ShortRepr
+from deepaccident_devkit.support.human_names import human_name
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import cooperative_boxes
 
 Judged: TypeAlias = MotionOutput | list[Accident] | DetectedBoxes
-# Half a second from frame to frame, two seconds ahead.
-_RELEASED_CONFIG: Final = MotionLabelConfig()
+# Configuration of the released labels: half a second from frame to frame, two seconds ahead.
+_RELEASED_CONFIG = MotionLabelConfig()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,10 +48,10 @@ class MotionVerdict(ShortRepr):
     """Predicted instances compared with the labels' instances.
 
     Attributes:
-        sample: Token.
+        sample: Token of the sample.
         label: Ground truth.
-        outcome: Matching instances, frame by frame.
-        words: Numbers of each range.
+        outcome: Which instances match, frame by frame.
+        words: The metrics of each range, in words.
     """
 
     sample: str
@@ -63,13 +62,13 @@ class MotionVerdict(ShortRepr):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AccidentVerdict(ShortRepr):
-    """Foreseen accidents compared with the one to come.
+    """Foreseen accidents compared with the one that follows.
 
     Attributes:
-        sample: Token.
-        compared: Accidents that the protocol compares, in the present ego frame.
-        truth: Actors around; None if unknown.
-        words: Outcome of the sample, by the allowed distance.
+        sample: Token of the sample.
+        compared: Accidents that the protocol compares, in the ego frame at t = 0.
+        truth: Surrounding actors; None if unknown.
+        words: Outcome of the sample at each allowed distance, in words.
     """
 
     sample: str
@@ -83,13 +82,13 @@ class DetectionVerdict(ShortRepr):
     """Detected boxes compared with the true ones.
 
     Attributes:
-        sample: Token.
+        sample: Token of the sample.
         rules: The protocol.
-        detected: Detections in its frame.
-        truth: True boxes in that frame.
-        matches: Matches at the threshold of the protocol's errors or, if it has none, at the middle
-            one.
-        words: Mean average precision of the sample.
+        detected: Detections in the protocol's frame.
+        truth: True boxes in the protocol's frame.
+        matches: Matches at the threshold at which the protocol computes errors or, if it computes
+            none, at the middle one.
+        words: Mean average precision of the sample, in words.
     """
 
     sample: str
@@ -103,14 +102,14 @@ class DetectionVerdict(ShortRepr):
 Verdict: TypeAlias = MotionVerdict | AccidentVerdict | DetectionVerdict
 
 
-def judged_as(prediction: object, task: str | None) -> tuple[Judged, str]:
-    """Return a checked prediction and its task: the one given, or the prediction's own.
+def check_judged_prediction(prediction: object, task: str | None) -> tuple[Judged, str]:
+    """Check a prediction; return it with the task to judge it by: `task`, or if None its own.
 
     Explicit accidents become a list.
 
     Raises:
-        ChoiceError: The prediction is not of the task.
-        EvaluationError: The object is no prediction.
+        ChoiceError: The prediction is for another task.
+        EvaluationError: The object is not a prediction.
     """
     if isinstance(prediction, DetectedBoxes):
         return prediction, _chosen_task(task, ("detection",))
@@ -136,13 +135,13 @@ def sample_verdict(
     label: MotionLabels | None = None,
 ) -> Verdict:
     """Judge a prediction for a sample; arguments and errors are as for `render_evaluation`."""
-    checked, task = judged_as(prediction, task)
+    checked, task = check_judged_prediction(prediction, task)
     token = dataset.get("sample", sample)["token"]
     if isinstance(checked, DetectedBoxes):
         return _detection_verdict(dataset, token, checked, protocol or "released")
     if isinstance(checked, MotionOutput) and task == "motion":
         evaluator = MotionEvaluator(protocol or "released")
-        label = label or _label(dataset, token, checked, evaluator.protocol.labels)
+        label = label or _make_label(dataset, token, checked, evaluator.protocol.labels)
         return _motion_verdict(token, checked, label, evaluator)
     default = "boxes"
     if isinstance(checked, MotionOutput):
@@ -158,7 +157,7 @@ def _motion_verdict(
     ranges = []
     for name, within in evaluator.compute().ranges.items():
         ranges.append(
-            f"{name} m: IoU {within.iou:.1f} %, VPQ {within.pq:.1f} %, "
+            f"{human_name(name, 'qualifiers')}: IoU {within.iou:.1f} %, VPQ {within.pq:.1f} %, "
             f"{within.true_positive} TP, {within.false_positive} FP, {within.false_negative} FN"
         )
     outcome = motion_outcome(output, label)
@@ -173,14 +172,17 @@ def _accident_verdict(
     evaluator: AccidentEvaluator,
 ) -> AccidentVerdict:
     if label is None and hasattr(evaluator.protocol, "labels"):
-        label = _label(dataset, token, prediction, evaluator.protocol.labels)
-    context = accident_context(dataset, token, _horizon(prediction))
+        label = _make_label(dataset, token, prediction, evaluator.protocol.labels)
+    frames = _frame_count(prediction)
+    future_frames = _RELEASED_CONFIG.future_frames if frames is None else frames - 1
+    horizon = future_frames * _RELEASED_CONFIG.step * FRAME_PERIOD
+    context = accident_context(dataset, token, horizon)
     evaluator.update(token, prediction, label, context)
     return AccidentVerdict(
         sample=token,
         compared=compared_accidents(prediction, label, context, evaluator.protocol),
         truth=context.truth,
-        words=f"accident: {verdict_words(evaluator.compute())}",
+        words=f"accident prediction: {verdict_words(evaluator.compute())}",
     )
 
 
@@ -190,8 +192,8 @@ def _detection_verdict(
     rules = detection_protocol(protocol)
     truth = detection_truth(dataset, token, rules)
     world_from_prediction = dataset.world_from(token, prediction.boxes.frame)
-    pose = dataset.world_from(token, rules.frame).inverse() @ world_from_prediction
-    boxes = prediction.boxes.transform(pose, rules.frame)
+    truth_from_world = dataset.world_from(token, rules.frame).inverse()
+    boxes = prediction.boxes.transform(truth_from_world @ world_from_prediction, rules.frame)
     detected = DetectedBoxes(boxes=boxes, scores=prediction.scores)
     evaluator = DetectionEvaluator(rules)
     evaluator.update(token, detected, truth)
@@ -202,12 +204,12 @@ def _detection_verdict(
         detected=detected,
         truth=truth,
         matches=detection_matches(detected, truth, rules),
-        words=f"detection: mean average precision of this sample {precision:.1f} %",
+        words=f"object detection: mAP of this sample {precision:.1f} %",
     )
 
 
-def _frames(prediction: Prediction) -> int | None:
-    """Return how many frames motion has; None for other predictions."""
+def _frame_count(prediction: Prediction) -> int | None:
+    """Return how many frames a motion prediction has; None for other predictions."""
     if not isinstance(prediction, MotionOutput):
         return None
     if prediction.instances is not None:
@@ -215,27 +217,22 @@ def _frames(prediction: Prediction) -> int | None:
     return len((prediction.heads or ())[-1].segmentation)
 
 
-def _horizon(prediction: Prediction) -> float:
-    future_frames, frames = _RELEASED_CONFIG.future_frames, _frames(prediction)
-    if frames is not None:
-        future_frames = frames - 1
-    return future_frames * _RELEASED_CONFIG.step * FRAME_PERIOD
-
-
-def _label(
+def _make_label(
     dataset: Dataset, token: str, prediction: Prediction, protocol: str | None
 ) -> MotionLabels:
+    """Make a sample's motion labels (by token) on the grid and for the frames of a prediction."""
     config = replace(_RELEASED_CONFIG, protocol=protocol or "released")
-    frames = _frames(prediction)
+    frames = _frame_count(prediction)
     if isinstance(prediction, MotionOutput) and frames is not None:
         config = replace(config, grid=prediction.grid, future_frames=frames - 1)
     return motion_labels(dataset, token, config)
 
 
 def boxes_of(dataset: Dataset, verdict: AccidentVerdict) -> Boxes:
-    """Return the present boxes of the pair of an accident, in world.
+    """Return the boxes of an accident's pair in the current frame, in the world frame.
 
-    The pair is the colliding one by meta, or otherwise the one that the first alarm names.
+    The pair is the one that collides according to meta, otherwise the one that the first alarm
+    names.
     """
     record = dataset.get("sample", verdict.sample)
     collision = dataset.get("scenario", record["scenario_token"])["collision"]

@@ -1,6 +1,6 @@
-"""A scenario as one HTML file that plays in a browser without a network.
+"""Replays: one HTML file per scenario, which plays in a browser without a network connection.
 
-Its parts serve other pages too.
+Other pages of the devkit use parts of replays.
 """
 
 from deepaccident_devkit.render.replay.entries import recording_of

@@ -15,9 +15,9 @@ from deepaccident_devkit.support.parallel.batches import (
 from deepaccident_devkit.support.parallel.executors import (
     FEWER_WORKERS,
     cluster_executor,
+    keep_workers,
     own_threads,
     starting_workers,
-    workers_kept,
 )
 from deepaccident_devkit.support.parallel.failures import Failure, Tried, check_failures
 from deepaccident_devkit.support.parallel.store import Store, unfinished_folder
@@ -33,10 +33,10 @@ __all__ = [
     "check_failures",
     "cluster_executor",
     "in_order",
+    "keep_workers",
     "own_threads",
     "run_batch",
     "run_unordered",
     "starting_workers",
     "unfinished_folder",
-    "workers_kept",
 ]

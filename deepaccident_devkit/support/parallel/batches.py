@@ -13,13 +13,13 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeAlias, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypedDict, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, WorkerError
 from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import temporary_path
 from deepaccident_devkit.support.parallel.executors import (
-    fault_of_workers,
+    describe_worker_fault,
     main_module_hidden,
     own_workers,
     signals_deferred,
@@ -32,26 +32,30 @@ if TYPE_CHECKING:
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-# Whether to show a progress bar; or a function that gets each item's share of the work, for a bar
-# of the caller's own.
+# Position of an item, and its result, as soon as it is ready.
+_Results: TypeAlias = Generator[tuple[int, _Result], None, None]
+# Whether to show a progress bar, or a function that is called with each item's share of the work,
+# for a progress bar of the caller's own.
 Progress: TypeAlias = "bool | Callable[[float], object]"
 # Seconds in which a signal that ended a worker ends this process too, if it was sent to all
 # processes of a job.
-_SIGNAL_DELAY_S: Final = 0.1
-# Items under way for each one that the workers do at once; and the same counted from the oldest
-# unfinished item, since results that are needed in order wait for it in memory.
-_ITEMS_PER_WORKER, _MAX_ITEMS_AHEAD = 4, 32
-# Time after which the number of workers of an executor is read again, since workers join and leave.
-_WIDTH_SECONDS: Final = 5.0
+_SIGNAL_DELAY_S = 0.1
+# Number of items that are submitted for each item that the workers can process at once.
+_ITEMS_PER_WORKER = 4
+# Largest number of items from the oldest unfinished to the newest submitted one, for each item that
+# the workers can process at once. Results that are needed in order wait in memory for the oldest.
+_MAX_ITEMS_AHEAD = 32
+# Seconds after which an executor's number of workers is read again, since workers join and leave.
+_WIDTH_SECONDS = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Places:
-    """Files and folders that all workers must see.
+    """Files and folders that all workers must be able to access.
 
     Attributes:
-        reads: Files and folders that they read.
-        writes: Folders that they write into; made if necessary.
+        reads: Files and folders that the workers read.
+        writes: Folders that the workers write into. They are created if they do not exist.
     """
 
     reads: tuple[Path, ...] = ()
@@ -61,13 +65,14 @@ class Places:
 class Engine(TypedDict, total=False):
     """How bulk work runs: arguments of every function that works on many scenarios or samples.
 
-    All of these functions raise ChoiceError if `workers` is less than 1, and WorkerError if a
-    worker was killed or cannot do the work.
+    All these functions raise ChoiceError if `workers` is less than 1, and WorkerError if a worker
+    was killed or cannot do the work.
 
     Attributes:
-        workers: Number of processes; 1 for this one only, None for as many as the work is worth.
-        executor: Any executor of `concurrent.futures` to run on, instead of own workers.
-        progress: Whether to show a bar; or a function, see `run_unordered`.
+        workers: Number of processes; 1 for this process only, None for as many as speed up the
+            work.
+        executor: Any `concurrent.futures.Executor` to use instead of own workers.
+        progress: Whether to show a progress bar, or a function, as described in `run_unordered`.
     """
 
     workers: int | None
@@ -90,20 +95,20 @@ def run_batch(
     Args:
         work: Importable function of the devkit (workers import it by name).
         items: Arguments of the function, one call for each.
-        workers: Processes to use; 1 runs in this one; None takes as many as this process may use
-            cores, or only this process if the work is too little for a pool or the caller is a
-            worker itself.
-        executor: Any `concurrent.futures.Executor` to run on instead (a dask client's, MPI's, a
-            thread pool).
+        workers: Number of worker processes. With 1, this process does the work. With None, there is
+            one worker for each core that this process can use, unless the work is too little for a
+            pool or the caller is a worker itself: then this process does the work.
+        executor: Any `concurrent.futures.Executor` to use instead of own workers (a dask client's,
+            MPI's, a thread pool).
         label: Text of the progress bar.
-        progress: Whether to show one; or a function, see `run_unordered`.
-        places: Files and folders that the workers of an executor must see; checked before their
-            first item.
+        progress: Whether to show a progress bar, or a function, as described in `run_unordered`.
+        places: Files and folders that the workers of an executor must be able to access. Each
+            worker checks them before its first item.
 
     Raises:
-        ChoiceError: `workers` is less than 1.
-        WorkerError: A worker was killed; or a worker of an executor does not see the places, or has
-            no devkit or another version of it.
+        ChoiceError: If `workers` is less than 1.
+        WorkerError: If a worker was killed, or if a worker of an executor cannot access the places
+            or does not have this version of the devkit.
     """
     results = dict(
         run_unordered(
@@ -129,29 +134,30 @@ def run_unordered(
     progress: Progress = False,
     sizes: Sequence[int] | None = None,
     places: Places | None = None,
-) -> Generator[tuple[int, _Result], None, None]:
+) -> _Results[_Result]:
     """Apply `work` to every item; yield each one's position and result as soon as it is ready.
 
     Closing the generator cancels items that have not begun, and ends its own workers, as an
-    interruption does. Arguments and errors are the same as of `run_batch`; `progress` may be a
-    function that gets each item's share of the work, and `sizes` is how far each item moves the
-    progress bar; None for one step each.
+    interruption does. Arguments and errors are as in `run_batch`. In addition, `progress` may be
+    a function that gets each item's share of the work, and `sizes` are the steps by which each item
+    moves the progress bar; None for one step each.
     """
     # Imported here: with asyncio and multiprocessing, it takes a third of the package's import
     # time.
     from tqdm.auto import tqdm
 
-    count, steps = _worker_count(workers, len(items)), sizes or [1] * len(items)
+    count = _choose_worker_count(workers, len(items))
+    steps = sizes or [1] * len(items)
     with (
         tqdm(total=sum(steps), desc=label, disable=progress is not True, unit="") as bar,
         ExitStack() as stack,
     ):
         if executor is not None:
             paths = stack.enter_context(visible_paths(places or Places()))
-            results = _run_on(executor, [Call(work, item, paths) for item in items], cancel=True)
+            results = _run_calls(executor, [Call(work, item, paths) for item in items], cancel=True)
         elif count > 1:
             pool = stack.enter_context(own_workers(count))
-            results = _run_on(pool, [Call(work, item, ()) for item in items], cancel=False)
+            results = _run_calls(pool, [Call(work, item, ()) for item in items], cancel=False)
         else:
             results = ((position, work(item)) for position, item in enumerate(items))
         for position, result in stack.enter_context(closing(results)):
@@ -161,7 +167,7 @@ def run_unordered(
             yield position, result
 
 
-def in_order(results: Generator[tuple[int, _Result], None, None]) -> Generator[_Result, None, None]:
+def in_order(results: _Results[_Result]) -> Generator[_Result, None, None]:
     """Yield the results of `run_unordered` in order, each as soon as all before it are ready."""
     waiting: dict[int, _Result] = {}
     next_position = 0
@@ -173,7 +179,7 @@ def in_order(results: Generator[tuple[int, _Result], None, None]) -> Generator[_
                 next_position += 1
 
 
-def _worker_count(workers: int | None, items: int) -> int:
+def _choose_worker_count(workers: int | None, items: int) -> int:
     import multiprocessing
 
     if workers is not None and workers < 1:
@@ -186,43 +192,47 @@ def _worker_count(workers: int | None, items: int) -> int:
     return max(1, min(usable_cores(), items // items_per_worker))
 
 
-def _run_on(
+def _run_calls(
     executor: Executor, calls: Sequence[Call[_Item, _Result]], *, cancel: bool
-) -> Generator[tuple[int, _Result], None, None]:
+) -> _Results[_Result]:
     """Yield positions and results of calls; as many are under way as keep the workers busy."""
     from queue import SimpleQueue
 
-    done: SimpleQueue[Future[_Result]] = SimpleQueue()
+    finished: SimpleQueue[Future[_Result]] = SimpleQueue()
     running: dict[Future[_Result], int] = {}
-    next_position, width, width_time = 0, 1, float("-inf")
+    next_position = 0
+    width = 1
+    width_time = float("-inf")
     try:
         while running or next_position < len(calls):
             if time.monotonic() - width_time >= _WIDTH_SECONDS:
-                width, width_time = width_of(executor), time.monotonic()
+                width = width_of(executor)
+                width_time = time.monotonic()
             oldest = next(iter(running.values()), next_position)
-            end = min(
+            stop = min(
                 len(calls),
                 next_position + _ITEMS_PER_WORKER * width - len(running),
                 oldest + _MAX_ITEMS_AHEAD * width,
             )
-            if next_position < end:
+            if next_position < stop:
                 with main_module_hidden(), signals_deferred():
-                    for position in range(next_position, end):
+                    for position in range(next_position, stop):
                         future = executor.submit(calls[position])
                         running[future] = position
-                        future.add_done_callback(done.put)
-                next_position = end
-            future = done.get()
+                        future.add_done_callback(finished.put)
+                next_position = stop
+            future = finished.get()
             yield running.pop(future), future.result()
     except Exception as error:
-        fault = fault_of_workers(error)
+        fault = describe_worker_fault(error)
         if fault is None:
             raise
         time.sleep(_SIGNAL_DELAY_S)
         raise WorkerError(fault) from error
     finally:
-        for future in running if cancel else ():
-            future.cancel()
+        if cancel:
+            for future in running:
+                future.cancel()
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +241,7 @@ class Call(Generic[_Item, _Result]):
 
     Attributes:
         work: Function that workers can import.
-        item: Its argument.
+        item: Argument of the function.
         paths: Paths that must exist.
     """
 
@@ -247,16 +257,17 @@ class Call(Generic[_Item, _Result]):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the call so that work and item are only unpickled when it is called.
 
-        So a scheduler on the way needs no devkit, and a worker without one, or that cannot open the
-        dataset of the item, reports it as the task's error; dask's workers end if a message cannot
-        be unpickled.
+        A scheduler on the way then needs no devkit. A worker that has none, or that cannot open the
+        item's dataset, reports this as the task's error; dask's workers would end if a message
+        could not be unpickled.
         """
         # Imported here, as it takes ten milliseconds.
         from multiprocessing.reduction import ForkingPickler
 
         content = bytes(ForkingPickler.dumps((self.work, self.item)))
         result = _ResultWhenRead(content, self.paths)
-        return partial, (ForkingPickler.loads, bytes(ForkingPickler.dumps(result)))
+        pickled_result = bytes(ForkingPickler.dumps(result))
+        return partial, (ForkingPickler.loads, pickled_result)
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,6 +282,7 @@ class _ResultWhenRead:
 
 
 def _check_and_run(version: str, paths: tuple[str, ...], content: bytes) -> Any:
+    """Check this process and apply the pickled work to the pickled item."""
     from multiprocessing.reduction import ForkingPickler
 
     _check_worker(version, paths)
@@ -282,18 +294,18 @@ def _check_and_run(version: str, paths: tuple[str, ...], content: bytes) -> Any:
 def visible_paths(places: Places) -> Iterator[tuple[str, ...]]:
     """Yield the paths that workers must see.
 
-    In folders that they write into, there is a file with a new name during the block: a folder of
-    the same name on a worker's own disk has no such file.
+    During the block, the folders that they write into have a file with a new name, which a folder
+    of the same name on a worker's own disk lacks.
     """
     with ExitStack() as stack:
-        marks = []
+        mark_files = []
         for folder in places.writes:
             folder.mkdir(parents=True, exist_ok=True)
-            mark = temporary_path(folder / "seen")
-            mark.touch()
-            stack.callback(mark.unlink, missing_ok=True)
-            marks.append(mark)
-        yield tuple(map(str, (*places.reads, *marks)))
+            mark_file = temporary_path(folder / "seen")
+            mark_file.touch()
+            stack.callback(mark_file.unlink, missing_ok=True)
+            mark_files.append(mark_file)
+        yield tuple(map(str, (*places.reads, *mark_files)))
 
 
 @lru_cache(maxsize=64)
@@ -305,8 +317,8 @@ def _check_worker(version: str, paths: tuple[str, ...]) -> None:
     worker = f"a worker on {platform.node()}"
     if version != __version__:
         raise WorkerError(
-            f"{worker} has deepaccident_devkit {__version__}, and this is {version}; install the "
-            "same version on all"
+            f"{worker} has deepaccident_devkit {__version__}, but this machine has {version}; "
+            "install the same version on all machines"
         )
     for path in map(Path, paths):
         if not path.exists():

@@ -20,14 +20,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from deepaccident_devkit.errors import (
-    MOST_TOLD,
+    MAX_REASON_LENGTH,
     DeepAccidentError,
     MissingExtraError,
     WorkerError,
     shortened,
 )
 from deepaccident_devkit.support.cores import usable_cores
-from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.reading import read_bytes, reason_text
 from deepaccident_devkit.support.version import __version__
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 # Number of simultaneous tasks of an executor that does not have it as an attribute.
-_DEFAULT_WIDTH: Final = 64
+_DEFAULT_WIDTH = 64
 MPI: Final = "mpi"
 # Seconds in which an empty file of a scheduler may still get its address.
 ADDRESS_WAIT: Final = 10.0
@@ -46,8 +46,8 @@ FEWER_WORKERS: Final = (
     "if memory or shared memory (/dev/shm) ran out, use fewer workers, or none (for training: "
     "without --workers)"
 )
-_PACKAGE: Final = __name__.partition(".")[0]
-# Within `workers_kept`: number of processes → a pool of them that waits for work.
+_PACKAGE = __name__.partition(".")[0]
+# Within `keep_workers`: number of processes → a pool of them that waits for work.
 _idle_pools: ContextVar[dict[int, ProcessPoolExecutor] | None] = ContextVar("kept", default=None)
 
 
@@ -64,8 +64,8 @@ def width_of(executor: Executor) -> int:
     return _DEFAULT_WIDTH
 
 
-def fault_of_workers(error: Exception) -> str | None:
-    """Return what an error reveals about the workers; None if it is about the work."""
+def describe_worker_fault(error: Exception) -> str | None:
+    """Describe the fault of workers that an error reveals; None if the work itself has failed."""
     distributed = sys.modules.get("distributed")
     if distributed is not None and isinstance(error, distributed.KilledWorker):
         return (
@@ -74,13 +74,13 @@ def fault_of_workers(error: Exception) -> str | None:
         )
     if isinstance(error, BrokenExecutor):
         return (
-            f"a worker process was killed ({error}), perhaps because memory ran out; run it again "
+            f"a worker process was killed ({error}), perhaps because memory ran out; try again "
             "with fewer workers"
         )
     if isinstance(error, CancelledError):
         return (
-            "the scheduler has ended, or cancelled a task; start it again, then run the same: it "
-            "does what is left"
+            "the scheduler has ended, or cancelled a task; start the scheduler again, then run "
+            "the same command: it does the rest"
         )
     is_import_fault = isinstance(error, ImportError) or str(error).startswith("Can't get attribute")
     if is_import_fault and _PACKAGE in str(error) and not isinstance(error, DeepAccidentError):
@@ -94,7 +94,7 @@ def cluster_executor(
 ) -> Iterator[Executor | None]:
     """Yield an executor on the workers of a cluster; None without a scheduler.
 
-    All data to and from a scheduler is pickled: use one that you trust.
+    All data to and from a scheduler is pickled: use only one that you trust.
 
     Args:
         address: Address of a dask scheduler, such as `tcp://10.0.0.5:8786`; or `mpi` for the other
@@ -102,8 +102,8 @@ def cluster_executor(
         scheduler_file: File that a dask scheduler writes its address into, instead of `address`.
 
     Raises:
-        MissingExtraError: `distributed` or mpi4py is not installed.
-        WorkerError: No scheduler answers, or this is no MPI program of several ranks.
+        MissingExtraError: If `distributed` or mpi4py is not installed.
+        WorkerError: If no scheduler answers, or this is not an MPI program of several ranks.
     """
     if address is None and scheduler_file is None:
         yield None
@@ -122,13 +122,13 @@ def _mpi_executor() -> Iterator[Executor]:
         from mpi4py.futures import MPIPoolExecutor
     except (ImportError, OSError, RuntimeError) as error:  # RuntimeError: this machine has no MPI
         raise MissingExtraError(
-            f"mpi4py cannot be imported ({error}); install an MPI, and: pip install mpi4py"
+            f"mpi4py cannot be imported ({error}); install an MPI library, then: pip install mpi4py"
         ) from error
     # If a rank other than the first ran this, all ranks would do the same work.
     if mpi.COMM_WORLD.size < 2 or mpi.COMM_WORLD.rank:
         raise WorkerError(
-            "this is no MPI program whose other ranks wait for work; start it with: mpiexec -n 8 "
-            f"python -m mpi4py.futures -m {_PACKAGE}.cli …"
+            "no other MPI ranks wait for work; start the command with: mpiexec -n 8 python -m "
+            f"mpi4py.futures -m {_PACKAGE}.cli …"
         )
     with MPIPoolExecutor() as executor:
         yield executor
@@ -140,7 +140,7 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
         from distributed import Client
     except ImportError as error:
         raise MissingExtraError(
-            "dask is not installed; in a checkout: pip install '.[distributed]'"
+            "dask is not installed; run pip install '.[distributed]' in a checkout"
         ) from error
     source = str(scheduler_file or address)
     try:
@@ -148,7 +148,7 @@ def _dask_client(address: str | None, scheduler_file: Path | None) -> Iterator[C
             address = _read_address(scheduler_file)
         client = _connect_client(Client, address=address, set_as_default=False)
     except Exception as error:  # for an odd address, dask raises many kinds
-        fault = shortened(fault_text(error), MOST_TOLD)
+        fault = shortened(reason_text(error), MAX_REASON_LENGTH)
         raise WorkerError(
             f"{source}: no dask scheduler answers ({fault}); start one with `dask scheduler`, and "
             "give its address"
@@ -175,14 +175,15 @@ def _connect_client(kind: Any, **options: Any) -> Client:
 
 
 def _read_address(file: Path) -> str:
-    """Return the address that a dask scheduler wrote into a file; wait for one that has just begun.
+    """Read the address that a dask scheduler writes into a file when it begins.
 
-    Raises OSError or ValueError. Dask itself would wait for it for ever, and read anything.
+    Dask itself would wait for the file for ever, and read anything. Raises OSError or ValueError.
     """
     # Imported here, as it takes some milliseconds.
     from deepaccident_devkit.support.json_text import as_record, parsed_json
 
-    deadline, content = time.monotonic() + ADDRESS_WAIT, b""
+    deadline = time.monotonic() + ADDRESS_WAIT
+    content = b""
     while not content:
         with suppress(FileNotFoundError):
             content = read_bytes(file, "spec")
@@ -193,10 +194,10 @@ def _read_address(file: Path) -> str:
 
 
 @contextmanager
-def workers_kept() -> Iterator[None]:
-    """Keep own workers that begin in the block for later work in it.
+def keep_workers() -> Iterator[None]:
+    """Keep own workers that begin in the block for later work in the same block.
 
-    To begin takes each of them most of a second. They end with the outermost such block.
+    Starting a worker takes most of a second. They end with the outermost such block.
     """
     pools: dict[int, ProcessPoolExecutor] = {}
     token = _idle_pools.set(pools) if _idle_pools.get() is None else None
@@ -224,10 +225,10 @@ def starting_workers() -> Iterator[None]:
 def own_workers(count: int) -> Iterator[Executor]:
     """Yield a pool of spawned processes.
 
-    After an error of an item, the other workers finish their items; anything else ends them at
-    once. The pool itself cancels items that have not begun: if other code did and a process was
-    killed, a thread of the pool would fail. If one is killed while another begins, the pool would
-    wait for that one for ever.
+    After an error in an item, the other workers finish their items; anything else ends them at
+    once. The pool itself cancels items that have not begun: if other code cancelled them and a
+    process was killed, a thread of the pool would fail. If a process is killed while another one
+    begins, the pool would wait for that one for ever.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
@@ -253,9 +254,9 @@ def own_workers(count: int) -> Iterator[Executor]:
 
 
 def own_threads() -> ThreadPoolExecutor:
-    """Return threads of this process, one for each usable core, for a `with` block.
+    """Return a pool of threads for a `with` block, one thread for each usable core.
 
-    They suit work in libraries that let other threads run.
+    It suits work in libraries that let other threads run.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -263,7 +264,7 @@ def own_threads() -> ThreadPoolExecutor:
 
 
 def _begin_worker() -> None:
-    """Leave Ctrl-C, which terminals also send to workers, to the parent, and end with it."""
+    """Prepare a worker: it ignores Ctrl-C, which its parent handles, and ends with its parent."""
     from tqdm import tqdm
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -273,7 +274,7 @@ def _begin_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """End with the parent; otherwise a worker would wait for ever after its parent was killed."""
+    """End this worker with its parent; otherwise it would wait forever if the parent was killed."""
     import multiprocessing
 
     parent = multiprocessing.parent_process()
@@ -294,7 +295,7 @@ def signals_deferred() -> Iterator[None]:
         return
     received: list[int] = []
     handlers = {
-        number: signal.signal(number, lambda arrived, _frame: received.append(arrived))
+        number: signal.signal(number, lambda received_number, _: received.append(received_number))
         for number in (signal.SIGINT, signal.SIGTERM)
         # The handler of a program that embeds Python is None, and cannot be restored.
         if signal.getsignal(number) is not None
@@ -306,23 +307,25 @@ def signals_deferred() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        for arrived in received:
-            handler = handlers[signal.Signals(arrived)]
-            handler(arrived, None) if callable(handler) else signal.raise_signal(arrived)
+        for received_number in received:
+            handler = handlers[signal.Signals(received_number)]
+            if callable(handler):
+                handler(received_number, None)
+            else:
+                signal.raise_signal(received_number)
 
 
 @contextmanager
 def main_module_hidden() -> Iterator[None]:
     """Keep new processes from importing the user's script again.
 
-    A spawned process runs the parent's main script unless that has no file. Our work is always
-    importable from the package, and a user's three-line script has no `if __name__ == "__main__"`
-    guard.
+    A spawned process runs the parent's main script again if the script has a file. This is not
+    needed, since our work can always be imported from the package, and it does harm if the user's
+    script has no `if __name__ == "__main__"` guard.
     """
     main = sys.modules["__main__"]
-    attributes = {
-        name: getattr(main, name) for name in ("__file__", "__spec__") if hasattr(main, name)
-    }
+    names = [name for name in ("__file__", "__spec__") if hasattr(main, name)]
+    attributes = {name: getattr(main, name) for name in names}
     try:
         for name in attributes:
             setattr(main, name, None)

@@ -1,7 +1,5 @@
 """Failing items of bulk work: the others are finished, and failures are listed at the end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -20,10 +18,10 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A failure, which stands for the result of an item.
+    """A failure, which takes the place of an item's result.
 
     Attributes:
-        message: Message of its error.
+        message: Message of the error.
     """
 
     message: str
@@ -33,16 +31,16 @@ class Failure:
 class Tried(Generic[_Item, _Result]):
     """Work that returns a Failure for an item with a fault of its own.
 
-    A full disk or a lost worker still ends it all.
+    A full disk or a lost worker still ends all work.
 
     Attributes:
-        work: Function of an item.
+        work: Function that is applied to each item.
     """
 
     work: Callable[[_Item], _Result]
 
     def __call__(self, item: _Item) -> _Result | Failure:
-        """Do the work."""
+        """Do the work on an item."""
         try:
             return self.work(item)
         except ReleaseError as error:  # a missing file is an OSError too
@@ -54,8 +52,9 @@ class Tried(Generic[_Item, _Result]):
 
 
 def check_failures(results: Iterable[tuple[str, object]], where: str) -> None:
-    """Raise SomeFailedError if there is a Failure among named results; the message lists all."""
-    count, failures = 0, []
+    """Raise SomeFailedError, which lists all failures, if a named result is a Failure."""
+    count = 0
+    failures = []
     for name, result in results:
         count += 1
         if isinstance(result, Failure):
@@ -63,6 +62,6 @@ def check_failures(results: Iterable[tuple[str, object]], where: str) -> None:
     if failures:
         lines = [f"{where}: {len(failures)} of {count} failed:", *failures]
         lines.append(
-            "The others are done; mend these, and run the same again: it does what is left."
+            "The others are done. Fix these and run the same command again; it does only the rest."
         )
         raise SomeFailedError("\n".join(lines))

@@ -40,12 +40,12 @@ from deepaccident_devkit.support.text import warn_once
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 # Number of bytes of the seal after a result.
-_SEAL_LENGTH: Final = 16
-_LOCKS: Final = (".lock", ".making")
+_SEAL_LENGTH = 16
+_LOCKS = (".lock", ".making")
 # How long a file system may take to answer whether a lock is free.
-_ANSWER_SECONDS: Final = 30.0
+_ANSWER_SECONDS = 30.0
 # How long another process may hold a lock: for a scenario, or for all work of another command.
-_WAIT_HOURS: Final = 24
+_WAIT_HOURS = 24
 # Devices of the file systems without locks, as far as this process knows.
 _without_locks: Final = set[int]()
 
@@ -73,43 +73,48 @@ class Store:
         """Return the path of an item's result; raise OutputFolderError for links."""
         return place_in(self.folder, f"kept/{name}", opened=True)
 
-    def kept(self, name: str, key: str, kind: FileKind = "bundle") -> bytes | None:
-        """Return a result; None if it is missing, damaged, or made from other inputs.
+    def read_result(self, name: str, key: str, kind: FileKind = "bundle") -> bytes | None:
+        """Return a stored result; None if it is missing, damaged, or made from other inputs.
 
         Args:
-            name: Name of the item; a path below the folder.
+            name: Name of the item, a path below the folder.
             key: Digest of all that decides the result, such as files and settings.
             kind: Kind of the file, which limits its size.
 
         Raises:
-            OutputFolderError: A link leads there.
+            OutputFolderError: If a link leads there.
         """
         try:
             content = read_bytes(self.path(name), kind)
         except OSError:
             return None
-        result, seal = content[:-_SEAL_LENGTH], content[-_SEAL_LENGTH:]
-        if seal == _seal(key, result):
+        result = content[:-_SEAL_LENGTH]
+        seal = content[-_SEAL_LENGTH:]
+        if seal == _make_seal(key, result):
             return result
         return None
 
-    def keep(self, name: str, key: str, content: bytes) -> None:
-        """Store a result over an earlier one of this name; raise OSError or OutputFolderError."""
-        write_own(self.path(name), content + _seal(key, content))
+    def write_result(self, name: str, key: str, content: bytes) -> None:
+        """Store a result, replacing an earlier one; raise OSError or OutputFolderError."""
+        sealed_content = content + _make_seal(key, content)
+        write_own(self.path(name), sealed_content)
 
     def drop(self, name: str) -> None:
         """Remove a result, if it exists; raise OSError or OutputFolderError."""
         remove_in(self.folder, f"kept/{name}")
 
     def remove(self, *, keep: bool = False) -> None:
-        """Remove the folder, or all except results, once the product is complete.
+        """Remove the folder once the product is complete; with `keep`, all except the results.
 
         Processes that wait for its locks notice that.
 
         Raises:
-            OSError, OutputFolderError: Something cannot be removed, or there is a link on the way.
+            OSError, OutputFolderError: If something cannot be removed, or a link is on the way.
         """
-        for name in ("locks", *_LOCKS, *(() if keep else ("kept",))):
+        names = ["locks", *_LOCKS]
+        if not keep:
+            names.append("kept")
+        for name in names:
             remove_in(self.folder, name)
         with suppress(OSError):  # something else is there, or another process has begun again
             self.folder.rmdir()
@@ -124,14 +129,14 @@ class Store:
         """Take part in the work on the items, together with other processes, during the block.
 
         Args:
-            begin: Function called before that, if nobody else takes part.
-            tidy: Function that removes leftovers of killed processes; called before `begin`, and
-                after an error, if nobody else makes items.
+            begin: Function that is called first if no other process takes part.
+            tidy: Function that removes leftovers of killed processes; it is called before `begin`,
+                and after an error, if no other process makes items.
 
         Raises:
-            OutputFolderError: The folder or its lock is a link.
-            DeepAccidentError: The error `error`, for any OSError: the folder cannot be made or
-                written to, the disk is full; or another process holds the lock too long.
+            OutputFolderError: If the folder or its lock is a link.
+            DeepAccidentError: `error`, if the folder cannot be made or written to, if the disk is
+                full (or for any other OSError), or if another process holds the lock too long.
         """
         turn = _Turn(self)
         try:
@@ -143,7 +148,7 @@ class Store:
                     tidy()
             if isinstance(error, DeepAccidentError) or not isinstance(error, OSError):
                 raise
-            remedy = "make room there, or choose another folder, and run it again"
+            remedy = "free space there, or choose another folder, and run the command again"
             raise self.error(f"{self.out}: cannot be written ({error}); {remedy}") from error
         finally:
             try:
@@ -156,10 +161,10 @@ class Store:
     ) -> dict[str, _Result]:
         """Apply `work` to every item that no other process is making, and then to the others.
 
-        The others are done once they have been released.
+        The others are done once the processes that made them have released them.
 
         Args:
-            work: Importable function, or an object that can be pickled. It only gets the item, and
+            work: Importable function, or an object that can be pickled. It gets only the item, and
                 first checks whether its result exists.
             items: Name → item; names are paths.
             **engine: Arguments of `run_batch`: `workers`, `executor`, `label`, `progress`,
@@ -169,9 +174,9 @@ class Store:
             Name → result, in the order of the items.
 
         Raises:
-            SomeFailedError: Some items failed, as in `Tried`; the others are done.
-            OSError: An item cannot be locked, or its result cannot be written.
-            ChoiceError, WorkerError: See `run_batch`.
+            SomeFailedError: If some items failed, as in `Tried`; the others are done.
+            OSError: If an item cannot be locked, or its result cannot be written.
+            ChoiceError, WorkerError: As in `run_batch`.
         """
         results: dict[str, _Result | Failure | _InProgress] = {}
         remaining = list(items.items())
@@ -181,8 +186,8 @@ class Store:
             if wait:
                 self.say_waiting()
             locked_work = _LockedWork(self, work, wait=wait)
-            done = run_batch(Tried(locked_work), remaining, **engine)
-            for (name, _), result in zip(remaining, done, strict=True):
+            new_results = run_batch(Tried(locked_work), remaining, **engine)
+            for (name, _), result in zip(remaining, new_results, strict=True):
                 results[name] = result
             remaining = [item for item in remaining if isinstance(results[item[0]], _InProgress)]
         check_failures(results.items(), str(self.out))
@@ -195,20 +200,20 @@ class Store:
     def take(self, file: int, kind: int, *, wait: bool = False) -> bool:
         """Take the lock of an open file; return False if another process holds it.
 
-        If `wait`, it waits for the other process. Raises DeepAccidentError, of the kind `error`, if
-        another process holds it too long.
+        With `wait`, it waits for the other process. Raises `error` if the other process holds the
+        lock too long.
         """
         import fcntl
 
         device = os.fstat(file).st_dev
         if device in _without_locks:
             return True
-        fault = _fault_of_lock(file, kind | fcntl.LOCK_NB, _ANSWER_SECONDS)
+        fault = _request_lock(file, kind | fcntl.LOCK_NB, _ANSWER_SECONDS)
         if wait and isinstance(fault, BlockingIOError):
             self.say_waiting()
-            fault = _fault_of_lock(file, kind, _WAIT_HOURS * 3600)
+            fault = _request_lock(file, kind, _WAIT_HOURS * 3600)
             if isinstance(fault, TimeoutError):
-                remedy = f"end it, or if there is none any more, remove {self.folder}"
+                remedy = f"end that process, or, if no such process runs, remove {self.folder}"
                 raise self.error(
                     f"{self.out}: another process has held a lock for {_WAIT_HOURS} hours; {remedy}"
                 )
@@ -216,15 +221,15 @@ class Store:
             return fault is None
         _without_locks.add(device)
         warn_once(
-            f"{self.out}: its file system has no locks that work ({fault}), so this goes on as if "
-            "no other process wrote there; do not run a command twice at once on this folder"
+            f"{self.out}: file locks do not work on this file system ({fault}), so other processes "
+            "that write there go unnoticed; do not run two commands on this folder at once"
         )
         return True
 
     def say_waiting(self) -> None:
-        """Log once that this process waits for another one, and for how long at most."""
+        """Log once that this process waits for another one, and the longest time that it waits."""
         warn_once(
-            f"{self.out}: another process {self.task} there; waiting for it, for at most "
+            f"{self.out}: another process {self.task} there; waiting for it for at most "
             f"{_WAIT_HOURS} hours"
         )
 
@@ -234,18 +239,21 @@ class Store:
 
 
 class _Turn:
-    """One process's part in the work on a store: first shared, at the end exclusive."""
+    """The part of one process in the work on a store: first shared, at the end exclusive."""
 
     def __init__(self, store: Store) -> None:
         """Start without locks."""
         self._store = store
-        self._lock = self._making = -1
+        # Descriptors of the two lock files; −1 if they are not open.
+        self._lock = -1
+        self._making = -1
 
     def join(self, begin: Callable[[], object]) -> None:
         """Take part together with other processes of the same command; see `Store.shared`."""
         import fcntl
 
-        command, has_other_command = self._store.command.encode(), False
+        command = self._store.command.encode()
+        has_other_command = False
         while True:
             self.end()
             self._lock, self._making = (
@@ -270,8 +278,8 @@ class _Turn:
     def alone(self, *, wait: bool = True) -> bool:
         """Wait until no other process makes items; return whether this process has the store.
 
-        False if one of the others has finished meanwhile and removed the store. Without `wait` it
-        is also False if others make items.
+        The result is False if another process has meanwhile finished and removed the store; without
+        `wait`, also if other processes make items.
         """
         import fcntl
 
@@ -282,7 +290,7 @@ class _Turn:
         return self._store.take(self._making, fcntl.LOCK_EX, wait=wait) and self._is_current()
 
     def remove_if_unused(self) -> None:
-        """Remove the store if it has no results and nobody makes items.
+        """Remove the store if it has no results and no process makes items.
 
         A worker may still make items after its caller was stopped.
         """
@@ -293,31 +301,34 @@ class _Turn:
             locks = folder / "locks"
             lock_attempt = _LockedWork(self._store, str, wait=False)
             names = [str(path.relative_to(locks)) for path in locks.glob("**/*") if path.is_file()]
-            if not any(isinstance(lock_attempt((name, "")), _InProgress) for name in names):
-                self._store.remove()
+            for name in names:
+                if isinstance(lock_attempt((name, "")), _InProgress):
+                    return
+            self._store.remove()
 
     def end(self) -> None:
         """Release the locks that are held."""
         for file in (self._making, self._lock):
             if file >= 0:
                 os.close(file)
-        self._lock = self._making = -1
+        self._lock = -1
+        self._making = -1
 
     def _is_current(self) -> bool:
-        """Return whether the open locks are the ones that others find by their names."""
-        opened = zip(_LOCKS, (self._lock, self._making), strict=True)
+        """Return whether the open locks are the ones that other processes find by their names."""
         try:
-            return all(
-                os.path.samestat((self._store.folder / name).lstat(), os.fstat(file))
-                for name, file in opened
-            )
+            for name, file in zip(_LOCKS, (self._lock, self._making), strict=True):
+                named_status = (self._store.folder / name).lstat()
+                if not os.path.samestat(named_status, os.fstat(file)):
+                    return False
         except OSError:
             return False
+        return True
 
 
 @dataclass(frozen=True, slots=True)
 class _InProgress:
-    """A mark instead of a result: another process is making the item."""
+    """A mark that takes the place of a result: another process is making the item."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,24 +359,24 @@ def unfinished_folder(out: Path) -> Path:
 
 
 def _open_lock(lock: Path) -> int:
-    """Open the file of a lock, which is made if necessary, with its folder."""
+    """Open a lock file and return its descriptor; file and folder are made if necessary."""
     while True:
         lock.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):  # another process has just removed the folder
             return os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
-def _fault_of_lock(file: int, kind: int, seconds: float) -> OSError | None:
-    """Request the lock of an open file; return None if it is taken, otherwise the error.
+def _request_lock(file: int, kind: int, seconds: float) -> OSError | None:
+    """Request the lock of an open file; return None if it was taken, otherwise the error.
 
-    It is TimeoutError if there is no answer within some seconds. The call is made in a thread of
-    its own, since a file server that has gone may never answer it.
+    The error is a TimeoutError if there is no answer within `seconds`. The call is made in a thread
+    of its own, since a file server that has gone may never answer.
     """
     import fcntl
 
     fault: OSError | None = TimeoutError(f"no answer within {seconds:g} s")
 
-    def ask() -> None:
+    def lock_file() -> None:
         nonlocal fault
         try:
             fcntl.flock(file, kind)
@@ -373,12 +384,14 @@ def _fault_of_lock(file: int, kind: int, seconds: float) -> OSError | None:
         except OSError as error:
             fault = error
 
-    thread = threading.Thread(target=ask, daemon=True)
+    thread = threading.Thread(target=lock_file, daemon=True)
     thread.start()
     thread.join(seconds)
     return fault
 
 
-def _seal(key: str, content: bytes) -> bytes:
+def _make_seal(key: str, content: bytes) -> bytes:
+    """Return a keyed digest of a result's bytes."""
     key_digest = hashlib.blake2b(key.encode()).digest()
-    return hashlib.blake2b(content, digest_size=_SEAL_LENGTH, key=key_digest).digest()
+    seal = hashlib.blake2b(content, digest_size=_SEAL_LENGTH, key=key_digest)
+    return seal.digest()

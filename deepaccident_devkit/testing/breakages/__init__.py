@@ -1,4 +1,4 @@
-"""`BREAKAGES`: every named way to break a release, and the devkit's findings for each."""
+"""`BREAKAGES`: the named ways to break a release, and the devkit's findings for each."""
 
 from collections.abc import Mapping
 from hashlib import sha256
@@ -39,28 +39,25 @@ BREAKAGES: Mapping[str, Breakage] = {
 
 
 def break_release(root: Path, name: str) -> BrokenRelease:
-    """Break the first labelled scenario of a release, in place; hard links are safe.
+    """Break the first labelled scenario of a release in place; hard-linked copies stay intact.
 
-    The release should be made by this kit, or be a copy.
+    The release should be made by this test kit, or be a copy.
 
     Args:
         root: Folder of the release.
         name: One of `BREAKAGES`.
 
     Raises:
-        ChoiceError: The breakage is unknown.
-        ConfigError: The release has no labelled scenario, or it lacks a part that this breaks.
+        ChoiceError: If `name` is not in `BREAKAGES`.
+        ConfigError: If the release has no labelled scenario, or lacks a part that is to be broken.
     """
     breakage = checked_breakage(name)
     editor = _WatchedEditor(root, _first_labelled(root))
-    agent = next((agent for agent in editor.agents if agent in VEHICLE_AGENTS), editor.agents[0])
+    vehicles = [agent for agent in editor.agents if agent in VEHICLE_AGENTS]
+    agent = (vehicles or editor.agents)[0]
     frame = editor.frames[len(editor.frames) // 2]
-    victim = Victim(
-        editor=editor,
-        agent=agent,
-        frame=frame,
-        marker=root.with_name(f"{root.name} - code has run"),
-    )
+    marker = root.with_name(f"{root.name} - code has run")
+    victim = Victim(editor=editor, agent=agent, frame=frame, marker=marker)
     try:
         path = breakage.apply(victim)
     except (FileNotFoundError, LookupError, ValueError) as error:
@@ -80,7 +77,7 @@ def break_release(root: Path, name: str) -> BrokenRelease:
         agent=agent,
         frame=frame,
         path=path,
-        marker=victim.marker,
+        marker=marker,
     )
 
 
@@ -93,33 +90,33 @@ def broken_release(out: Path, name: str, config: SmallRelease | None = None) -> 
         config: Options of the release; `SmallRelease()` if None.
 
     Raises:
-        ChoiceError: The breakage is unknown.
-        ConfigError: `out` is a file or is not empty, or a release with these options lacks a part
-            that this breaks.
+        ChoiceError: If `name` is not in `BREAKAGES`.
+        ConfigError: If `out` is a file or is not empty, or if a release with these options lacks a
+            part that is to be broken.
     """
     checked_breakage(name)
     return break_release(write_small_release(out, config), name)
 
 
 def checked_breakage(name: str) -> Breakage:
-    """Return the breakage with a name; raises ChoiceError."""
+    """Return the breakage with a name; raise ChoiceError if it does not exist."""
     return BREAKAGES[choice("breakage", name, BREAKAGES)]
 
 
 class _WatchedEditor(ScenarioEditor):
-    """An editor that records whether any file has changed."""
+    """An editor that notices whether any file has changed."""
 
     def __init__(self, root: Path, scenario: ScenarioFolder) -> None:
         super().__init__(root, scenario)
         self._before: dict[Path, bytes | None] = {}
 
     def changing(self, path: Path) -> None:
-        """Note the content of a file before its first change."""
+        """Remember a digest of a file's content before its first change."""
         if path not in self._before:
             self._before[path] = _digest(path)
 
     def has_changed(self) -> bool:
-        """Return whether a file was changed, made or removed."""
+        """Return whether any file was changed, created or removed."""
         for path, before in self._before.items():
             if _digest(path) != before:
                 return True

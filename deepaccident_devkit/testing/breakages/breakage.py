@@ -1,4 +1,4 @@
-"""`Breakage`, and `ScenarioEditor`, which replaces raw files of a scenario."""
+"""`Breakage`, and `ScenarioEditor`, which replaces the raw files of a scenario."""
 
 import io
 import shutil
@@ -22,28 +22,29 @@ from deepaccident_devkit.taxonomy import CHANNEL_FORMAT, INFRASTRUCTURE, AgentNa
 LabelRows = list[list[str]]
 """The words of a label file's lines; the first line is the header."""
 FILE_ENDINGS: Mapping[str, str] = {"label": "txt", "calib": "pkl", **CHANNEL_FORMAT}
-"""Kind of file → its ending."""
+"""Kind of file → its extension."""
 FIELD: Mapping[str, int] = {name: index for index, name in enumerate(LABEL_FIELDS)}
 """Field of a label line → its index in the line."""
 Apply = Callable[["Victim"], Path]
+"""Function that breaks a scenario and returns the broken file or folder."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Breakage(ShortRepr):
-    """A named way in which a release can be broken, or unusual though its format allows it.
+    """A named way to break a release, or to make it unusual in ways that its format allows.
 
     Attributes:
-        name: Name such as `label-cut`.
-        group: Broken part: `label`, `calib`, `meta`, `sensor`, `release`; `legal` for unusual
+        name: A name such as `label-cut`.
+        group: What is broken: `label`, `calib`, `meta`, `sensor` or `release`; `legal` for unusual
             content that a loader must accept.
         description: One sentence.
-        codes: Codes that `deepaccident validate` finds in a small release with this breakage and
-            not in a healthy one, sorted; empty if it finds none.
-        deep: Whether it needs `--deep` to find them.
-        opening: Error of `DeepAccident(...)`; None if the release can be opened.
-        reading: Error of the reader of the broken file; None if there is no such file, or it can be
+        codes: Codes that `deepaccident validate` reports for a small release with this breakage,
+            and not for a healthy one, sorted; empty if it reports none.
+        deep: Whether `--deep` is needed to find them.
+        opening: Error that `DeepAccident(...)` raises; None if the release can be opened.
+        reading: Error that the broken file's reader raises; None if no file is broken, or it can be
             read.
-        channel: Sensor with the files that it needs; None if it needs only labels, calib and meta.
+        channel: Sensor whose files it needs; None if it only needs labels, calib and meta.
         apply: Function that breaks a scenario and returns the broken file or folder.
     """
 
@@ -66,11 +67,11 @@ class BrokenRelease(ShortRepr):
         root: Folder of the release.
         breakage: The breakage.
         scenario: Token of the broken scenario; the others are unchanged.
-        agent: Agent with the broken files, if only one agent has any.
-        frame: Frame with the broken files, if only one frame has any.
+        agent: Agent whose files are broken; None if it is not just one.
+        frame: Frame whose files are broken; None if it is not just one.
         path: File or folder that is broken, missing or unusual.
-        marker: Folder that a program hidden in the release makes if somebody runs it; it must never
-            exist.
+        marker: Folder that is created if anybody runs a program hidden in the release; it must
+            never exist.
     """
 
     root: Path
@@ -83,9 +84,9 @@ class BrokenRelease(ShortRepr):
 
 
 class ScenarioEditor:
-    """Damages one scenario's files; safe for hard links, because no file is changed in place.
+    """Damages the files of one scenario; safe for hard links, as no file is edited in place.
 
-    Methods that write, edit or remove return the path.
+    Methods that write, edit or remove return the path that they changed.
 
     Attributes:
         root: Folder of the release.
@@ -103,22 +104,26 @@ class ScenarioEditor:
         self.frames = frame_numbers(scenario.kind_folder(scenario.agents[0], "calib"), "pkl")[0]
 
     def changing(self, path: Path) -> None:
-        """Prepare the change or removal of a file; a subclass can save the old file here."""
+        """Prepare for a file's change or removal; a subclass can save the old file here."""
 
     def file(self, agent: str, kind: str, frame: int) -> Path:
-        """Return the path of a file of a kind: `label`, `calib` or a channel."""
+        """Return the path of a file of one kind: `label`, `calib` or a channel."""
         path = self.scenario.file(agent, kind, frame, FILE_ENDINGS[kind])
         return real_path(path)
 
     def folder(self, agent: str, kind: str) -> Path:
-        """Return the folder of the files of a kind."""
+        """Return the folder with the files of one kind: `label`, `calib` or a channel."""
         return real_path(self.scenario.kind_folder(agent, kind))
 
     def write(self, path: Path, content: bytes) -> Path:
-        """Make or replace a file."""
+        """Create or replace a file."""
         self.changing(path)
         write_bytes(path, content)
         return path
+
+    def append(self, path: Path, content: bytes) -> Path:
+        """Add bytes to the end of a file."""
+        return self.write(path, path.read_bytes() + content)
 
     def remove(self, path: Path) -> Path:
         """Remove a file."""
@@ -127,7 +132,7 @@ class ScenarioEditor:
         return path
 
     def remove_folder(self, folder: Path) -> Path:
-        """Remove a folder with all its contents; if there is none, do nothing."""
+        """Remove a folder and its contents; do nothing if it does not exist."""
         for path in sorted(folder.rglob("*")):
             if path.is_file():
                 self.changing(path)
@@ -135,26 +140,27 @@ class ScenarioEditor:
         return folder
 
     def rename(self, path: Path, name: str) -> None:
-        """Give a file another name in its folder."""
+        """Rename a file within its folder."""
         self.write(path.with_name(name), path.read_bytes())
         self.remove(path)
 
     def exchange(self, path: Path, other: Path) -> None:
-        """Exchange the contents of two files."""
+        """Swap the contents of two files."""
         content = path.read_bytes()
         other_content = other.read_bytes()
         self.write(path, other_content)
         self.write(other, content)
 
     def rows(self, agent: str, frame: int) -> LabelRows:
-        """Return the words of a label file's lines."""
+        """Return the words in each line of a label file."""
         text = self.file(agent, "label", frame).read_text("ascii")
         return [line.split() for line in text.splitlines()]
 
     def write_rows(self, agent: str, frame: int, rows: LabelRows) -> Path:
-        """Replace a label."""
-        text = "\n".join(" ".join(row) for row in rows)
-        return self.write(self.file(agent, "label", frame), text.encode("ascii"))
+        """Replace the content of a label file by these lines, each a list of words."""
+        text = "\n".join(map(" ".join, rows))
+        path = self.file(agent, "label", frame)
+        return self.write(path, text.encode("ascii"))
 
     def edit_rows(
         self,
@@ -164,7 +170,10 @@ class ScenarioEditor:
         *,
         actor: int | None = None,
     ) -> Path:
-        """Apply `edit` to the words of the frames' box lines; with `actor`, only of this id."""
+        """Apply `edit` to the words of each box line in these frames.
+
+        If `actor`, a label id, is not None, only its lines are edited.
+        """
         for frame in frames:
             rows = self.rows(agent, frame)
             for row in rows[1:]:
@@ -174,11 +183,11 @@ class ScenarioEditor:
         return self.folder(agent, "label")
 
     def calib(self, agent: str, frame: int) -> dict[str, AnyArray]:
-        """Return the dict in a calib file. Raises CalibError if the file is already damaged."""
+        """Return the dict in a calib file; raise CalibError if the file is already damaged."""
         return read_calib(self.file(agent, "calib", frame), raw=True)
 
     def write_calib(self, agent: str, frame: int, calib: Mapping[str, AnyArray]) -> Path:
-        """Replace a calib file; nothing is checked."""
+        """Replace a calib file without any checks."""
         path = self.file(agent, "calib", frame)
         self.changing(path)
         write_raw_calib(path, calib)
@@ -187,27 +196,29 @@ class ScenarioEditor:
     def edit_calib(
         self, agent: str, frames: Sequence[int], key: str, edit: Callable[[AnyArray], AnyArray]
     ) -> Path:
-        """Replace one array in the calib files of the frames."""
+        """Replace one array in the calib files of several frames."""
         for frame in frames:
             calib = self.calib(agent, frame)
             self.write_calib(agent, frame, {**calib, key: edit(calib[key])})
         return self.folder(agent, "calib")
 
     def array(self, agent: str, channel: str, frame: int) -> AnyArray:
-        """Return the array of an npz file, unchanged."""
+        """Return the array in an npz file as stored."""
         return read_npz(self.file(agent, channel, frame), "lidar")
 
     def write_array(
         self, agent: str, channel: str, frame: int, array: Any, *, key: str = KEY
     ) -> Path:
-        """Replace an npz file by one with any array, also of objects, under any key."""
+        """Replace an npz file; the array may have any type, including object, and any key."""
         content = io.BytesIO()
         np.savez_compressed(content, **{key: array})
-        return self.write(self.file(agent, channel, frame), content.getvalue())
+        path = self.file(agent, channel, frame)
+        return self.write(path, content.getvalue())
 
     def meta_lines(self) -> list[str]:
-        """Return the lines of the meta file."""
-        return real_path(self.scenario.meta_path).read_text("ascii").splitlines()
+        """Return the lines in the meta file."""
+        path = real_path(self.scenario.meta_path)
+        return path.read_text("ascii").splitlines()
 
     def write_meta_lines(self, lines: Sequence[str]) -> Path:
         """Replace the meta file."""
@@ -217,13 +228,13 @@ class ScenarioEditor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Victim:
-    """The scenario that a breakage breaks.
+    """The scenario that a breakage is applied to.
 
     Attributes:
         editor: Editor of the scenario.
-        agent: A vehicle.
+        agent: The vehicle whose files are broken.
         frame: A frame in the middle of the scenario.
-        marker: As in `BrokenRelease`.
+        marker: See `BrokenRelease`.
     """
 
     editor: ScenarioEditor
@@ -233,32 +244,53 @@ class Victim:
 
     @property
     def other(self) -> AgentName:
-        """Another vehicle. Raises LookupError without any."""
+        """Another vehicle; raise LookupError if there is none."""
         for agent in self.editor.agents:
             if agent not in (self.agent, INFRASTRUCTURE):
                 return agent
         raise LookupError("a second vehicle that records")
 
     def file(self, kind: str) -> Path:
-        """Return the agent's file of a kind at the frame."""
+        """Return the agent's file of one kind in the frame."""
         return self.editor.file(self.agent, kind, self.frame)
 
+    def folder(self, kind: str) -> Path:
+        """Return the folder with the agent's files of one kind."""
+        return self.editor.folder(self.agent, kind)
+
+    def read_rows(self) -> LabelRows:
+        """Return the words in each line of the agent's label in the frame."""
+        return self.editor.rows(self.agent, self.frame)
+
+    def write_rows(self, rows: LabelRows) -> Path:
+        """Replace the agent's label in the frame; return its path."""
+        return self.editor.write_rows(self.agent, self.frame, rows)
+
+    def replace_pose(self, change: Callable[[AnyArray], AnyArray]) -> Path:
+        """Change the agent's pose in the frame's calib file; return the path of the file."""
+        self.editor.edit_calib(self.agent, [self.frame], "ego_to_world", change)
+        return self.file("calib")
+
+    def overwrite(self, kind: str, content: bytes) -> Path:
+        """Replace the agent's file of one kind in the frame; return its path."""
+        return self.editor.write(self.file(kind), content)
+
     def replace(self, kind: str, change: Callable[[bytes], bytes]) -> Path:
-        """Change the bytes of the agent's file at the frame; returns its path."""
+        """Change the bytes of the agent's file of one kind in the frame; return its path."""
         path = self.file(kind)
         return self.editor.write(path, change(path.read_bytes()))
 
     def replace_array(
         self, channel: str, change: Callable[[AnyArray], AnyArray], *, key: str = KEY
     ) -> Path:
-        """Change the array of the victim's npz file; returns the file."""
+        """Change the array in the agent's npz file in the frame; return the path of the file."""
         array = change(self.editor.array(self.agent, channel, self.frame))
         return self.editor.write_array(self.agent, channel, self.frame, array, key=key)
 
 
 @dataclass(slots=True)
 class BreakageGroup:
-    """Collects the breakages of a module, named and described by their functions."""
+    """Collects the breakages of a module; their functions define name and description."""
 
     name: str
     opening: type[ReleaseError] | None = None
@@ -267,7 +299,12 @@ class BreakageGroup:
     breakages: list[Breakage] = field(default_factory=list)
 
     def enter(self, *codes: str, channel: str | None = None) -> Callable[[Apply], Apply]:
-        """Add the decorated function, with the codes of `validate` and the sensor that it needs."""
+        """Return a decorator that adds a function to the group.
+
+        Args:
+            *codes: Codes that `deepaccident validate` reports.
+            channel: Sensor whose files the breakage needs; None if it needs none.
+        """
 
         def decorate(apply: Apply) -> Apply:
             breakage = Breakage(

@@ -21,23 +21,27 @@ LABEL_FORM = BreakageGroup("label", opening=BrokenReleaseError, reading=LabelErr
 LABEL_MEANING = BreakageGroup("label")
 
 
+def _first_half(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
 def _set_field(victim: Victim, name: str, word: str) -> Path:
-    """Change one word of the last box line."""
-    rows = victim.editor.rows(victim.agent, victim.frame)
+    """Replace one word of the last box line."""
+    rows = victim.read_rows()
     rows[-1][FIELD[name]] = word
-    return victim.editor.write_rows(victim.agent, victim.frame, rows)
+    return victim.write_rows(rows)
 
 
 @LABEL_FORM.enter("label-unreadable")
 def label_empty(victim: Victim) -> Path:
     """A label file has no bytes."""
-    return victim.replace("label", lambda _: b"")
+    return victim.overwrite("label", b"")
 
 
 @LABEL_FORM.enter("label-unreadable")
 def label_garbage(victim: Victim) -> Path:
     """A label file contains a picture's bytes."""
-    return victim.replace("label", lambda _: b"\xff\xd8\xff\xe0\x00\x10JFIF\x00\x01" * 20)
+    return victim.overwrite("label", b"\xff\xd8\xff\xe0\x00\x10JFIF\x00\x01" * 20)
 
 
 @LABEL_FORM.enter("label-unreadable")
@@ -49,23 +53,31 @@ def label_cut(victim: Victim) -> Path:
 @LABEL_FORM.enter("label-unreadable")
 def label_zeros(victim: Victim) -> Path:
     """The second half of a label file is zero bytes, as after a write to a full disk."""
-    return victim.replace(
-        "label", lambda content: content[: len(content) // 2] + bytes(len(content) // 2)
-    )
+
+    def clear_second_half(content: bytes) -> bytes:
+        half = len(content) // 2
+        return content[:half] + bytes(half)
+
+    return victim.replace("label", clear_second_half)
 
 
 @LABEL_FORM.enter("label-unreadable")
 def label_no_header(victim: Victim) -> Path:
     """A label file lacks its first line, the agent's velocity."""
-    return victim.replace("label", lambda content: content.split(b"\n", 1)[1])
+
+    def remove_first_line(content: bytes) -> bytes:
+        _, other_lines = content.split(b"\n", 1)
+        return other_lines
+
+    return victim.replace("label", remove_first_line)
 
 
 @LABEL_FORM.enter("label-unreadable")
 def label_field_missing(victim: Victim) -> Path:
     """A box line has 12 fields instead of 13."""
-    rows = victim.editor.rows(victim.agent, victim.frame)
+    rows = victim.read_rows()
     del rows[-1][FIELD["num_lidar_pts"]]
-    return victim.editor.write_rows(victim.agent, victim.frame, rows)
+    return victim.write_rows(rows)
 
 
 @LABEL_FORM.enter("label-unreadable")
@@ -89,16 +101,18 @@ def label_nan(victim: Victim) -> Path:
 @LABEL_MEANING.enter("own-row-missing")
 def label_own_row_missing(victim: Victim) -> Path:
     """A vehicle's label lacks the row of the vehicle itself (id −100)."""
-    rows = victim.editor.rows(victim.agent, victim.frame)
-    others = [row for row in rows[1:] if int(row[FIELD["id"]]) != OWN_ACTOR_ID]
-    return victim.editor.write_rows(victim.agent, victim.frame, [rows[0], *others])
+    header, *rows = victim.read_rows()
+    own_id = str(OWN_ACTOR_ID)
+    other_rows = [row for row in rows if row[FIELD["id"]] != own_id]
+    return victim.write_rows([header, *other_rows])
 
 
 @LABEL_MEANING.enter("duplicate-box", "duplicate-id")
 def label_line_twice(victim: Victim) -> Path:
-    """The box line of a tracked actor is there twice."""
-    rows = victim.editor.rows(victim.agent, victim.frame)
-    return victim.editor.write_rows(victim.agent, victim.frame, [*rows, rows[2]])
+    """The box line of a tracked actor appears twice."""
+    rows = victim.read_rows()
+    tracked_row = rows[2]
+    return victim.write_rows([*rows, tracked_row])
 
 
 @LABEL_MEANING.enter("headings-differ", "own-velocity", "positions-differ", "velocity-off")
@@ -107,7 +121,8 @@ def label_right_handed(victim: Victim) -> Path:
 
     def flip(row: list[str]) -> None:
         for name in ("y", "yaw", "vy"):
-            row[FIELD[name]] = repr(-float(row[FIELD[name]]))
+            column = FIELD[name]
+            row[column] = repr(-float(row[column]))
 
     return victim.editor.edit_rows(victim.agent, victim.editor.frames, flip)
 
@@ -119,7 +134,7 @@ def labels_of_two_agents_swapped(victim: Victim) -> Path:
         path = victim.editor.file(victim.agent, "label", frame)
         other_path = victim.editor.file(victim.other, "label", frame)
         victim.editor.exchange(path, other_path)
-    return victim.editor.folder(victim.agent, "label")
+    return victim.folder("label")
 
 
 CALIB_FORM = BreakageGroup("calib", opening=BrokenReleaseError, reading=CalibError)
@@ -129,20 +144,21 @@ CALIB_MEANING = BreakageGroup("calib")
 @CALIB_FORM.enter("calib-unreadable")
 def calib_empty(victim: Victim) -> Path:
     """A calib file has no bytes."""
-    return victim.replace("calib", lambda _: b"")
+    return victim.overwrite("calib", b"")
 
 
 @CALIB_FORM.enter("calib-unreadable")
 def calib_cut(victim: Victim) -> Path:
     """A calib file ends in the middle."""
-    return victim.replace("calib", lambda content: content[: len(content) // 2])
+    return victim.replace("calib", _first_half)
 
 
 @CALIB_FORM.enter("calib-unreadable")
 def calib_code(victim: Victim) -> Path:
     """A calib file is a pickle that runs a program: it makes a folder, `marker`, beside the release."""  # noqa: E501
-    name = str(victim.marker).encode("raw_unicode_escape")
-    return victim.replace("calib", lambda _: b"cos\nmkdir\n(V" + name + b"\ntR.")
+    folder = str(victim.marker).encode("raw_unicode_escape")
+    pickled = b"cos\nmkdir\n(V" + folder + b"\ntR."
+    return victim.overwrite("calib", pickled)
 
 
 @CALIB_FORM.enter("calib-unreadable")
@@ -156,27 +172,20 @@ def calib_key_missing(victim: Victim) -> Path:
 @CALIB_FORM.enter("calib-unreadable")
 def calib_wrong_shape(victim: Victim) -> Path:
     """A pose has three rows."""
-    victim.editor.edit_calib(victim.agent, [victim.frame], "ego_to_world", lambda pose: pose[:3])
-    return victim.file("calib")
+    return victim.replace_pose(lambda pose: pose[:3])
 
 
 @CALIB_FORM.enter("calib-unreadable")
 def calib_nan(victim: Victim) -> Path:
     """A pose contains NaN."""
-    victim.editor.edit_calib(
-        victim.agent, [victim.frame], "ego_to_world", lambda pose: pose * np.nan
-    )
-    return victim.file("calib")
+    return victim.replace_pose(lambda pose: pose * np.nan)
 
 
 @CALIB_FORM.enter("calib-unreadable")
 def calib_mirrored(victim: Victim) -> Path:
     """A pose is a reflection: its determinant is −1."""
     mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-    victim.editor.edit_calib(
-        victim.agent, [victim.frame], "ego_to_world", lambda pose: pose @ mirror
-    )
-    return victim.file("calib")
+    return victim.replace_pose(lambda pose: pose @ mirror)
 
 
 @CALIB_MEANING.enter("intrinsic-form")
@@ -184,7 +193,10 @@ def calib_wrong_k(victim: Victim) -> Path:
     """A camera's raw K has the usual order of axes, not that of the release."""
 
     def usual_matrix(raw: np.ndarray) -> np.ndarray:
-        return np.array([[raw[0, 1], 0, raw[0, 0]], [0, raw[0, 1], raw[1, 0]], [0, 0, 1]])
+        (cx, focal), (cy, _) = raw[:2, :2].tolist()
+        first_row = [focal, 0, cx]
+        second_row = [0, focal, cy]
+        return np.array([first_row, second_row, [0, 0, 1]])
 
     return victim.editor.edit_calib(
         victim.agent, victim.editor.frames, "intrinsic_Camera_Front", usual_matrix
@@ -204,12 +216,13 @@ def calib_inverse(victim: Victim) -> Path:
 @CALIB_MEANING.enter("camera-misplaced")
 def calib_cameras_swapped(victim: Victim) -> Path:
     """The extrinsics of two cameras of one agent are swapped."""
-    keys = ("lidar_to_Camera_FrontLeft", "lidar_to_Camera_BackRight")
+    front_left = "lidar_to_Camera_FrontLeft"
+    back_right = "lidar_to_Camera_BackRight"
     for frame in victim.editor.frames:
         calib = victim.editor.calib(victim.agent, frame)
-        swapped = dict(zip(keys, (calib[keys[1]], calib[keys[0]]), strict=True))
-        victim.editor.write_calib(victim.agent, frame, {**calib, **swapped})
-    return victim.editor.folder(victim.agent, "calib")
+        calib[front_left], calib[back_right] = calib[back_right], calib[front_left]
+        victim.editor.write_calib(victim.agent, frame, calib)
+    return victim.folder("calib")
 
 
 META_FORM = BreakageGroup("meta", opening=BrokenReleaseError, reading=MetaError)
@@ -217,7 +230,7 @@ META_MEANING = BreakageGroup("meta")
 
 
 def _edit_first_line(victim: Victim, index: int, word: str) -> Path:
-    """Replace one word of meta's first line."""
+    """Replace one word of the first line of the meta file."""
     first_line, *other_lines = victim.editor.meta_lines()
     words = first_line.split()
     words[index] = word
@@ -233,7 +246,8 @@ def meta_empty(victim: Victim) -> Path:
 @META_FORM.enter("meta-unreadable")
 def meta_cut(victim: Victim) -> Path:
     """A meta file ends within its first line."""
-    return victim.editor.write_meta_lines([victim.editor.meta_lines()[0][:20]])
+    first_line = victim.editor.meta_lines()[0]
+    return victim.editor.write_meta_lines([first_line[:20]])
 
 
 @META_FORM.enter("meta-unreadable")
@@ -245,7 +259,8 @@ def meta_id_no_number(victim: Victim) -> Path:
 @META_MEANING.enter("meta-missing")
 def meta_missing(victim: Victim) -> Path:
     """A labelled scenario has no meta file."""
-    return victim.editor.remove(real_path(victim.editor.scenario.meta_path))
+    path = real_path(victim.editor.scenario.meta_path)
+    return victim.editor.remove(path)
 
 
 @META_MEANING.enter("meta-frames")
@@ -266,10 +281,6 @@ SENSOR_MISSING = BreakageGroup("sensor", reading=MissingFileError)
 CAMERA = "Camera_Front"
 
 
-def _first_half(content: bytes) -> bytes:
-    return content[: len(content) // 2]
-
-
 @SENSOR_FORM.enter("sensor-unreadable", channel=CAMERA)
 def image_cut(victim: Victim) -> Path:
     """An image file ends in the middle."""
@@ -279,7 +290,7 @@ def image_cut(victim: Victim) -> Path:
 @SENSOR_FORM.enter("sensor-empty", "sensor-unreadable", channel=CAMERA)
 def image_empty(victim: Victim) -> Path:
     """An image file has no bytes."""
-    return victim.replace(CAMERA, lambda _: b"")
+    return victim.overwrite(CAMERA, b"")
 
 
 @SENSOR_MISSING.enter("sensor-frames-missing", channel=CAMERA)
@@ -292,9 +303,9 @@ def image_missing(victim: Victim) -> Path:
 def image_wrong_size(victim: Victim) -> Path:
     """An image is twice as large as its K says."""
     path = victim.file(CAMERA)
-    image = read_image(path)
+    image = read_image(path).repeat(2, axis=0)
     victim.editor.changing(path)
-    write_image(path, np.ascontiguousarray(image.repeat(2, axis=0).repeat(2, axis=1)))
+    write_image(path, np.ascontiguousarray(image.repeat(2, axis=1)))
     return path
 
 
@@ -319,9 +330,8 @@ def lidar_objects(victim: Victim) -> Path:
 @SENSOR_MEANING.enter("points-differ", channel=LIDAR)
 def lidar_right_handed(victim: Victim) -> Path:
     """A point cloud has the other handedness."""
-    return victim.replace_array(
-        LIDAR, lambda points: points * np.array([1, -1, 1, 1], dtype=np.float32)
-    )
+    signs = np.array([1, -1, 1, 1], dtype=np.float32)
+    return victim.replace_array(LIDAR, lambda points: points * signs)
 
 
 @SENSOR_FORM.enter("sensor-unreadable", channel=BEV_CAMERA)
@@ -342,4 +352,4 @@ def bev_mirrored(victim: Victim) -> Path:
     for frame in victim.editor.frames:
         picture = victim.editor.array(victim.agent, BEV_CAMERA, frame)
         victim.editor.write_array(victim.agent, BEV_CAMERA, frame, picture[:, ::-1])
-    return victim.editor.folder(victim.agent, BEV_CAMERA)
+    return victim.folder(BEV_CAMERA)

@@ -53,14 +53,16 @@ def frame_lost(victim: Victim) -> Path:
 def frame_number_short(victim: Victim) -> Path:
     """A label file's name has two digits for the frame."""
     path = victim.file("label")
-    victim.editor.rename(path, path.name.replace(f"_{victim.frame:03d}.", f"_{victim.frame:02d}."))
+    short_name = path.name.replace(f"_{victim.frame:03d}.", f"_{victim.frame:02d}.")
+    victim.editor.rename(path, short_name)
     return path
 
 
 @BROKEN.enter("agent-unlabelled", "folder-unreadable")
 def folder_is_a_file(victim: Victim) -> Path:
     """A file is where an agent's folder of labels must be."""
-    folder = victim.editor.remove_folder(victim.editor.folder(victim.agent, "label"))
+    folder = victim.folder("label")
+    victim.editor.remove_folder(folder)
     return victim.editor.write(folder, b"")
 
 
@@ -69,24 +71,30 @@ def scenario_twice(victim: Victim) -> Path:
     """A scenario is also in the folder of a second split."""
     scenario = victim.editor.scenario
     root = real_path(scenario.root)
-    start = root / scenario.folder
-    copy = root / ("val" if scenario.folder != "val" else "train")
-    for path in sorted((start / scenario.scenario_type).rglob(f"{scenario.name}*")):
+    split_folder = root / scenario.folder
+    other_split_folder = root / "val"
+    if scenario.folder == "val":
+        other_split_folder = root / "train"
+    type_folder = split_folder / scenario.scenario_type
+    for path in sorted(type_folder.rglob(f"{scenario.name}*")):
         if path.is_file():
-            victim.editor.write(copy / path.relative_to(start), path.read_bytes())
-    return copy / scenario.scenario_type
+            copy = other_split_folder / path.relative_to(split_folder)
+            victim.editor.write(copy, path.read_bytes())
+    return other_split_folder / scenario.scenario_type
 
 
 @ODD.enter("labels-without-calib")
 def agent_half_unpacked(victim: Victim) -> Path:
     """An agent has labels and sensor files, but no calib files."""
-    return victim.editor.remove_folder(victim.editor.folder(victim.agent, "calib"))
+    folder = victim.folder("calib")
+    return victim.editor.remove_folder(folder)
 
 
 @ODD.enter("agent-unlabelled")
 def agent_unlabelled(victim: Victim) -> Path:
     """An agent has no labels, but the others have."""
-    return victim.editor.remove_folder(victim.editor.folder(victim.agent, "label"))
+    folder = victim.folder("label")
+    return victim.editor.remove_folder(folder)
 
 
 @ODD.enter("ids-differ", "meta-pair", "own-box-apart", "sizes-differ")
@@ -98,31 +106,31 @@ def agents_swapped(victim: Victim) -> Path:
             other_path = victim.editor.file(victim.other, kind, frame)
             if path.exists() and other_path.exists():
                 victim.editor.exchange(path, other_path)
-    return victim.editor.folder(victim.agent, "calib").parents[1]
+    return victim.folder("calib").parents[1]
 
 
 @ODD.enter("positions-differ", "velocity-off")
 def frames_swapped(victim: Victim) -> Path:
     """Two frames' label files of an agent are swapped."""
     frames = victim.editor.frames
-    path = victim.editor.file(victim.agent, "label", frames[0])
+    first_path = victim.editor.file(victim.agent, "label", frames[0])
     last_path = victim.editor.file(victim.agent, "label", frames[-1])
-    victim.editor.exchange(path, last_path)
-    return victim.editor.folder(victim.agent, "label")
+    victim.editor.exchange(first_path, last_path)
+    return victim.folder("label")
 
 
 @SPLIT_FILE.enter("split-file-unreadable")
 def split_file_garbled(victim: Victim) -> Path:
     """A split file has a line of one word."""
     path = victim.editor.root / "val.txt"
-    return victim.editor.write(path, path.read_bytes() + b"Town03\n")
+    return victim.editor.append(path, b"Town03\n")
 
 
 @ODD.enter("split-file-repeats")
 def split_line_twice(victim: Victim) -> Path:
     """A split file lists a scenario twice."""
     paths = [victim.editor.root / f"{split}.txt" for split in SPLITS]
-    # Files of splits that the release lacks are empty.
+    # Split files that the release lacks are treated as empty.
     path = max(paths, key=lambda path: path.stat().st_size)
     return victim.editor.write(path, path.read_bytes() * 2)
 
@@ -146,22 +154,26 @@ def label_short_lines(victim: Victim) -> Path:
 def label_header_only(victim: Victim) -> Path:
     """The infrastructure's label has no boxes."""
     rows = victim.editor.rows(INFRASTRUCTURE, victim.frame)
-    return victim.editor.write_rows(INFRASTRUCTURE, victim.frame, rows[:1])
+    header = rows[:1]
+    return victim.editor.write_rows(INFRASTRUCTURE, victim.frame, header)
 
 
 @LEGAL.enter("velocity-unknown")
 def label_velocity_nan(victim: Victim) -> Path:
     """A tracked actor's velocity is NaN."""
-    rows = victim.editor.rows(victim.agent, victim.frame)
-    tracked = [row for row in rows[1:] if int(row[FIELD["id"]]) not in (OWN_ACTOR_ID, UNTRACKED_ID)]
-    tracked[0][FIELD["vx"]] = tracked[0][FIELD["vy"]] = "nan"
-    return victim.editor.write_rows(victim.agent, victim.frame, rows)
+    rows = victim.read_rows()
+    untracked_ids = (str(OWN_ACTOR_ID), str(UNTRACKED_ID))
+    tracked_rows = [row for row in rows[1:] if row[FIELD["id"]] not in untracked_ids]
+    for name in ("vx", "vy"):
+        tracked_rows[0][FIELD[name]] = "nan"
+    return victim.write_rows(rows)
 
 
 @LEGAL.enter("meta-incomplete")
 def meta_short(victim: Victim) -> Path:
     """A meta file ends after its third line."""
-    return victim.editor.write_meta_lines(victim.editor.meta_lines()[:3])
+    lines = victim.editor.meta_lines()
+    return victim.editor.write_meta_lines(lines[:3])
 
 
 @LEGAL.enter("no-collision-in-accident", "overlap-unnamed")
@@ -170,9 +182,8 @@ def meta_no_collision(victim: Victim) -> Path:
     first_line, _, *other_lines = victim.editor.meta_lines()
     words = first_line.split()
     no_collision = " ".join([words[0], *["-1"] * 7, words[8]])
-    return victim.editor.write_meta_lines(
-        [no_collision, " colliding agents: none none", *other_lines]
-    )
+    no_agents = " colliding agents: none none"
+    return victim.editor.write_meta_lines([no_collision, no_agents, *other_lines])
 
 
 @LEGAL.enter("agent-missing")
@@ -190,7 +201,7 @@ def labels_absent(victim: Victim) -> Path:
         for kind in ("label", BEV_CAMERA):
             victim.editor.remove_folder(victim.editor.folder(agent, kind))
     victim.editor.remove(real_path(victim.editor.scenario.meta_path))
-    return victim.editor.folder(victim.agent, "label")
+    return victim.folder("label")
 
 
 @LEGAL.enter()
@@ -199,7 +210,7 @@ def sensors_absent(victim: Victim) -> Path:
     for agent in AGENTS:
         for channel in CHANNELS:
             victim.editor.remove_folder(victim.editor.folder(agent, channel))
-    return victim.editor.folder(victim.agent, CHANNELS[0])
+    return victim.folder(CHANNELS[0])
 
 
 @LEGAL.enter("split-file-partial")
@@ -207,13 +218,13 @@ def split_lists_more(victim: Victim) -> Path:
     """A split file lists a scenario that was not downloaded."""
     path = victim.editor.root / "train.txt"
     line = b"type1_subtype2_normal Town07_type001_subtype0002_scenario00099\n"
-    return victim.editor.write(path, path.read_bytes() + line)
+    return victim.editor.append(path, line)
 
 
 @LEGAL.enter()
 def files_stray(victim: Victim) -> Path:
     """A folder of labels has files that operating systems make."""
-    folder = victim.editor.folder(victim.agent, "label")
+    folder = victim.folder("label")
     for name in (".DS_Store", "Thumbs.db", "README"):
         victim.editor.write(folder / name, b"stray")
     return folder

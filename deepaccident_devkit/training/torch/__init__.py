@@ -22,8 +22,8 @@ try:
     import torch  # noqa: F401 - nothing here works without it
 except ModuleNotFoundError as error:
     raise MissingExtraError(
-        "the torch adapter needs PyTorch: in a checkout, pip install '.[torch]' (for its CPU build "
-        "alone: pip install torch --index-url https://download.pytorch.org/whl/cpu)"
+        "the torch adapter needs PyTorch; run pip install '.[torch]' in a checkout (for PyTorch's "
+        "CPU build, first pip install torch --index-url https://download.pytorch.org/whl/cpu)"
     ) from error
 
 from deepaccident_devkit.export.images import ImageConfig

@@ -1,16 +1,17 @@
 """Items of a `V2XDataset`, batches of them for a DataLoader, and a merge of several ranks' counts.
 
 Training on several ranks needs no other part of the devkit: `V2XDataset` draws augmentations by
-position and epoch, so ranks that take different positions from torch's `DistributedSampler` draw
-different ones.
+index and epoch, so ranks that take different indices from torch's `DistributedSampler` draw
+different augmentations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import compress
 from multiprocessing.reduction import ForkingPickler
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Evaluator, EvaluatorT
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.distributed import ProcessGroup
 
-_MATRICES: Final = (
+_MATRICES = (
     "ego_from_agent",
     "agent_from_past",
     "intrinsics",
@@ -29,27 +30,29 @@ _MATRICES: Final = (
     "image_from_ego",
 )
 # Keys of tensors with the agents as their first axis.
-_AGENT_KEYS: Final = ("agent_valid", "files_missing", "images", *_MATRICES)
-_BOX_KEYS: Final = ("boxes", "velocity_known", "categories", "actor_ids")
+_AGENT_KEYS = ("agent_valid", "files_missing", "images", *_MATRICES)
+_BOX_KEYS = ("boxes", "velocity_known", "categories", "actor_ids")
 # Keys that stay lists with one entry for each item: texts, and tensors of different lengths.
-_LIST_KEYS: Final = ("token", "agents", "points", *_BOX_KEYS)
-# Keys that only `AllEgosDataset` items have.
-_EGO_KEYS: Final = ("egos", "partners", "targets")
-# Size up to which a tensor is copied, because shared memory takes 1 ms to set up.
-_MAX_COPIED_BYTES: Final = 1 << 16
+_LIST_KEYS = ("token", "agents", "points", *_BOX_KEYS)
+# Keys that only items of an `AllEgosDataset` have.
+_EGO_KEYS = ("egos", "partners", "targets")
+# Largest size of a tensor that is copied, because shared memory takes 1 ms to set up.
+_MAX_COPIED_BYTES = 1 << 16
 
 
 class V2XItem(dict[str, Any]):
     """An item of a `V2XDataset`: a dict with a short text, which torch batches by `collate`."""
 
     def __repr__(self) -> str:
-        """Return its token, its agents, and the names of its other contents."""
+        """Return the item's token and agents, and the names of its other contents."""
+        token = self.get("token")
+        agents = self.get("agents")
         names = [name for name in self if name not in ("token", "agents")]
-        return f"V2XItem({self.get('token')}, agents {self.get('agents')}: {', '.join(names)})"
+        return f"V2XItem({token}, agents {agents}: {', '.join(names)})"
 
 
 class _WorkersBatch(dict[str, Any]):
-    """A batch in a worker; the process that receives it gets a dict."""
+    """A batch in a worker, which becomes a dict in the process that receives it."""
 
 
 def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -58,12 +61,12 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     It is for models with a fixed number of agents, or with a mask for them. `token`, `agents`,
     `points` and the boxes (`boxes`, `velocity_known`, `categories`, `actor_ids`) of the items
     (`V2XDataset`) become lists of B. All other tensors are stacked, (B, …). If items have different
-    numbers of agents, (B, A, …) is filled with agents with `agent_valid` False, images of 0 and
-    identity matrices.
+    numbers of agents, tensors (B, A, …) are padded with blank agents, which have `agent_valid`
+    False, images of 0 and identity matrices.
 
     Raises:
-        ConfigError: There are no items, or they do not fit together: other configurations, images
-            of different sizes.
+        ConfigError: If there are no items, or they do not fit together because of different
+            configurations or image sizes.
     """
     from torch.utils.data import get_worker_info
 
@@ -74,10 +77,9 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
         values = [item[key] for item in items]
         if key in _LIST_KEYS:
             batch[key] = values
-        elif key in _AGENT_KEYS:
-            padded = [_with_agents(key, value, agent_count)[None] for value in values]
-            batch[key] = _joined(key, padded)
         else:
+            if key in _AGENT_KEYS:
+                values = [_with_agents(key, value, agent_count) for value in values]
             batch[key] = _joined(key, [value[None] for value in values])
     return batch
 
@@ -85,24 +87,24 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return B items as one dict with the agents of all items one after another.
 
-    It is for V2X fusion models such as OpenCOOD's. Agents with no data at the present are left
-    out (for the others, `agent_valid` still marks missing past data); the sample's own agent is
-    always the first of its item. N is the number of remaining agents in the complete batch. The
-    dict is that of `collate`, but tensors of agents are (N, …) instead of (B, A, …), `points` is a
+    It is for V2X fusion models such as OpenCOOD's. Agents with no data at the present are
+    left out (for the other agents, `agent_valid` still marks missing past data); the sample's own
+    agent is always the first of its item. N is the number of remaining agents in the batch. The
+    dict is as in `collate`, but tensors of agents are (N, …) instead of (B, A, …), `points` is a
     list of N, and `agents` is a list of B tuples of names. In addition:
 
     - `record_len` (B,) int64: number of agents of each item; the sum is N.
     - `pairwise_t_matrix` (B, L, L, 4, 4) float32, L = 5: [b, i, j] converts points of agent i's ego
       frame to agent j's, `j_from_i` = `ego_from_j`⁻¹ · `ego_from_i`, at the present, so that [b, i,
       0] leads to the sample's own ego frame. It is augmented like the points, with the link's
-      errors; the identity on the diagonal and beyond `record_len`.
+      errors; it is the identity on the diagonal and beyond `record_len`.
 
-    OpenCOOD's own frames are the LiDARs' frames, left-handed like CARLA's; these are ego frames,
-    right-handed.
+    The frames of OpenCOOD are the LiDARs' frames, left-handed like CARLA's; the frames here are ego
+    frames, right-handed.
 
     Raises:
-        ConfigError: There are no items, or they do not fit together: other configurations, images
-            of different sizes.
+        ConfigError: If there are no items, or they do not fit together because of different
+            configurations or image sizes.
     """
     import torch
 
@@ -113,30 +115,28 @@ def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
         if key in items[0]:
             parts = [item[key][mask] for item, mask in zip(items, masks, strict=True)]
             batch[key] = _joined(key, parts)
-    rows_of_items = [mask.nonzero()[:, 0].tolist() for mask in masks]
-    names, points = [], []
-    for item, rows in zip(items, rows_of_items, strict=True):
-        names.append(tuple(item["agents"][row] for row in rows))
-        if "points" in batch:
-            points += [item["points"][row] for row in rows]
-    batch["agents"] = names
-    if "points" in batch:
-        batch["points"] = points
-    batch["record_len"] = torch.tensor([len(rows) for rows in rows_of_items])
+    names: list[tuple[str, ...]] = []
+    clouds: list[Any] = []
     transforms = []
     for item, mask in zip(items, masks, strict=True):
+        names.append(tuple(compress(item["agents"], mask)))
+        clouds += compress(item.get("points", ()), mask)
         transforms.append(_pairwise_transforms(item["ego_from_agent"][mask, -1]))
+    batch["agents"] = names
+    if "points" in batch:
+        batch["points"] = clouds
+    batch["record_len"] = torch.tensor([len(item_names) for item_names in names])
     batch["pairwise_t_matrix"] = torch.stack(transforms)
     return batch
 
 
 def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return B moments as one dict, with an axis of the G egos of all of them one after another.
+    """Return B moments as one dict, with an axis of the G egos of all moments one after another.
 
     Sensor data are as in `collate`, (B, A, …). In addition:
 
     - `egos`: list of G tokens. `ego_rows` (G, 2) int64: the item and the agent of each ego.
-    - `partners` (G, A) bool: the agents of that item that cooperate with it.
+    - `partners` (G, A) bool: the agents of the ego's item that cooperate with the ego.
     - the targets: stacked, (G, …), or lists of G for boxes.
 
     Raises:
@@ -147,10 +147,13 @@ def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     _check_alike(items)
     batch = collate([_without_keys(item, _EGO_KEYS) for item in items])
     agent_count = max(len(item["agents"]) for item in items)
-    egos, ego_rows, partners, targets = [], [], [], []
+    egos = []
+    ego_rows = []
+    partners = []
+    targets = []
     for index, item in enumerate(items):
         for ego in item["egos"]:
-            agent = ego.rsplit("/", 2)[1]
+            _, agent, _ = ego.rsplit("/", 2)
             egos.append(ego)
             ego_rows.append((index, item["agents"].index(agent)))
         missing_count = agent_count - len(item["agents"])
@@ -167,12 +170,15 @@ def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def _without_keys(item: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
     """Return an item without some keys."""
-    return {key: value for key, value in item.items() if key not in keys}
+    remaining_keys = [key for key in item if key not in keys]
+    return {key: item[key] for key in remaining_keys}
 
 
 def _collate_by_default(items: Sequence[V2XItem], **_: object) -> dict[str, Any]:
     """Collate with `collate` or, for all egos, `collate_all_egos`; torch calls this for items."""
-    return collate_all_egos(items) if "egos" in items[0] else collate(items)
+    if "egos" in items[0]:
+        return collate_all_egos(items)
+    return collate(items)
 
 
 with suppress(ImportError):  # torch's documented registry, which has no public module
@@ -183,7 +189,7 @@ with suppress(ImportError):  # torch's documented registry, which has no public 
 
 
 class _ByValue:
-    """A small tensor as an array: it is copied, whereas larger tensors become shared memory."""
+    """A small tensor, sent as a copied array; larger tensors are sent in shared memory."""
 
     def __init__(self, array: AnyArray) -> None:
         self._array = array
@@ -195,23 +201,23 @@ class _ByValue:
         return torch.from_numpy, (self._array,)
 
 
-def _sent(value: Any) -> Any:
+def _sendable(value: Any) -> Any:
     """Return a part of an item or a batch in the form in which a worker sends it."""
     import torch
 
     if type(value) in (list, tuple):
-        return type(value)(map(_sent, value))
+        return type(value)(map(_sendable, value))
     if isinstance(value, dict):
-        return {key: _sent(part) for key, part in value.items()}
+        return {key: _sendable(part) for key, part in value.items()}
     if isinstance(value, torch.Tensor) and value.nbytes <= _MAX_COPIED_BYTES:
-        # numpy may lack its type, or it may be on a GPU, or have a gradient.
+        # numpy may lack the tensor's type, or the tensor may be on a GPU or have a gradient
         with suppress(TypeError, RuntimeError):
             return _ByValue(value.numpy())
     return value
 
 
-ForkingPickler.register(V2XItem, lambda item: (V2XItem, (_sent(item),)))
-ForkingPickler.register(_WorkersBatch, lambda batch: (dict, (_sent(batch),)))
+ForkingPickler.register(V2XItem, lambda item: (V2XItem, (_sendable(item),)))
+ForkingPickler.register(_WorkersBatch, lambda batch: (dict, (_sendable(batch),)))
 
 
 def _check_alike(items: Sequence[dict[str, Any]]) -> None:
@@ -228,9 +234,10 @@ def _check_alike(items: Sequence[dict[str, Any]]) -> None:
 
 
 def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
-    """Return parts (n, …) one after another (N, …); a single part is unchanged.
+    """Return tensors (n, …) joined along their first axis, (N, …); a single one is not copied.
 
-    Raises ConfigError if other axes differ.
+    Raises:
+        ConfigError: If other axes differ.
     """
     import torch
     from torch.utils.data import default_collate
@@ -239,7 +246,7 @@ def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
     if len(sizes) > 1:
         remedy = "choose resize=" if key == "images" else "batch items of one V2XConfig at a time"
         raise ConfigError(
-            f"{key}: items of shapes {sizes[0]} and {sizes[-1]} make no batch; {remedy}"
+            f"{key}: items of shapes {sizes[0]} and {sizes[-1]} cannot form a batch; {remedy}"
         )
     if len(parts) == 1:
         return parts[0]
@@ -250,19 +257,24 @@ def _joined(key: str, parts: Sequence[Tensor]) -> Tensor:
 
 
 def _pairwise_transforms(ego_from_agent: Tensor) -> Tensor:
-    """Return the transforms (L, L, 4, 4) between n agents (n, 4, 4), padded with identities."""
+    """Return the transforms (L, L, 4, 4) between n agents, padded with identity matrices.
+
+    Args:
+        ego_from_agent: (n, 4, 4) poses of the agents.
+    """
     import torch
 
     count = len(ego_from_agent)
-    exact = ego_from_agent.double()
+    poses = ego_from_agent.double()
+    inverse_poses = torch.linalg.inv(poses)
     transforms = torch.eye(4).repeat(len(AGENTS), len(AGENTS), 1, 1)
-    transforms[:count, :count] = (torch.linalg.inv(exact)[None, :] @ exact[:, None]).float()
+    transforms[:count, :count] = (inverse_poses[None, :] @ poses[:, None]).float()
     transforms[range(count), range(count)] = torch.eye(4)
     return transforms
 
 
 def _with_agents(key: str, value: Tensor, count: int) -> Tensor:
-    """Return a tensor (A, …), filled at the end with blank agents up to `count`."""
+    """Return a tensor (A, …) with blank agents at the end, up to a number of agents."""
     import torch
 
     missing_count = count - len(value)
@@ -277,9 +289,9 @@ def _with_agents(key: str, value: Tensor, count: int) -> Tensor:
 def merged_evaluator(evaluator: EvaluatorT, group: ProcessGroup | None = None) -> EvaluatorT:
     """Return all ranks' counts in one new evaluator, on every rank; all ranks must call it.
 
-    Counts are small and stored by token, and are summed exactly: the result has the bits of one
-    process that counted all samples. A sample that ranks counted alike, as after
-    `DistributedSampler`, counts once (`Evaluator.repeated`).
+    Counts are small and stored by token, and are summed exactly: the result is bit for bit
+    the same as if one process counted all samples. A sample that several ranks counted equally, as
+    after `DistributedSampler`, counts once (`Evaluator.repeated`).
 
     Args:
         evaluator: This rank's evaluator, which is not changed.
@@ -292,8 +304,8 @@ def merged_evaluator(evaluator: EvaluatorT, group: ProcessGroup | None = None) -
         up.
 
     Raises:
-        EvaluationError: On all ranks, if one passed no evaluator, or one of other settings, or two
-            counted the same sample differently.
+        EvaluationError: On all ranks, if one rank passed no evaluator or an evaluator of other
+            settings, or two ranks counted the same sample differently.
     """
     from torch import distributed
 
@@ -304,8 +316,8 @@ def merged_evaluator(evaluator: EvaluatorT, group: ProcessGroup | None = None) -
     for rank, rank_evaluator in enumerate(evaluators):
         if not isinstance(rank_evaluator, Evaluator):
             raise EvaluationError(
-                "evaluator: expected an Evaluator, such as MotionEvaluator(), rank "
-                f"{rank} has {rank_evaluator!r}"
+                f"evaluator: expected an Evaluator, such as MotionEvaluator(), but rank {rank} "
+                f"has {rank_evaluator!r}"
             )
     merged: EvaluatorT = evaluators[0].fresh()
     for rank_evaluator in evaluators:

@@ -2,17 +2,14 @@
 
 A is applied to boxes, points and poses, and drawn at random for training. All agents' ego frames
 are transformed in the same way: a point p becomes A p, a pose W between two ego frames becomes A W
-A⁻¹, and transforms from an ego frame to a sensor undo A first, so that points fall on the same
-pixels as before. Images do not change.
+A⁻¹, and transforms from an ego frame to a sensor undo A first, so that points are projected to the
+same pixels as before. Images do not change.
 """
 
-from __future__ import annotations
-
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,7 +28,7 @@ from deepaccident_devkit.support.arrays import (
     checked_number,
     checked_whole,
 )
-from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.text import PathType, settle_choices
 from deepaccident_devkit.taxonomy import OnError
 from deepaccident_devkit.v2x import Agents, Link
 from deepaccident_devkit.v2x.messages import checked_link
@@ -42,9 +39,10 @@ AugmentationSource = Augmentation | Callable[[np.random.Generator], Augmentation
 
 Spawned workers cannot receive a lambda.
 """
-_DEFAULT_STEP: Final = 5
+# Recorded frames (0.1 s) between frames of sensor data.
+_DEFAULT_STEP = 5
 # Field, its type or types, and the expected value in words for the error.
-_TYPED_FIELDS: Final = (
+_TYPED_FIELDS = (
     ("images", ImageConfig, "an ImageConfig, such as ImageConfig(resize=(224, 400))"),
     ("labels", (MotionLabelConfig, str), "a MotionLabelConfig, or the name of a preset"),
     ("bev_segmentation", BevGrid, "the BevGrid that it is resampled to, such as BevGrid()"),
@@ -53,36 +51,42 @@ _TYPED_FIELDS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class V2XConfig:
-    """The contents of an item; checked on construction, raises ConfigError or ChoiceError.
+    """The contents of an item.
 
     Attributes:
         agents: Agents that cooperate with the sample's own agent, which is always present and
             first: a configuration, its name, agents' names, or None for all agents (`v2x.Agents`).
         link: Degradation of the partners' sensor data and poses; boxes and labels do not change.
         past: Number of frames of sensor data, including the present.
-        step: Recorded frames (0.1 s) between them; None for the labels' own step or, without
-            labels, 5 (2 Hz).
+        step: Recorded frames (0.1 s) from one frame of sensor data to the next; None for the
+            labels' own step or, without labels, 5 (2 Hz).
         images: Preparation of images; None for no images and cameras.
         images_cache: Folder that `deepaccident cache` wrote and that images are read from; None for
             the release's own images.
         points: Whether to load point clouds.
         boxes: `sample` for the boxes that the sample's agent annotated, `cooperative` for the union
             of the cooperating agents' boxes (`v2x.cooperative_boxes`: with the sample's own agent,
-            if another one annotated it), None for none.
+            if another one annotated it), None for no boxes.
         visible: Visibility of the boxes: `released`, `camera`, or None for all, with own rows
             (`DeepAccident.boxes`, `v2x.cooperative_boxes`).
-        labels: Motion labels, or the name of a preset (`motion.PRESETS`); None for none. Their own
-            `agents` are the agents that see the labelled actors; this configuration's
+        labels: Motion labels, or the name of a preset (`motion.PRESETS`); None for no labels. Their
+            own `agents` are the agents that see the labelled actors; this configuration's
             `augmentation` augments them.
         to_present: Warp of the labels to the present ego frame and sampling of centerness:
-            `nearest` as in the released training, `bilinear` as in its evaluation. None: each frame
-            in its own ego frame.
-        bev_segmentation: Cells of the segmentation targets from the BEV camera; None for none.
-        augmentation: A, applied to everything in an ego frame; None for none.
+            `nearest` as in the released training, `bilinear` as in its evaluation; None to leave
+            each frame in its own ego frame.
+        bev_segmentation: Cells of the segmentation targets from the BEV camera; None for no such
+            targets.
+        augmentation: Transform A, applied to everything in an ego frame; None for none.
         seed: Seed of the drawn augmentations.
         on_missing: Treatment of sensor files that were not downloaded: `raise`, or `skip` treats
-            the agent's data of that frame as not arrived, and counts them in the item's
+            the agent's data of that frame as not arrived, and counts the files in the item's
             `files_missing`. The sample's own files of the present cannot be skipped.
+
+    Raises:
+        ConfigError: If a value has another type or is out of its range, or values exclude each
+            other.
+        ChoiceError: If a choice does not exist.
     """
 
     # Agents and frames.
@@ -92,7 +96,7 @@ class V2XConfig:
     step: int | None = None
     # Sensor data.
     images: ImageConfig | None = None
-    images_cache: str | os.PathLike[str] | None = None
+    images_cache: PathType | None = None
     points: bool = True
     # Targets.
     boxes: BoxSource | None = "sample"
@@ -109,38 +113,36 @@ class V2XConfig:
         """Check and complete the fields."""
         self._check_types()
         if isinstance(self.labels, str):
-            object.__setattr__(self, "labels", MotionLabelConfig.preset(self.labels))
+            preset = MotionLabelConfig.preset(self.labels)
+            object.__setattr__(self, "labels", preset)
         if self.step is None:
             step = _DEFAULT_STEP
             if isinstance(self.labels, MotionLabelConfig):
                 step = self.labels.step
             object.__setattr__(self, "step", step)
         for name, lowest in (("past", 1), ("step", 1), ("seed", 0)):
-            object.__setattr__(self, name, _checked_count(name, getattr(self, name), lowest))
-        words = {
+            count = _checked_count(name, getattr(self, name), lowest)
+            object.__setattr__(self, name, count)
+        choices = {
             "boxes": (None, *get_args(BoxSource)),
             "visible": (None, *get_args(Visible)),
             "to_present": (None, *get_args(WarpMode)),
         }
-        settle_choices(self, words)
+        settle_choices(self, choices)
         settle_choices(self, {"on_missing": get_args(OnError)})
-        if self.images_cache is not None and self.images is None:
-            raise ConfigError(
-                "images_cache: changes nothing without images=ImageConfig(…); give that too"
-            )
-        if (
-            self.images_cache is not None
-            and self.images is not None
-            and self.images.virtual_camera is not None
-        ):
-            raise ConfigError(
-                "images_cache: has images as their own cameras took them; leave out the virtual "
-                "camera"
-            )
+        if self.images_cache is not None:
+            if self.images is None:
+                raise ConfigError(
+                    "images_cache: has no effect without images=ImageConfig(…); also give images"
+                )
+            if self.images.virtual_camera is not None:
+                raise ConfigError(
+                    "images_cache: contains images of the real cameras; remove the virtual camera"
+                )
         if isinstance(self.labels, MotionLabelConfig) and self.labels.augmentation is not None:
             raise ConfigError(
-                "labels: their augmentation is that of boxes, points and poses; give "
-                "V2XConfig(augmentation=…) alone"
+                "labels: labels have the same augmentation as boxes, points and poses; give "
+                "only V2XConfig(augmentation=…)"
             )
 
     def _check_types(self) -> None:
@@ -165,21 +167,22 @@ class V2XConfig:
         """Return the augmentation of an item in an epoch, which only depends on these and the seed.
 
         Raises:
-            ConfigError: The function that draws it returned something else.
+            ConfigError: If the function that draws it returns something else.
         """
         if self.augmentation is None or isinstance(self.augmentation, Augmentation):
             return self.augmentation or Augmentation()
-        augmentation = self.augmentation(np.random.default_rng([self.seed, epoch, index]))
+        generator = np.random.default_rng([self.seed, epoch, index])
+        augmentation = self.augmentation(generator)
         if not isinstance(augmentation, Augmentation):
             raise ConfigError(
-                "augmentation: its function must return an Augmentation, and returned "
+                "augmentation: the function must return an Augmentation, but returned "
                 f"{augmentation!r}"
             )
         return augmentation
 
 
 def _checked_count(name: str, value: object, lowest: int) -> int:
-    """Return an integer that is not below the lowest value; raises ConfigError."""
+    """Return a value if it is a whole number that is not too low; raises ConfigError otherwise."""
     expected = f"a whole number from {lowest}"
     number = checked_whole(name, value, expected, ConfigError)
     if isinstance(value, bool) or number < lowest:
@@ -189,11 +192,11 @@ def _checked_count(name: str, value: object, lowest: int) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomAugmentation:
-    """Draws an `Augmentation` from a generator; the defaults are BEVerse's ranges.
+    """A function that draws an `Augmentation` from a generator; the defaults are BEVerse's ranges.
 
     Attributes:
-        rotation: The largest angle in either direction, radians; uniform.
-        scale: The smallest and the largest factor; uniform.
+        rotation: Largest angle in either direction, radians; angles are drawn uniformly.
+        scale: Smallest and largest factor; factors are drawn uniformly.
         flip: Probability of mirroring left and right.
     """
 
@@ -229,31 +232,30 @@ class RandomAugmentation:
 
 
 def augmented_boxes(boxes: Boxes, augmentation: Augmentation) -> FloatArray:
-    """Return boxes of an ego frame in the augmented one, (M, 9): x y z l w h yaw vx vy.
+    """Return boxes of an ego frame in the augmented frame, (M, 9): x y z l w h yaw vx vy.
 
-    Right-handed, z of the centre; metres, radians in (−π, π], m/s; NaN velocities stay NaN. As in
-    the released code sizes and velocities scale too. The released flip turns yaw into π − yaw,
-    which swaps front and rear; here the heading of a mirrored box is mirrored like its velocity.
+    They are right-handed, with z of the centre; metres, radians in (−π, π], m/s; NaN velocities
+    stay NaN. As in the released code sizes and velocities scale too. The released flip turns yaw
+    into π − yaw, which swaps front and rear; here the heading of a mirrored box is mirrored like
+    its velocity.
     """
     rotation = augmentation.matrix[:2, :2]
     headings = np.column_stack([np.cos(boxes.yaw), np.sin(boxes.yaw)]) @ rotation.T
-    return np.column_stack(
-        [
-            transformed(augmentation.matrix, boxes.center),
-            boxes.size * augmentation.scale,
-            np.arctan2(headings[:, 1], headings[:, 0]),
-            boxes.velocity[:, :2] @ rotation.T,
-        ]
-    )
+    center = transformed(augmentation.matrix, boxes.center)
+    size = boxes.size * augmentation.scale
+    yaw = np.arctan2(headings[:, 1], headings[:, 0])
+    velocity = boxes.velocity[:, :2] @ rotation.T
+    return np.column_stack([center, size, yaw, velocity])
 
 
 def augmented_points(cloud: LidarPointCloud, augmentation: Augmentation) -> AnyArray:
-    """Return a cloud of an ego frame in the augmented one, (N, 4) float32.
+    """Return the points of an ego frame in the augmented frame, (N, 4) float32.
 
     The columns are x y z in metres, and the unchanged intensity.
     """
     xyz = transformed(augmentation.matrix, cloud.xyz)
-    return np.column_stack([xyz, cloud.intensity]).astype(np.float32)
+    points = np.column_stack([xyz, cloud.intensity])
+    return points.astype(np.float32)
 
 
 def augmented_pose(pose: ArrayLike, augmentation: Augmentation) -> FloatArray:
@@ -272,5 +274,7 @@ def augmented_six_vectors(six: ArrayLike, augmentation: Augmentation) -> FloatAr
 
 
 def transformed(matrix: FloatArray, points: FloatArray) -> FloatArray:
-    """Return points (N, 3) moved by an affine matrix (4, 4)."""
-    return as_floats(points @ matrix[:3, :3].T + matrix[:3, 3])
+    """Return points (N, 3) transformed by an affine matrix (4, 4)."""
+    linear_part = matrix[:3, :3]
+    translation = matrix[:3, 3]
+    return as_floats(points @ linear_part.T + translation)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -45,26 +46,27 @@ class V2XDataset(TorchDataset):
     """Samples of a release with the data of cooperating agents; an item is a dict of tensors.
 
     Everything is right-handed: x forward, y left, z up; metres, radians, seconds. With an
-    augmentation A, each agent's ego frame is the augmented one: points are A p, poses between ego
-    frames A W A⁻¹, and so on; images do not change. In shapes, A is the number of agents (the
-    sample's own is first), P of frames (the present is last), C of cameras, T and R of label frames
-    (`motion.MotionLabels`), H × W a grid's rows and columns in its own orientation.
+    augmentation G, all ego frames are augmented: a point p becomes G p, a pose W between ego frames
+    becomes G W G⁻¹, and images do not change. In shapes, A is the number of agents (the sample's
+    own agent is first), P the number of frames (the present is last), C the number of cameras, T
+    and R are numbers of label frames (see `motion.MotionLabels`), and H × W are the rows and
+    columns of a grid in its own orientation.
 
     Always:
 
-    - `token`: str. `agents`: their names, a tuple of A.
+    - `token`: str. `agents`: tuple of the names of the A agents.
     - `agent_valid` (A, P) bool: False if the link lost a message, if the frame is before the
-      recording, or if sensor files are skipped. Then clouds are empty, images are 0 and matrices
-      are the identity.
-    - `ego_from_agent` (A, P, 4, 4) float32: the sender's ego frame at that frame → the present ego
-      frame of the sample's agent, as this agent believes, with pose noise. [0, −1] is the identity,
-      [0, :] the agent's own motion.
-    - `agent_from_past` (A, P, 4, 4) float32: the sender's ego frame at that frame → its ego frame
-      at its last one, by its own exact poses. With it, senders can join their own frames before
-      they send data.
-    - `world_from_ego` (4, 4) float64: of the sample's agent at the present; for augmented
-      coordinates.
-    - `augmentation` (4, 4) float32: A.
+      recording, or if sensor files are skipped. In these cases, clouds are empty, images are 0 and
+      matrices are the identity.
+    - `ego_from_agent` (A, P, 4, 4) float32: transform from the sender's ego frame at that frame to
+      the present ego frame of the sample's agent, as this agent knows it: with pose noise. Entry
+      [0, −1] is the identity, and entries [0, :] are the agent's own motion.
+    - `agent_from_past` (A, P, 4, 4) float32: transform from the sender's ego frame at that frame to
+      its ego frame at its last frame, by its own exact poses. A sender can use it to combine its
+      own frames before it sends data.
+    - `world_from_ego` (4, 4) float64: pose of the sample's agent at the present, as a transform
+      from the augmented ego frame.
+    - `augmentation` (4, 4) float32: the augmentation G.
 
     With `on_missing="skip"`: `files_missing` (A, P) int64, the number of requested sensor files
     that are missing.
@@ -77,26 +79,27 @@ class V2XDataset(TorchDataset):
     - `images` (A, P, C, 3, h, w), RGB, as described in `ImageConfig`.
     - `intrinsics` (A, P, C, 3, 3) float32, of the resized and cropped image; pixel centres are at
       0.5, 1.5, ….
-    - `ego_from_camera` (A, P, C, 4, 4) float32: optical camera frame → the sender's augmented ego
-      frame (so neither rigid with a scale nor right-handed with a flip).
-    - `image_from_ego` (A, P, C, 4, 4) float32: point of the sender's ego frame → (u · d, v · d, d,
-      1), depth d.
+    - `ego_from_camera` (A, P, C, 4, 4) float32: transform from the optical camera frame to the
+      sender's augmented ego frame (with a scale it is not rigid, with a flip not right-handed).
+    - `image_from_ego` (A, P, C, 4, 4) float32: projection of a point of the sender's ego frame to
+      (u · d, v · d, d, 1), where d is the depth.
 
     With `boxes`, M of them in the ego frame of the sample's agent at the present:
 
     - `boxes` (M, 9) float32: x y z l w h yaw vx vy; z of the centre. `velocity_known` (M,) bool:
       False if vx and vy are 0 because they are unknown.
-    - `categories` (M,) int64, positions in `taxonomy.CATEGORIES`; −1 must be ignored: a class of
-      another source that the devkit does not have. `actor_ids` (M,) int64, as in the label (−100 is
-      the agent's own row) or, for cooperative boxes, CARLA's ids; −1 is untracked.
+    - `categories` (M,) int64, indices into `taxonomy.CATEGORIES`; −1 must be ignored: it is a class
+      of another source that the devkit does not have. `actor_ids` (M,) int64, as in the label (−100
+      is the agent's own row) or, for cooperative boxes, CARLA's ids; −1 is an untracked actor.
 
-    With `labels`, all at the present or each frame in its own ego frame, depending on `to_present`:
+    With `labels`, where each map is in the present ego frame or in the ego frame of its own moment,
+    depending on `to_present`:
 
     - `segmentation` (T, H, W) int64, `instance` (T, H, W) int64, `centerness` (T, 1, H, W) float32,
       `offset` and `flow` (T, 2, H, W) float32.
     - `future_egomotion` (R, 6) float32: `next_from_this` from the first past frame on, between
       augmented ego frames.
-    - `label_valid` (T,) bool: the frames that are in the recording.
+    - `label_valid` (T,) bool: whether each frame is in the recording.
 
     With `bev_segmentation`: `bev_segmentation` (5, H, W) bool, classes as `motion.BEV_CLASSES`, and
     `bev_known` (H, W) bool (`motion.BevSegmentation`).
@@ -115,17 +118,17 @@ class V2XDataset(TorchDataset):
 
         Args:
             dataset: The release.
-            tokens: Tokens or records of samples; one item for each, in this order.
+            tokens: Tokens or records of samples; each becomes an item, in this order.
             config: Contents of an item; None for the agent's own points and boxes.
 
         Raises:
-            TokenError: There is no such sample.
-            ChoiceError: The configuration names an agent that does not exist.
-            NotAvailableError: Labels are requested for a sample without a label, or an agent is not
-                in this (partial) release.
-            ConfigError: The link's latency is longer than the past of a sample; `tokens` is a
-                single sample, or `config` no V2XConfig; or the cache of images lacks something, or
-                is of other images.
+            TokenError: If there is no such sample.
+            ChoiceError: If the configuration names an agent that does not exist.
+            NotAvailableError: If labels are requested for a sample without a label, or an agent is
+                not in this (partial) release.
+            ConfigError: If the link's latency is longer than the past of a sample, `tokens` is a
+                single sample, `config` is not a V2XConfig, or the cache of images lacks something
+                or was made of other images.
         """
         import torch
 
@@ -140,7 +143,7 @@ class V2XDataset(TorchDataset):
         self._check_labelled()
         self._check_latency()
         self._cache = self._open_cache()
-        # Shared memory, so that workers that live longer than an epoch know the next one.
+        # in shared memory, so that workers that live longer than an epoch know the next epoch
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __len__(self) -> int:
@@ -163,7 +166,7 @@ class V2XDataset(TorchDataset):
         Each epoch draws new augmentations.
 
         Raises:
-            ConfigError: The number is no integer from 0.
+            ConfigError: If the number is not a whole number from 0.
         """
         number = checked_whole("epoch", epoch, "a whole number from 0", ConfigError)
         if number < 0:
@@ -174,18 +177,20 @@ class V2XDataset(TorchDataset):
         """Return the item of a sample, as described for the class.
 
         Raises:
-            IndexError: There is no such item.
-            MissingFileError: A sensor file was not downloaded, and may not be skipped
+            IndexError: If there is no such item.
+            MissingFileError: If a sensor file was not downloaded and may not be skipped
                 (`V2XConfig.on_missing`).
-            SensorFileError: A sensor file cannot be read.
-            ConfigError: Images have different sizes without `resize`, or are smaller than the crop;
-                or the function that draws augmentations returns something else.
+            SensorFileError: If a sensor file cannot be read.
+            ConfigError: If images have different sizes without `resize`, or are smaller than the
+                crop, or the function that draws augmentations returns something else.
         """
         position = range(len(self))[operator.index(index)]
-        sample = self._dataset.sample[int(self._rows[position])]["token"]
+        row = int(self._rows[position])
+        sample = self._dataset.sample[row]["token"]
         augmentation = self.config.augmentation_of(int(self._epoch), position)
         received_item = self._received_item(sample, augmentation)
-        return V2XItem(received_item | self._target_items([sample], augmentation)[0])
+        (target_item,) = self._target_items([sample], augmentation)
+        return V2XItem(received_item | target_item)
 
     def senders(self) -> list[tuple[AgentName, ...]]:
         """Return the agents with data of the present in each item, the own agent first.
@@ -193,8 +198,8 @@ class V2XDataset(TorchDataset):
         Nothing is read; files are only looked up.
 
         Raises:
-            MissingFileError: A sensor file of a sample's own agent was not downloaded, or may not
-                be skipped.
+            MissingFileError: If a sensor file of a sample's own agent was not downloaded, or may
+                not be skipped.
         """
         senders = []
         for row in self._rows.tolist():
@@ -207,7 +212,8 @@ class V2XDataset(TorchDataset):
 
         The numbers are as in `sensor_data.with_files`.
         """
-        dataset, config = self._dataset, self.config
+        dataset = self._dataset
+        config = self.config
         names = sensor_data.participants(dataset, sample, config.agents)
         received = sensor_data.received_messages(dataset, sample, names, config)
         arrived, missing_counts = sensor_data.with_files(
@@ -219,7 +225,8 @@ class V2XDataset(TorchDataset):
         """Return the sample's own tensors, and the sensor data that arrived."""
         import torch
 
-        dataset, config = self._dataset, self.config
+        dataset = self._dataset
+        config = self.config
         names, arrived, missing_counts = self._arrived(sample)
         inverse_augmentation = np.linalg.inv(augmentation.matrix)
         world_from_ego = dataset.world_from(sample, "ego").matrix @ inverse_augmentation
@@ -244,7 +251,7 @@ class V2XDataset(TorchDataset):
                 dataset, names, arrived, augmentation, config.images, self._cache
             )
             for name, array in arrays.items():
-                item[name] = torch.from_numpy(array)  # these arrays are new, so they are not copied
+                item[name] = torch.from_numpy(array)  # not copied, because these arrays are new
         return item
 
     def _target_items(
@@ -267,7 +274,8 @@ class V2XDataset(TorchDataset):
 
     def _box_item(self, sample: str, augmentation: Augmentation) -> dict[str, Tensor]:
         """Return the tensors of a sample's boxes."""
-        visible, dataset = self.config.visible, self._dataset.with_ignored
+        visible = self.config.visible
+        dataset = self._dataset.with_ignored
         if self.config.boxes == "cooperative":
             names = sensor_data.participants(self._dataset, sample, self.config.agents)
             boxes = cooperative_boxes(dataset, sample, agents=names, frame="ego", visible=visible)
@@ -316,12 +324,12 @@ class V2XDataset(TorchDataset):
         agent_rows = self._dataset.columns("sample")["agent_row"][self._rows]
         _, indices = np.unique(agent_rows, return_index=True)
         agents: dict[str, None] = {}
-        # One sample of each agent is enough, because its partners are always the same.
+        # one sample of each agent is enough, because its partners are always the same
         for row in self._rows[indices].tolist():
             sample = self._dataset.sample[row]["token"]
-            scenario = sample.rsplit("/", 2)[0]
-            names = sensor_data.participants(self._dataset, sample, self.config.agents)
-            agents.update(dict.fromkeys(agent_token(scenario, name) for name in names))
+            scenario, _, _ = sample.rsplit("/", 2)
+            for name in sensor_data.participants(self._dataset, sample, self.config.agents):
+                agents[agent_token(scenario, name)] = None
         cache.check_release(self._dataset, list(agents))
         return cache
 
@@ -341,14 +349,19 @@ class V2XDataset(TorchDataset):
             token = self._dataset.sample[int(unlabelled_rows[0])]["token"]
             raise NotAvailableError(
                 f"{len(unlabelled_rows)} of the {len(self)} samples have no label, such as {token} "
-                "(the test split ships without them); leave them out, or choose labels=None"
+                "(the test split has none); exclude them, or choose labels=None"
             )
 
     def _check_latency(self) -> None:
-        """Raise now, and not later in an epoch, if partners' data would precede the recording."""
+        """Check that partners' data are from the recording now, and not later in an epoch.
+
+        Raises:
+            ConfigError: If partners' data would be from before the recording.
+        """
         frames = 0 if self.config.link is None else self.config.link.latency_frames
-        samples, scenarios = self._dataset.columns("sample"), self._dataset.columns("scenario")
-        first_frame_rows = scenarios["first_frame_row"][samples["scenario_row"][self._rows]]
+        samples = self._dataset.columns("sample")
+        scenario_rows = samples["scenario_row"][self._rows]
+        first_frame_rows = self._dataset.columns("scenario")["first_frame_row"][scenario_rows]
         frame_numbers = samples["frame_row"][self._rows] - first_frame_rows
         refused_tokens = []
         for row in self._rows[frame_numbers < frames].tolist():
@@ -359,14 +372,19 @@ class V2XDataset(TorchDataset):
         if refused_tokens:
             raise ConfigError(
                 f"latency: {len(refused_tokens)} of the {len(self)} samples are within the first "
-                f"{frames / 10} s of their scenario, such as {refused_tokens[0]}, so that "
-                "partners' data would be from before it; leave them out, or choose a shorter "
-                "latency"
+                f"{frames / 10} s of their scenario, such as {refused_tokens[0]}, so partners' "
+                "data would be from before its start; exclude these samples, or choose a "
+                "shorter latency"
             )
 
 
 def _sample_rows(dataset: Dataset, tokens: Iterable[RowArgument]) -> list[int]:
-    """Return the rows of samples; raises ConfigError and TokenError."""
+    """Return the rows of samples.
+
+    Raises:
+        ConfigError: If the dataset is not a release, or a single sample is given.
+        TokenError: If there is no such sample.
+    """
     if not isinstance(dataset, Dataset):
         raise ConfigError(
             f"dataset: expected an open release, DeepAccident(dataroot=…), found {dataset!r}"
@@ -396,10 +414,10 @@ class AllEgosDataset(V2XDataset):
     agents of the release at this moment, all with the same augmentation, and:
 
     - `egos`: tokens of the E samples of this moment, without agents with skipped sensor files.
-    - `partners` (E, A) bool: the agents that cooperate with each ego, as configured by `agents`,
-      including itself.
-    - `targets`: E dicts with the boxes, labels and segmentation of a `V2XDataset` item, each in its
-      ego's own frame.
+    - `partners` (E, A) bool: whether each agent cooperates with each ego, as configured by
+      `agents`; an ego cooperates with itself.
+    - `targets`: E dicts with the boxes, labels and segmentation of a `V2XDataset` item, each in the
+      frame of its ego.
 
     `collate_all_egos` makes batches of them.
 
@@ -417,7 +435,8 @@ class AllEgosDataset(V2XDataset):
         Args:
             dataset: The release.
             tokens: Tokens or records of samples.
-            config: The contents; None for `V2XConfig()`. Its `agents` cooperate with each ego.
+            config: Contents of an item; None for `V2XConfig()`. Its `agents` cooperate with each
+                ego.
 
         Raises:
             DeepAccidentError: As in `V2XDataset`.
@@ -436,8 +455,9 @@ class AllEgosDataset(V2XDataset):
             moments.setdefault((scenario, frame), []).append(sample)
         self.egos = list(moments.values())
         self._agents = config.agents
-        super().__init__(dataset, [egos[0] for egos in self.egos], replace(config, agents=None))
-        # A mistake is the same for all moments, so the first one is enough.
+        first_egos = [egos[0] for egos in self.egos]
+        super().__init__(dataset, first_egos, replace(config, agents=None))
+        # a mistake is the same for all moments, so the first moment is enough
         for egos in self.egos[:1]:
             for ego in egos:
                 sensor_data.participants(dataset, ego, config.agents)
@@ -447,7 +467,7 @@ class AllEgosDataset(V2XDataset):
         return self.item(index, int(self._epoch))
 
     def item(self, index: int, epoch: int) -> V2XItem:
-        """Return the item of a moment in an epoch, whatever `set_epoch` has set.
+        """Return the item of a moment in a given epoch, instead of the one that `set_epoch` set.
 
         It is for loaders that continue through epochs.
         """
@@ -455,23 +475,24 @@ class AllEgosDataset(V2XDataset):
         moment_egos = self.egos[position]
         augmentation = self.config.augmentation_of(epoch, position)
         item = self._received_item(moment_egos[0], augmentation)
-        present_names = [
-            name
-            for name, valid in zip(item["agents"], item["agent_valid"][:, -1], strict=True)
-            if valid
-        ]
-        egos = [ego for ego in moment_egos if ego.rsplit("/", 2)[1] in present_names]
+        has_data = item["agent_valid"][:, -1]
+        present_names = set(compress(item["agents"], has_data))
+        egos = []
+        for ego in moment_egos:
+            _, name, _ = ego.rsplit("/", 2)
+            if name in present_names:
+                egos.append(ego)
         if not egos:
             raise MissingFileError(
-                f"{moment_egos[0]}: no agent has all its sensor files at this moment; take "
-                "scenarios that have them, by a split file (deepaccident split … --where … --out "
-                "FILE.txt), or choose fewer cameras"
+                f"{moment_egos[0]}: no agent has all its sensor files at this moment; choose "
+                "scenarios that have these files with a split file (deepaccident split … "
+                "--where … --out FILE.txt), or choose fewer cameras"
             )
-        is_heard = []
+        is_partner = []
         for ego in egos:
-            partners = sensor_data.participants(self._dataset, ego, self._agents)
-            is_heard.append([name in partners for name in item["agents"]])
+            partner_names = sensor_data.participants(self._dataset, ego, self._agents)
+            is_partner.append([name in partner_names for name in item["agents"]])
         item["egos"] = tuple(egos)
-        item["partners"] = tensor(np.array(is_heard))
+        item["partners"] = tensor(is_partner)
         item["targets"] = self._target_items(egos, augmentation)
         return V2XItem(item)

@@ -1,10 +1,8 @@
-"""The sensor data of cooperating agents for a sample, as arrays (agents × past frames × …)."""
-
-from __future__ import annotations
+"""The sensor data of cooperating agents for a sample, as arrays (agents, past frames, …)."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -26,14 +24,14 @@ from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import LIDAR, AgentName
 from deepaccident_devkit.training.image_cache import ImageCache
 from deepaccident_devkit.training.torch.config import V2XConfig, augmented_points, augmented_pose
-from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
+from deepaccident_devkit.v2x import Agents, cooperating_agents
 from deepaccident_devkit.v2x.messages import Message, messages
 
-_NO_POINTS: Final = np.zeros((0, 4), dtype=np.float32)
+_NO_POINTS = np.zeros((0, 4), dtype=np.float32)
 Received = Sequence[Mapping[AgentName, Message]]
-"""For each past frame, the present last: sender → its message, if it arrived."""
-# Name → rows and columns.
-_MATRICES: Final = {"intrinsics": 3, "ego_from_camera": 4, "image_from_ego": 4}
+"""For each past frame, the present last: sender → the message that arrived from it."""
+# Name of a square matrix → number of its rows.
+_MATRICES = {"intrinsics": 3, "ego_from_camera": 4, "image_from_ego": 4}
 
 
 def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentName, ...]:
@@ -42,7 +40,8 @@ def participants(dataset: Dataset, sample: str, agents: Agents) -> tuple[AgentNa
     Errors are as in `v2x.cooperating_agents`.
     """
     own_agent = cooperating_agents(dataset, sample, "single")
-    return tuple(dict.fromkeys([*own_agent, *cooperating_agents(dataset, sample, agents)]))
+    cooperating = cooperating_agents(dataset, sample, agents)
+    return tuple(dict.fromkeys([*own_agent, *cooperating]))
 
 
 def received_messages(
@@ -51,26 +50,29 @@ def received_messages(
     """Return the messages that arrive at a sample and at the `config.past` − 1 moments before it.
 
     Each moment's messages come through the link. A moment before the recording has no messages. If
-    latency asks for data from before the recording, the moment has no messages of partners; at the
-    sample itself that raises ConfigError.
+    partners' data would be from before the recording because of the latency, the moment has no
+    messages of partners; at the sample itself that is an error.
+
+    Raises:
+        ConfigError: If partners' data for the sample itself would be from before the recording.
     """
     scenario, ego, number = sample.rsplit("/", 2)
+    latency_frames = 0
+    if config.link is not None:
+        latency_frames = config.link.latency_frames
     received: list[dict[AgentName, Message]] = []
     for steps_back in range(config.past - 1, -1, -1):
-        index = int(number) - steps_back * (config.step or 1)
-        if index < 1:
+        frame = int(number) - steps_back * (config.step or 1)
+        if frame < 1:
             received.append({})
             continue
-        senders = names if not steps_back or _reaches(config.link, index) else names[:1]
-        moment = sample_token(scenario, ego, index)
+        senders = names
+        if steps_back and frame <= latency_frames:
+            senders = names[:1]
+        moment = sample_token(scenario, ego, frame)
         moment_messages = messages(dataset, moment, senders, config.link)
         received.append({message.agent: message for message in moment_messages})
     return received
-
-
-def _reaches(link: Link | None, index: int) -> bool:
-    """Return whether data that arrive at a frame (from 1) are from the recording."""
-    return link is None or index > link.latency_frames
 
 
 def with_files(
@@ -83,13 +85,25 @@ def with_files(
     *,
     needs_own: bool = True,
 ) -> tuple[Received, IntArray]:
-    """Return the messages with all their sensor files, and the number of missing files (A, P).
+    """Return the messages that have all their sensor files, and the numbers of missing files.
 
-    The numbers are of each agent and frame. With a cache, images exist if the cache has them.
+    With a cache, images exist if the cache has them.
+
+    Args:
+        dataset: The release.
+        sample: Token of the sample.
+        names: Names of the A agents.
+        arrived: Messages of P frames.
+        config: Contents of the sample's item.
+        cache: Cache of images; None for the release's own images.
+        needs_own: Whether the sample's own agent must have its files of the present.
+
+    Returns:
+        The messages, and the number of missing files of each agent and frame, (A, P).
 
     Raises:
-        MissingFileError: A file is missing and `on_missing` forbids it; or a file of the sample's
-            own agent at the present is missing, and it `needs_own`.
+        MissingFileError: If a file is missing and `on_missing` forbids that, or a file that the
+            sample's own agent must have is missing.
     """
     channels: list[str] = [LIDAR] if config.points else []
     if config.images is not None:
@@ -97,47 +111,47 @@ def with_files(
     skippable = MissingFiles(dataset.dataroot, config.on_missing)
     necessary = MissingFiles(dataset.dataroot, "skip")  # their error has another remedy
 
-    def lacks(token: str, channel: str, *, is_own: bool) -> bool:
+    def is_missing(token: str, channel: str, *, is_own: bool) -> bool:
         if cache is not None and channel != LIDAR:
-            # Otherwise loading the image raises the error.
-            return (is_own or config.on_missing == "skip") and not cache.has(token)
+            # otherwise loading the image raises the error
+            is_checked = is_own or config.on_missing == "skip"
+            return is_checked and not cache.has(token)
         files = necessary if is_own else skippable
         return not files.has(dataset.sensor_path(token), channel)
 
     missing_counts = np.zeros((len(names), len(arrived)), dtype=np.int64)
-    # The present comes first, because its missing files are an error.
+    complete: list[dict[AgentName, Message]] = []
+    # the present comes first, because its missing files are an error
     for frame in reversed(range(len(arrived))):
+        complete.insert(0, {})
         for name, message in arrived[frame].items():
             is_own = needs_own and message.sample == sample
-            missing = []
+            missing_channels = []
             for channel in channels:
-                if lacks(f"{message.sample}/{channel}", channel, is_own=is_own):
-                    missing.append(channel)
-            if is_own and missing:
-                location = "" if cache is None or missing[0] == LIDAR else " in the cache of images"
+                if is_missing(f"{message.sample}/{channel}", channel, is_own=is_own):
+                    missing_channels.append(channel)
+            if not missing_channels:
+                complete[0][name] = message
+            elif is_own:
+                path = dataset.sensor_path(f"{sample}/{missing_channels[0]}")
+                is_cached = cache is not None and missing_channels[0] != LIDAR
+                location = " in the cache of images" if is_cached else ""
                 raise MissingFileError(
-                    f"{dataset.sensor_path(f'{sample}/{missing[0]}')}: no such file{location}; "
-                    f"{sample} lacks {len(missing)} of the {len(channels)} files of its own agent, "
-                    "which cannot be skipped; unpack the archives that hold them, choose other "
-                    "sensors, or take only samples that have them: "
-                    f"da.training_samples(split, sensors={channels})"
+                    f"{path}: no such file{location}; {sample} lacks {len(missing_channels)} of "
+                    f"the {len(channels)} files of its own agent, which cannot be skipped; unpack "
+                    "the archives that contain them, choose other sensors, or use only samples "
+                    f"with them: da.training_samples(split, sensors={channels})"
                 )
-            missing_counts[names.index(name), frame] = len(missing)
-    complete = []
-    for frame, moment in enumerate(arrived):
-        complete.append(
-            {
-                name: message
-                for name, message in moment.items()
-                if not missing_counts[names.index(name), frame]
-            }
-        )
+            missing_counts[names.index(name), frame] = len(missing_channels)
     return complete, missing_counts
 
 
 def valid_mask(names: Sequence[AgentName], arrived: Received) -> BoolArray:
-    """Return whether each message arrived, (A, P) bool."""
-    return np.array([[name in moment for moment in arrived] for name in names])
+    """Return whether each agent's message arrived at each frame, (A, P) bool."""
+    valid = np.zeros((len(names), len(arrived)), dtype=bool)
+    for agent, name in enumerate(names):
+        valid[agent] = [name in moment for moment in arrived]
+    return valid
 
 
 def relative_poses(
@@ -147,9 +161,9 @@ def relative_poses(
     arrived: Received,
     augmentation: Augmentation,
 ) -> AnyArray:
-    """Return `ego_from_agent` (A, P, 4, 4) float32: augmented, with the link's errors.
+    """Return the augmented `ego_from_agent` (A, P, 4, 4) float32, with the link's errors.
 
-    It is the identity without a message.
+    Without a message it is the identity.
     """
     ego_from_world = dataset.world_from(sample, "ego").inverse()
     poses = np.tile(np.eye(4), (len(names), len(arrived), 1, 1))
@@ -164,26 +178,28 @@ def relative_poses(
 def own_motions(
     dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> AnyArray:
-    """Return `agent_from_past` (A, P, 4, 4) float32: augmented, exact.
+    """Return the augmented `agent_from_past` (A, P, 4, 4) float32, without the link's errors.
 
-    It is the identity without a message.
+    Without a message it is the identity.
     """
     poses = np.tile(np.eye(4), (len(names), len(arrived), 1, 1))
+    *past_moments, present = arrived
     for agent, name in enumerate(names):
-        if name not in arrived[-1]:
+        if name not in present:
             continue
-        agent_from_world = dataset.world_from(arrived[-1][name].sample, "ego").inverse()
-        for frame, moment in enumerate(arrived[:-1]):
+        agent_from_world = dataset.world_from(present[name].sample, "ego").inverse()
+        for frame, moment in enumerate(past_moments):
             if name in moment:
-                pose = (agent_from_world @ dataset.world_from(moment[name].sample, "ego")).matrix
-                poses[agent, frame] = augmented_pose(pose, augmentation)
+                world_from_past = dataset.world_from(moment[name].sample, "ego")
+                agent_from_past = agent_from_world @ world_from_past
+                poses[agent, frame] = augmented_pose(agent_from_past.matrix, augmentation)
     return poses.astype(np.float32)
 
 
 def point_clouds(
     dataset: Dataset, names: Sequence[AgentName], arrived: Received, augmentation: Augmentation
 ) -> list[list[AnyArray]]:
-    """Return the cloud (N, 4) float32 of each agent and moment; empty without a message.
+    """Return the points (N, 4) float32 of each agent and moment; empty without a message.
 
     The columns are x y z in the sender's own augmented ego frame, and intensity.
     """
@@ -210,46 +226,55 @@ def camera_arrays(
 ) -> dict[str, AnyArray]:
     """Return the arrays of all agents' C cameras.
 
-    Without a message, images are 0 and matrices are the identity. The arrays are `images` (A, P, C,
-    3, h, w) as configured, and, all float32, `intrinsics` (A, P, C, 3, 3), `ego_from_camera` (A, P,
-    C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders' own augmented ego frames.
-    Raises ConfigError if images have different sizes, or the crop reaches beyond them.
+    Without a message, images are 0 and matrices are the identity.
+
+    Returns:
+        `images` (A, P, C, 3, h, w) as configured, and, all float32, `intrinsics` (A, P, C, 3, 3),
+        `ego_from_camera` (A, P, C, 4, 4) and `image_from_ego` (A, P, C, 4, 4), with the senders'
+        own augmented ego frames.
+
+    Raises:
+        ConfigError: If images have different sizes, or are smaller than the crop.
     """
     from torch.utils.data import get_worker_info
 
     load = partial(config.load, dataset) if cache is None else partial(cache.load, config, dataset)
-    map_function = map if cache is not None or get_worker_info() is not None else _map_in_threads
+    has_free_cores = cache is None and get_worker_info() is None
+    map_function = _map_in_threads if has_free_cores else map
     shape = (len(names), len(arrived), len(config.cameras))
     keep_freed()
     images: ByteArray = np.zeros((*shape, 3, 0, 0), dtype=np.uint8)  # until the size is known
-    matrices = {
-        key: np.tile(np.eye(size, dtype=np.float32), (*shape, 1, 1))
-        for key, size in _MATRICES.items()
-    }
+    matrices = {}
+    for key, size in _MATRICES.items():
+        identity = np.eye(size, dtype=np.float32)
+        matrices[key] = np.tile(identity, (*shape, 1, 1))
     for frame, moment in enumerate(arrived):
         for name, message in moment.items():
-            agent, intrinsics = names.index(name), []
+            agent = names.index(name)
+            intrinsics = []
             tokens = [f"{message.sample}/{channel}" for channel in config.cameras]
-            for camera, (pixels, intrinsic) in enumerate(map_function(load, tokens)):
+            for camera, (image, intrinsic) in enumerate(map_function(load, tokens)):
+                image_size = image.shape[:2]
                 if not images.size:
-                    images = np.zeros((*shape, 3, *pixels.shape[:2]), dtype=np.uint8)
-                if images.shape[4:] != pixels.shape[:2]:
+                    images = np.zeros((*shape, 3, *image_size), dtype=np.uint8)
+                if images.shape[4:] != image_size:
                     raise ConfigError(
-                        f"images have different sizes, {images.shape[4:]} and {pixels.shape[:2]}; "
+                        f"images have different sizes, {images.shape[4:]} and {image_size}; "
                         "choose resize="
                     )
-                images[agent, frame, camera] = pixels.transpose(2, 0, 1)
+                images[agent, frame, camera] = image.transpose(2, 0, 1)
                 intrinsics.append(intrinsic)
             message_matrices = _camera_matrices(
                 dataset, message.sample, augmentation, config, np.stack(intrinsics)
             )
-            for key, matrix in message_matrices.items():
-                matrices[key][agent, frame] = matrix
-    return {"images": config.values(images, valid_mask(names, arrived)), **matrices}
+            for key, message_matrix in message_matrices.items():
+                matrices[key][agent, frame] = message_matrix
+    values = config.values(images, valid_mask(names, arrived))
+    return {"images": values, **matrices}
 
 
 def _map_in_threads(function: Callable[[str], Any], values: Iterable[str]) -> list[Any]:
-    """Map in threads, for decoding if no workers share the cores.
+    """Map values in threads, for decoding where no workers share the cores.
 
     Decoding runs outside of the interpreter's lock.
     """
@@ -264,13 +289,14 @@ def _camera_matrices(
     config: ImageConfig,
     intrinsics: FloatArray,
 ) -> dict[str, AnyArray]:
-    """Return the matrices of `camera_arrays` of one agent at a moment, without two axes."""
+    """Return the matrices of `camera_arrays` for one agent at one moment, (C, …)."""
     ego_from_world = dataset.world_from(sample, "ego").inverse()
-    poses = [
-        (ego_from_world @ dataset.world_from(sample, channel)).matrix for channel in config.cameras
-    ]
-    ego_from_camera: FloatArray = augmentation.matrix @ np.stack(poses)
-    projection = np.tile(np.eye(4), (len(poses), 1, 1))
+    matrices = []
+    for channel in config.cameras:
+        pose = ego_from_world @ dataset.world_from(sample, channel)
+        matrices.append(pose.matrix)
+    ego_from_camera: FloatArray = augmentation.matrix @ np.stack(matrices)
+    projection = np.tile(np.eye(4), (len(matrices), 1, 1))
     projection[:, :3, :3] = intrinsics
     return {
         "intrinsics": intrinsics,

@@ -38,15 +38,15 @@ MUTATIONS: Mapping[str, Mutation] = {
 HARMLESS: Mapping[str, str] = {
     name: mutation.harmless for name, mutation in MUTATIONS.items() if mutation.harmless is not None
 }
-"""Names of the mutations that `validate` may let pass, as they do no harm → why."""
+"""Name of a mutation that `validate` may let pass, because it does no harm → why."""
 BEYOND: Mapping[str, str] = {
     name: mutation.beyond for name, mutation in MUTATIONS.items() if mutation.beyond is not None
 }
-"""Names of the faults that `validate` does not tell → why."""
+"""Name of a fault that `validate` need not find → why."""
 
 
 def seeded(name: str, seed: int) -> np.random.Generator:
-    """The source of all that is random in one application."""
+    """Return the random generator for one application of a mutation."""
     return np.random.default_rng([seed, *name.encode()])
 
 

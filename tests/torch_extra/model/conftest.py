@@ -1,4 +1,4 @@
-"""Models in a small size, their data, and runs that several tests look at."""
+"""Small models and their data."""
 
 import functools
 import importlib.util
@@ -12,9 +12,9 @@ from deepaccident_devkit.taxonomy import AGENTS
 
 if importlib.util.find_spec("torch") is not None:
     import torch
-    from torch_extra.model.small_model import small
+    from torch_extra.model.small_model import small_config
 
-    torch.set_num_threads(1)  # several tests run side by side
+    torch.set_num_threads(1)  # several tests run at the same time
 
     from deepaccident_devkit.plugins.model.inputs import Handedness, ModelInputs, model_inputs
     from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
@@ -23,8 +23,7 @@ if importlib.util.find_spec("torch") is not None:
 
 @pytest.fixture(scope="session")
 def config() -> "ModelConfig":
-    """The small one."""
-    return small()
+    return small_config()
 
 
 @pytest.fixture(scope="session")
@@ -35,46 +34,43 @@ def moment(sample: str) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def seeded(da: DeepAccident, moment: list[str]) -> Callable[..., "V2XFormer"]:
-    """A model whose weights depend on a seed alone, in evaluation mode.
+def make_model(da: DeepAccident, moment: list[str]) -> Callable[..., "V2XFormer"]:
+    """A maker of models in evaluation mode with weights that depend only on a seed.
 
-    Its batch statistics are those of a moment, so that signals neither fade nor grow on their way.
+    A real moment sets the batch statistics, so that signals neither fade nor grow between layers.
     """
 
     @functools.cache
-    def inputs(given: "V2XConfig", handedness: "Handedness") -> "ModelInputs":
-        return model_inputs(collate([V2XDataset(da, moment[:1], given)[0]]), handedness)
+    def load_inputs(config: "V2XConfig", handedness: "Handedness") -> "ModelInputs":
+        item = V2XDataset(da, moment[:1], config)[0]
+        return model_inputs(collate([item]), handedness)
 
-    def made(config: "ModelConfig", seed: int = 0) -> "V2XFormer":
+    def make(config: "ModelConfig", seed: int = 0) -> "V2XFormer":
         torch.manual_seed(seed)
         model = V2XFormer(config)
         for module in model.modules():
             if isinstance(module, torch.nn.modules.batchnorm._BatchNorm):
                 module.momentum = 1.0
         with torch.no_grad():
-            model(inputs(config.inputs("all"), config.handedness))
+            model(load_inputs(config.inputs("all"), config.handedness))
         return model.eval()
 
-    return made
+    return make
 
 
 @pytest.fixture
-def predicted() -> Callable[..., list[Any]]:
-    """A model's maps of both tasks for each ego, with the same draws for all of them."""
+def predict_maps() -> Callable[..., list[Any]]:
+    """A predictor of the maps of both tasks for each ego, with the same draws for all egos."""
 
-    def of(model: "V2XFormer", inputs: "ModelInputs") -> list[Any]:
-        noise = model.noise(1, torch.Generator().manual_seed(4)).expand(
-            -1, len(inputs.ego_rows), -1, -1, -1
-        )
+    def predict(model: "V2XFormer", inputs: "ModelInputs") -> list[Any]:
+        noise = model.noise(1, torch.Generator().manual_seed(4))
+        noise = noise.expand(-1, len(inputs.ego_rows), -1, -1, -1)
         with torch.inference_mode():
-            found = model(inputs, noise=noise)
-        maps = [each.movedim(1, 0) for each in found.motion.maps]
-        return [*maps, *(each for task in found.detection for each in (task.heatmap, task.code))]
+            outputs = model(inputs, noise=noise)
 
-    return of
+        maps = [values.movedim(1, 0) for values in outputs.motion.maps]
+        for task in outputs.detection:
+            maps += [task.heatmap, task.code]
+        return maps
 
-
-@pytest.fixture(scope="session")
-def root(da: DeepAccident) -> str:
-    """Where the release is, for other processes."""
-    return str(da.dataroot)
+    return predict

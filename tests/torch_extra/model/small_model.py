@@ -1,5 +1,6 @@
-"""`tiny` in an even smaller size, and runs with it: in a module that other processes can import by
-name.
+"""The preset `tiny` in an even smaller size, and runs with it.
+
+Other processes import this module by its name.
 """
 
 import os
@@ -23,8 +24,8 @@ from deepaccident_devkit.plugins.model.network import CameraConfig, ModelConfig
 from deepaccident_devkit.plugins.model.pillars import PillarConfig
 from deepaccident_devkit.plugins.model.training_run import TrainConfig
 
-ALONG = (-50.0, 50.0, 2.5)
-"""40 cells: 20 after the encoder, 5 of the latent."""
+AXIS = (-50.0, 50.0, 2.5)
+"""Start, end and step in metres: 40 cells, which are 20 after the encoder and 5 in the latent."""
 RUN = TrainConfig(
     steps=6,
     egos=2,
@@ -34,13 +35,11 @@ RUN = TrainConfig(
     save_every=2,
     warm_up=0.2,
 )
-"""A run of seconds, whose steps are saved two by two."""
+"""A run that takes seconds and saves every second step."""
 
 
-def small() -> ModelConfig:
-    """The wiring of `tiny` with 40 × 40 cells, images of 64 × 36 pixels, and labels of three
-    frames, 0.1 s apart.
-    """
+def small_config() -> ModelConfig:
+    """Return `tiny` with 40 × 40 cells, 64 × 36 pixels and three label frames 0.1 s apart."""
     tiny = presets.tiny()
     return replace(
         tiny,
@@ -53,38 +52,34 @@ def small() -> ModelConfig:
                 in_channels=8,
                 channels=8,
                 depth=(2.0, 50.0, 4.0),
-                x=ALONG,
-                y=ALONG,
+                x=AXIS,
+                y=AXIS,
                 image_size=(48, 64),
             ),
         ),
-        temporal=replace(tiny.temporal, channels=8, grid=BevGrid(x=ALONG, y=ALONG)),
+        temporal=replace(tiny.temporal, channels=8, grid=BevGrid(x=AXIS, y=AXIS)),
         bev=BevUNetConfig(in_channels=8, out_channels=16, widths=(16, 16)),
         motion=replace(
             tiny.motion, in_channels=16, latent=4, future_frames=2, hidden=8, upsample=2, samples=2
         ),
-        detection=replace(tiny.detection, in_channels=16, shared_channels=8, x=ALONG, y=ALONG),
-        labels=replace(tiny.labels, grid=BevGrid(x=ALONG, y=ALONG), step=1, future_frames=2),
+        detection=replace(tiny.detection, in_channels=16, shared_channels=8, x=AXIS, y=AXIS),
+        labels=replace(tiny.labels, grid=BevGrid(x=AXIS, y=AXIS), step=1, future_frames=2),
     )
 
 
-def small_both() -> ModelConfig:
-    """`small`, which also sees with LiDARs."""
-    config = small()
+def small_both_config() -> ModelConfig:
+    config = small_config()
     return replace(config, pillars=PillarConfig(channels=8, grid=config.grid, width=8))
 
 
-def small_lidar() -> ModelConfig:
-    """`small`, which sees with LiDARs alone."""
-    return replace(small_both(), cameras=None)
+def small_lidar_config() -> ModelConfig:
+    return replace(small_both_config(), cameras=None)
 
 
-def small_released() -> ModelConfig:
-    """The wiring of `released` with all its quirks, two frames and a narrow encoder; the released
-    kinds of layers.
-    """
+def small_released_config() -> ModelConfig:
+    """Return `released` with its layers and quirks, but two frames and a narrow encoder."""
     released = presets.released()
-    along = (-48.0, 48.0, 3.0)
+    axis = (-48.0, 48.0, 3.0)
     return replace(
         released,
         cameras=CameraConfig(
@@ -101,16 +96,16 @@ def small_released() -> ModelConfig:
                 in_channels=16,
                 channels=8,
                 depth=(1.0, 41.0, 5.0),
-                x=along,
-                y=along,
+                x=axis,
+                y=axis,
                 image_size=(32, 64),
             ),
         ),
-        temporal=replace(released.temporal, channels=8, grid=BevGrid(x=along, y=along)),
+        temporal=replace(released.temporal, channels=8, grid=BevGrid(x=axis, y=axis)),
         fusion=replace(released.fusion, channels=8, ego_channels=(1, 5)),
         bev=BevEncodeConfig(in_channels=8, out_channels=16, widths=(8, 8, 16)),
         motion=replace(released.motion, in_channels=16, latent=4, future_frames=2, samples=2),
-        detection=replace(released.detection, in_channels=16, shared_channels=8, x=along, y=along),
+        detection=replace(released.detection, in_channels=16, shared_channels=8, x=axis, y=axis),
         labels=replace(
             released.labels,
             grid=BevGrid(
@@ -124,7 +119,7 @@ def small_released() -> ModelConfig:
     )
 
 
-def trained(
+def train_small_model(
     dataset: DeepAccident,
     folder: Path,
     config: TrainConfig = RUN,
@@ -132,50 +127,49 @@ def trained(
     curves: bool = False,
     **options: Any,
 ) -> Path:
-    """A run with `small` in the place of `tiny`, on one thread; curves, which take seconds, are
-    left out.
+    """Train the small model instead of `tiny` on one thread, and return the weights' path.
+
+    Curves take seconds to draw, so that they are left out by default.
     """
     torch.set_num_threads(1)
-    drawn = training.save_training if curves else lambda *_: None
+    save_training = training.save_training if curves else lambda *_: None
     with (
-        patch.object(presets, "MODEL_PRESETS", {"tiny": small}),
-        patch.object(training, "save_training", drawn),
+        patch.object(presets, "MODEL_PRESETS", {"tiny": small_config}),
+        patch.object(training, "save_training", save_training),
     ):
         return training.train(
             dataset, folder, presets.ModelChoice(), config, device="cpu", **options
         )
 
 
-def killed_run(root: str, folder: str, step: int) -> None:
-    """A run that is killed as soon as it has logged a step, before it saves anything."""
-    add = training.add_to_log
+def train_and_die(root: str, folder: str, step: int) -> None:
+    """Train until a step is logged, and die before anything of it is saved."""
+    add_to_log = training.add_to_log
 
     def add_and_die(run: Path, row: dict[str, Any]) -> None:
-        add(run, row)
+        add_to_log(run, row)
         if row["step"] == step:
             os.kill(os.getpid(), signal.SIGKILL)
 
     with patch.object(training, "add_to_log", add_and_die):
-        trained(DeepAccident("v1", root, verbose=False), Path(folder))
+        train_small_model(DeepAccident("v1", root, verbose=False), Path(folder))
 
 
-def one_of_several(root: str, folder: Path) -> None:
-    """A run of two steps on one of several processes; leaves its parameters, as it has them at the
-    end.
-    """
-    made: list[torch.nn.Module] = []
-    model_of = training.new_model
+def train_one_rank(root: str, folder: Path) -> None:
+    """Train for two steps as one of several processes, and save this rank's final parameters."""
+    models: list[torch.nn.Module] = []
+    new_model = training.new_model
 
-    def watched(*arguments: Any) -> Any:
-        made.append(model_of(*arguments))
-        return made[-1]
+    def record_model(*arguments: Any) -> Any:
+        models.append(new_model(*arguments))
+        return models[-1]
 
-    with patch.object(training, "new_model", watched):
-        trained(
+    with patch.object(training, "new_model", record_model):
+        train_small_model(
             DeepAccident("v1", root, verbose=False), folder, replace(RUN, steps=2, validation=None)
         )
-    torch.save(dict(made[0].named_parameters()), folder / f"rank_{os.environ['RANK']}.pth")
+    torch.save(dict(models[0].named_parameters()), folder / f"rank_{os.environ['RANK']}.pth")
 
 
 if __name__ == "__main__":  # under `torchrun`
-    one_of_several(sys.argv[1], Path(sys.argv[2]))
+    train_one_rank(sys.argv[1], Path(sys.argv[2]))

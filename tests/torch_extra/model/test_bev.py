@@ -5,7 +5,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from refusals import assert_refused
+from support.expected_errors import assert_raises
+from torch_extra.model.gradients import names_without_gradient
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
@@ -34,27 +35,30 @@ ENCODERS = [
 def test_a_plane_stays_a_plane_in_every_grid(orientation, low, counts, size) -> None:
     x, y = ((start, start + count * size, size) for start, count in zip(low, counts, strict=True))
     source, target = (grid.with_orientation(orientation) for grid in (SOURCE, BevGrid(x, y)))
-    found = crop(plane(source), source, target)
-    torch.testing.assert_close(found, plane(target), rtol=0, atol=1e-3)
+
+    cropped = crop(draw_plane(source), source, target)
+
+    torch.testing.assert_close(cropped, draw_plane(target), rtol=0, atol=1e-3)
 
 
 def test_beyond_the_source_features_fade_to_zero_within_half_a_cell() -> None:
     target = BevGrid((-20.0, 20.0, 0.2), (-20.0, 20.0, 0.2))
     x, y = np.moveaxis(target.centers(), -1, 0)
-    beyond = np.maximum(
-        *(
-            abs(p - (low + high) / 2) - (high - low) / 2
-            for p, (low, high, _) in ((x, SOURCE.x), (y, SOURCE.y))
-        )
+    beyond_x, beyond_y = (
+        abs(centers - (low + high) / 2) - (high - low) / 2
+        for centers, (low, high, _) in ((x, SOURCE.x), (y, SOURCE.y))
     )
-    found = crop(torch.ones(1, 1, *SOURCE.shape), SOURCE, target)[0, 0].numpy()
-    np.testing.assert_allclose(found[beyond > 0.5], 0, atol=1e-5)
-    np.testing.assert_allclose(found[beyond < -0.5], 1, atol=1e-5)
-    assert (found[abs(beyond) < 0.1] > 0.1).all()
+    beyond = np.maximum(beyond_x, beyond_y)
+
+    cropped = crop(torch.ones(1, 1, *SOURCE.shape), SOURCE, target)[0, 0].numpy()
+
+    np.testing.assert_allclose(cropped[beyond > 0.5], 0, atol=1e-5)
+    np.testing.assert_allclose(cropped[beyond < -0.5], 1, atol=1e-5)
+    assert (cropped[abs(beyond) < 0.1] > 0.1).all()
 
 
-def test_what_does_not_fit_is_refused() -> None:
-    assert_refused(
+def test_features_that_do_not_fit_the_grids_are_refused() -> None:
+    assert_raises(
         (
             lambda: crop(torch.zeros(1, 1, 18, 30), SOURCE, BevGrid()),
             GeometryError,
@@ -71,14 +75,12 @@ def test_what_does_not_fit_is_refused() -> None:
 @pytest.mark.parametrize(("encoder", "shape"), ENCODERS)
 def test_encoders_have_their_sizes_and_use_every_weight(encoder, shape) -> None:
     encoder.train().zero_grad()
-    result = encoder(torch.rand(2, 6, 16, 24))
-    assert tuple(result.shape) == (2, *shape)
-    result.square().sum().backward()
-    assert [
-        name
-        for name, each in encoder.named_parameters()
-        if each.grad is None or not each.grad.any()
-    ] == []
+
+    features = encoder(torch.rand(2, 6, 16, 24))
+    features.square().sum().backward()
+
+    assert tuple(features.shape) == (2, *shape)
+    assert names_without_gradient(encoder) == []
 
 
 @pytest.mark.parametrize(
@@ -99,10 +101,11 @@ def test_encoders_have_their_sizes_and_use_every_weight(encoder, shape) -> None:
     ],
 )
 def test_impossible_sizes_are_refused(config, values, message) -> None:
-    assert_refused((lambda: config(**values), ConfigError, message))
+    assert_raises((lambda: config(**values), ConfigError, message))
 
 
-def plane(grid: BevGrid) -> torch.Tensor:
-    """(1, 1, H, W) a linear function of x and y at the cells' centres."""
+def draw_plane(grid: BevGrid) -> torch.Tensor:
+    """Return a linear function of x and y at the cells' centres, shape (1, 1, H, W)."""
     x, y = np.moveaxis(grid.centers(), -1, 0)
-    return torch.from_numpy(0.7 * x - 1.3 * y + 2.0).float()[None, None]
+    heights = torch.from_numpy(0.7 * x - 1.3 * y + 2.0)
+    return heights.float()[None, None]

@@ -1,11 +1,11 @@
-"""Image encoders: shapes, names, windows, and that official Swin weights mean the same after their
-conversion.
-"""
+"""Image encoders: shapes, gradients, windows, and wrong configurations."""
 
 import pytest
 import torch
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 from torch import nn
+from torch_extra.model.gradients import names_without_gradient
+from torch_extra.model.tensors import make_noise
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.images import (
@@ -14,7 +14,7 @@ from deepaccident_devkit.plugins.model.images import (
     SwinConfig,
     from_official,
     image_encoder,
-    normalised,
+    normalise_images,
 )
 from deepaccident_devkit.plugins.model.images.swin import PatchMerging
 
@@ -38,57 +38,55 @@ ENCODERS = [
 ]
 
 
-def noise(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.parametrize(
+WITH_ENCODERS = pytest.mark.parametrize(
     "config", ENCODERS, ids=lambda config: f"{type(config).__name__}-{config.stride}"
 )
+
+
+@WITH_ENCODERS
 def test_features_have_the_stated_size_and_all_weights_learn(config):
     backbone, neck = image_encoder(config)
-    maps = backbone(noise(2, 3, 90, 100))
+    stride = config.stride
+
+    maps = backbone(make_noise(2, 3, 90, 100))
     features = neck(maps)
-    assert features.shape == (
-        2,
-        config.neck_channels,
-        -(-90 // config.stride),
-        -(-100 // config.stride),
-    )
-    assert (tuple(each.shape[1] for each in maps), neck.out_channels) == (
-        backbone.out_channels,
-        config.neck_channels,
-    )
-    (features * noise(*features.shape, seed=1)).sum().backward()
-    weights = dict((*backbone.named_parameters(), *neck.named_parameters()))
-    assert [
-        name for name, each in weights.items() if each.grad is None or not each.grad.abs().sum() > 0
-    ] == []
+
+    assert features.shape == (2, config.neck_channels, -(-90 // stride), -(-100 // stride))
+    assert neck.out_channels == config.neck_channels
+    assert tuple(stage.shape[1] for stage in maps) == backbone.out_channels
+
+    (features * make_noise(*features.shape, seed=1)).sum().backward()
+    assert names_without_gradient(backbone, neck) == []
 
 
-@pytest.mark.parametrize(
-    "config", ENCODERS, ids=lambda config: f"{type(config).__name__}-{config.stride}"
-)
+@WITH_ENCODERS
 def test_an_image_does_not_depend_on_the_others_of_its_batch(config):
-    images, (backbone, neck) = (
-        noise(3, 3, 64, 96),
-        (module.eval() for module in image_encoder(config)),
-    )
-    torch.testing.assert_close(
-        neck(backbone(images))[1:2], neck(backbone(images[1:2])), atol=1e-5, rtol=1e-4
-    )
+    images = make_noise(3, 3, 64, 96)
+    backbone, neck = (module.eval() for module in image_encoder(config))
+    features, single = neck(backbone(images)), neck(backbone(images[1:2]))
+    torch.testing.assert_close(features[1:2], single, atol=1e-5, rtol=1e-4)
 
 
 def test_images_are_normalised_channel_by_channel():
-    images = torch.tensor([0, 128, 255], dtype=torch.uint8)[None, :, None, None].expand(2, 3, 2, 2)
-    expected = torch.tensor([(0 - 0.485) / 0.229, (128 / 255 - 0.456) / 0.224, (1 - 0.406) / 0.225])
-    torch.testing.assert_close(normalised(images), expected[None, :, None, None].expand(2, 3, 2, 2))
+    pixel = torch.tensor([0, 128, 255], dtype=torch.uint8)
+    images = pixel[None, :, None, None].expand(2, 3, 2, 2)
+
+    values = normalise_images(images)
+
+    expected = torch.tensor(
+        [
+            (0 - 0.485) / 0.229,
+            (128 / 255 - 0.456) / 0.224,
+            (1 - 0.406) / 0.225,
+        ]
+    )
+    torch.testing.assert_close(values, expected[None, :, None, None].expand(2, 3, 2, 2))
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: normalised(torch.zeros(1, 3, 4, 4)), "expected uint8, found torch.float32"),
+        (lambda: normalise_images(torch.zeros(1, 3, 4, 4)), "expected uint8, found torch.float32"),
         (lambda: image_encoder("swin"), "expected a SwinConfig or a SmallConvConfig, found 'swin'"),
         (lambda: SmallConvConfig(widths=(8, 8)), "widths: expected three"),
         (lambda: SwinConfig(num_heads=(3, 6)), "num_heads: expected 4"),
@@ -103,8 +101,8 @@ def test_images_are_normalised_channel_by_channel():
         ),
     ],
 )
-def test_what_does_not_fit_is_named(make, message):
-    assert_refused((make, ConfigError, message))
+def test_wrong_values_are_named(make, message):
+    assert_raises((make, ConfigError, message))
 
 
 # --- Swin
@@ -112,20 +110,20 @@ def test_what_does_not_fit_is_named(make, message):
 
 def test_checkpointing_changes_neither_values_nor_gradients():
     torch.manual_seed(0)
-    plain, again = (
-        Swin(SwinConfig(**SMALL_SWIN, checkpointing=each)).train() for each in (False, True)
+    plain, checkpointed = (
+        Swin(SwinConfig(**SMALL_SWIN, checkpointing=choice)).train() for choice in (False, True)
     )
-    again.load_state_dict(plain.state_dict())
-    for network in (plain, again):
-        sum(each.square().sum() for each in network(noise(1, 3, 64, 96))).backward()
-    gradients = [
-        {name: each.grad for name, each in network.named_parameters()} for network in (plain, again)
-    ]
+    checkpointed.load_state_dict(plain.state_dict())
+
+    gradients = []
+    for network in (plain, checkpointed):
+        sum(maps.square().sum() for maps in network(make_noise(1, 3, 64, 96))).backward()
+        gradients.append({name: weight.grad for name, weight in network.named_parameters()})
+
     torch.testing.assert_close(*gradients)
 
 
-def test_maps_of_odd_sizes_are_filled_to_be_halved():
-    merging, features = PatchMerging(2), noise(1, 3, 5, 2)
-    torch.testing.assert_close(
-        merging(features), merging(nn.functional.pad(features, (0, 0, 0, 1, 0, 1)))
-    )
+def test_maps_of_odd_sizes_are_padded_before_they_are_halved():
+    merging, features = PatchMerging(2), make_noise(1, 3, 5, 2)
+    padded = nn.functional.pad(features, (0, 0, 0, 1, 0, 1))
+    torch.testing.assert_close(merging(features), merging(padded))

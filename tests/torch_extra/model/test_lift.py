@@ -1,4 +1,4 @@
-"""The lift: its geometry is the devkit's, and sums are whole."""
+"""The lift: its geometry is the devkit's, and its sums hold all that the pixels have."""
 
 from dataclasses import replace
 
@@ -8,8 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
-from refusals import assert_refused
-from strategies import ANGLES, arrays, rotation_matrix
+from support.expected_errors import assert_raises
+from support.strategies import ANGLES, arrays, rotation_matrix
+from torch_extra.model.tensors import make_noise
 
 from deepaccident_devkit.errors import ConfigError, GeometryError
 from deepaccident_devkit.geometry import SE3, BevGrid, PinholeCamera
@@ -26,37 +27,35 @@ CONFIG = LiftConfig(
     stride=8,
 )
 WIDE = replace(CONFIG, x=(-200, 200, 10), y=(-200, 200, 10), z=(-200, 200, 400))
-# optical axes (x right, y down, z forward) of a camera that looks along the ego's x axis
+# optical axes (x right, y down, z forward) of a camera that faces along the ego's x axis
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 CAMERA = PinholeCamera(np.array([[30.0, 0, 20], [0, 30, 12], [0, 0, 1]]), 40, 24)
 
 
-def noise(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-def rig(seed: int = 0, shape: tuple[int, int, int] = (2, 2, 3)) -> CameraGeometry:
-    """Cameras at heights of a car's that look around."""
+def make_rig(seed: int = 0, shape: tuple[int, int, int] = (2, 2, 3)) -> CameraGeometry:
+    """Make cameras near the origin that face all ways and are tilted a little."""
     random = np.random.default_rng(seed)
     count = int(np.prod(shape))
     angles = random.uniform(-1, 1, (count, 2)) * (np.pi, 0.1)
-    given = {
+    arrays_by_name = {
         "rotation": np.stack([rotation_matrix(yaw, tilt, 0) @ FORWARD for yaw, tilt in angles]),
         "translation": random.uniform(-2, 2, (count, 3)),
         "intrinsics": np.tile(CAMERA.intrinsic, (count, 1, 1)),
     }
-    return CameraGeometry(
-        **{name: torch.tensor(each).float().unflatten(0, shape) for name, each in given.items()}
-    )
+    tensors = {
+        name: torch.tensor(values).float().unflatten(0, shape)
+        for name, values in arrays_by_name.items()
+    }
+    return CameraGeometry(**tensors)
 
 
-def lift_of(config: LiftConfig) -> LiftSplat:
+def make_lift(config: LiftConfig) -> LiftSplat:
     torch.manual_seed(0)
     return LiftSplat(config)
 
 
-def without_weights(config: LiftConfig, bias: dict[int, float]) -> LiftSplat:
-    """One whose depths and features are those of a bias alone."""
+def make_lift_of_bias(config: LiftConfig, bias: dict[int, float]) -> LiftSplat:
+    """Make a lift with depths and features that depend only on a bias."""
     lift = LiftSplat(config)
     torch.nn.init.zeros_(lift.depthnet.weight)
     torch.nn.init.zeros_(lift.depthnet.bias)
@@ -64,14 +63,16 @@ def without_weights(config: LiftConfig, bias: dict[int, float]) -> LiftSplat:
     return lift
 
 
-def posed(rotation: np.ndarray, position: ArrayLike) -> SE3:
-    return SE3(np.vstack([np.column_stack([rotation, position]), [0, 0, 0, 1]]))
+def make_pose(rotation: np.ndarray, position: ArrayLike) -> SE3:
+    upper_rows = np.column_stack([rotation, position])
+    return SE3(np.vstack([upper_rows, [0, 0, 0, 1]]))
 
 
-def one_camera(camera: PinholeCamera, ego_from_camera: SE3) -> CameraGeometry:
-    parts = (ego_from_camera.matrix[:3, :3], ego_from_camera.matrix[:3, 3], camera.intrinsic)
+def make_one_camera(camera: PinholeCamera, ego_from_camera: SE3) -> CameraGeometry:
+    matrix = ego_from_camera.matrix
     rotation, translation, intrinsics = (
-        torch.tensor(np.array(each))[None, None, None] for each in parts
+        torch.tensor(np.array(values))[None, None, None]
+        for values in (matrix[:3, :3], matrix[:3, 3], camera.intrinsic)
     )
     return CameraGeometry(rotation=rotation, translation=translation, intrinsics=intrinsics)
 
@@ -89,41 +90,44 @@ def one_camera(camera: PinholeCamera, ego_from_camera: SE3) -> CameraGeometry:
     arrays((2,), 30.0),
 )
 def test_points_lie_where_the_devkit_sees_them(yaw, pitch, roll, position, fx, fy, centre):
-    """Points project onto the centres of their pixels at their depths, and their cells are those of
-    a BevGrid.
-    """
-    lift = lift_of(replace(CONFIG, z=(-100, 100, 200)))
+    """Points project onto the centres of their pixels, and lie in the cells of a BevGrid."""
+    lift = make_lift(replace(CONFIG, z=(-100, 100, 200)))
     camera = PinholeCamera(
-        np.array([[fx, 0, 20 + centre[0]], [0, fy, 12 + centre[1]], [0, 0, 1]]), 40, 24
+        np.array([[fx, 0, 20 + centre[0]], [0, fy, 12 + centre[1]], [0, 0, 1]]),
+        40,
+        24,
     )
-    ego_from_camera = posed(rotation_matrix(yaw, pitch, roll), position)
-    cameras = one_camera(camera, ego_from_camera)
+    ego_from_camera = make_pose(rotation_matrix(yaw, pitch, roll), position)
+    cameras = make_one_camera(camera, ego_from_camera)
+
     points = lift.points(cameras).numpy().reshape(-1, 3)
-    pixels, depth = camera.project(ego_from_camera.inverse().apply(points))
-    d, i, j = np.meshgrid(np.arange(8), np.arange(3), np.arange(5), indexing="ij")
-    np.testing.assert_allclose(depth, 2.0 + 2 * d.ravel(), atol=1e-4)
-    np.testing.assert_allclose(
-        pixels, np.stack([8 * j.ravel() + 4, 8 * i.ravel() + 4], 1), atol=1e-3
-    )
+
+    pixels, depths = camera.project(ego_from_camera.inverse().apply(points))
+    bins, rows, columns = (values.ravel() for values in np.indices((8, 3, 5)))
+    np.testing.assert_allclose(depths, 2.0 + 2 * bins, atol=1e-4)
+    np.testing.assert_allclose(pixels, np.stack([8 * columns + 4, 8 * rows + 4], 1), atol=1e-3)
 
     index, inside = BevGrid(x=CONFIG.x, y=CONFIG.y).index_of(points)
-    expected = np.where(inside & (np.abs(points[:, 2]) < 100), index @ (32, 1), -1)
-    np.testing.assert_array_equal(lift.cells(cameras).flatten(), expected)
+    inside &= np.abs(points[:, 2]) < 100
+    np.testing.assert_array_equal(
+        lift.cells(cameras).flatten(), np.where(inside, index @ (32, 1), -1)
+    )
 
 
 def test_one_pixel_at_one_depth_lights_one_cell():
-    """A camera 1 m above the ego's origin that looks ahead: pixel row 1, column 3 at 10 m is at
-    (10, −8/3, 1).
+    """The camera is 1 m above the ego's origin and faces ahead.
 
-    Its cell is in row (−8/3 + 16) / 0.5 and column 10 + 12.
+    Its pixel in row 1 and column 3 is at (10, −8/3, 1) in a depth of 10 m. The cell of that point
+    is in row (−8/3 + 16) / 0.5 and column 10 + 12.
     """
-    lift = without_weights(CONFIG, {4: 100.0})  # the fifth depth: 10 m
+    lift = make_lift_of_bias(CONFIG, {4: 100.0})  # the fifth depth: 10 m
     lift.depthnet.weight.data[8:, :3, 0, 0] = torch.eye(3)
-    features, expected = torch.zeros(1, 1, 1, 5, 3, 5), torch.zeros(1, 1, 3, 64, 32)
-    features[0, 0, 0, :3, 1, 3] = expected[0, 0, :, 26, 22] = torch.tensor([1.0, 2.0, 3.0])
-    torch.testing.assert_close(
-        lift(features, one_camera(CAMERA, posed(FORWARD, (0, 0, 1)))), expected
-    )
+    camera = make_one_camera(CAMERA, make_pose(FORWARD, (0, 0, 1)))
+    features = torch.zeros(1, 1, 1, 5, 3, 5)
+    features[0, 0, 0, :3, 1, 3] = torch.tensor([1.0, 2.0, 3.0])
+    expected = torch.zeros(1, 1, 3, 64, 32)
+    expected[0, 0, :, 26, 22] = torch.tensor([1.0, 2.0, 3.0])
+    torch.testing.assert_close(lift(features, camera), expected)
 
 
 @pytest.mark.parametrize(
@@ -135,67 +139,75 @@ def test_one_pixel_at_one_depth_lights_one_cell():
 )
 def test_rays_pass_through_the_centres_or_from_corner_to_corner(frustum, columns, rows):
     rays = LiftSplat(replace(CONFIG, frustum=frustum)).frustum
-    depths, down, along = (
+    axes = (
         torch.arange(2.0, 18, 2),
         torch.tensor(rows).float(),
         torch.tensor(columns).float(),
     )
-    expected = torch.stack(torch.meshgrid(depths, down, along, indexing="ij")[::-1], dim=-1)
-    torch.testing.assert_close(rays, expected, rtol=0, atol=0)
+    torch.testing.assert_close(
+        rays,
+        torch.stack(torch.meshgrid(*axes, indexing="ij")[::-1], dim=-1),
+        rtol=0,
+        atol=0,
+    )
 
 
 # --- sums
 
 
 def test_a_wide_map_holds_all_that_the_pixels_have():
-    """Probabilities of depths sum to 1, so that the map's sum is the sum over pixels, frame by
-    frame.
-    """
-    lift, features = lift_of(WIDE), noise(2, 2, 3, 5, 3, 5)
+    """Probabilities of depths sum to 1, so that the sum of a frame's map is that of its pixels."""
+    lift, features = make_lift(WIDE), make_noise(2, 2, 3, 5, 3, 5)
     pixels = lift.depthnet(features.flatten(0, 2))[:, 8:].unflatten(0, (2, 2, 3))
     torch.testing.assert_close(
-        lift(features, rig()).sum((3, 4)), pixels.sum((2, 4, 5)), atol=1e-4, rtol=1e-4
+        lift(features, make_rig()).sum((3, 4)),
+        pixels.sum((2, 4, 5)),
+        atol=1e-4,
+        rtol=1e-4,
     )
 
 
 def test_gradients_reach_the_features_and_every_weight():
-    lift, features = lift_of(CONFIG), noise(1, 2, 3, 5, 3, 5).requires_grad_()
-    bev = lift(features, rig(shape=(1, 2, 3)))
-    (bev * noise(*bev.shape, seed=1)).sum().backward()
+    lift = make_lift(CONFIG)
+    features = make_noise(1, 2, 3, 5, 3, 5).requires_grad_()
+
+    maps = lift(features, make_rig(shape=(1, 2, 3)))
+    (maps * make_noise(*maps.shape, seed=1)).sum().backward()
+
     assert all((weight.grad != 0).all() for weight in lift.parameters())
     assert (features.grad != 0).any()
 
 
-# --- what `tiny` has beside the release
+# --- options of `tiny` that the release does not have
 
 
 def test_only_points_in_the_band_above_the_road_count():
-    """The road is at the origin's height under cameras that stand above it, and 4 m below those of
-    a pole.
-    """
-    cameras, plain, banded = rig(), lift_of(CONFIG), lift_of(replace(CONFIG, band=(-0.5, 1.5)))
-    for height, road in ((1.8, 0.0), (0.0, -4.0)):
-        cameras.translation[..., 2] = height
-        above, cells = plain.points(cameras)[..., 2] - road, plain.cells(cameras)
-        expected = torch.where((above >= -0.5) & (above < 1.5), cells, -1)
+    """The road is at height 0 under a vehicle's cameras, and 4 m below the cameras of a pole."""
+    cameras, lift = make_rig(), make_lift(CONFIG)
+    banded = make_lift(replace(CONFIG, band=(-0.5, 1.5)))
+    for camera_height, road_height in ((1.8, 0.0), (0.0, -4.0)):
+        cameras.translation[..., 2] = camera_height
+        heights = lift.points(cameras)[..., 2] - road_height
+        cells = lift.cells(cameras)
+        expected = torch.where((heights >= -0.5) & (heights < 1.5), cells, -1)
         assert torch.equal(banded.cells(cameras), expected)
         assert 10 < int((expected >= 0).sum()) < int((cells >= 0).sum()) - 10
 
 
 def test_a_mean_does_not_grow_with_the_number_of_points():
-    """Where all features are equal, each cell that is reached has them, or nearly."""
-    lift, cameras = (
-        without_weights(replace(CONFIG, pooling="mean"), {8: 1.0, 9: 2.0, 10: 3.0}),
-        rig(),
+    """Where all features are equal, each reached cell has almost these features."""
+    lift = make_lift_of_bias(replace(CONFIG, pooling="mean"), {8: 1.0, 9: 2.0, 10: 3.0})
+    cameras = make_rig()
+
+    maps = lift(make_noise(2, 2, 3, 5, 3, 5), cameras)
+
+    cells = lift.cells(cameras).flatten(2).flatten(0, 1)
+    counts = [torch.bincount(frame[frame >= 0], minlength=64 * 32) for frame in cells]
+    mass = torch.stack(counts).view(2, 2, 1, 64, 32) / 8
+    torch.testing.assert_close(
+        maps,
+        mass / (mass + 0.01) * torch.tensor([1.0, 2.0, 3.0])[:, None, None],
     )
-    maps, cells = lift(noise(2, 2, 3, 5, 3, 5), cameras), lift.cells(cameras).flatten(2)
-    points = [
-        [torch.bincount(each[each >= 0], minlength=64 * 32).view(64, 32) for each in row]
-        for row in cells
-    ]
-    mass = torch.stack([torch.stack(row) for row in points]) / 8
-    expected = (mass / (mass + 0.01))[:, :, None] * torch.tensor([1.0, 2.0, 3.0])[:, None, None]
-    torch.testing.assert_close(maps, expected)
     assert 0.9 < float(maps.detach()[:, :, 0].max()) < 1
 
 
@@ -209,20 +221,21 @@ def test_a_mean_does_not_grow_with_the_number_of_points():
         ({"depth": (1, 10, 0)}, "depth: expected start, end and step"),
         ({"z": (-10, 10, 5)}, "z: expected one step"),
         ({"x": (-10, 10, 3)}, "x: -10 to 10 m is not a whole number of cells"),
-        ({"band": (2.5, -0.5)}, "band: expected a lower and a higher end"),
+        ({"band": (2.5, -0.5)}, "band: expected the lower end, then the higher end"),
         ({"image_size": (90, 160), "stride": 8}, r"multiples of the stride 8, found \(90, 160\)"),
     ],
 )
 def test_a_wrong_configuration_is_named(change, message):
-    assert_refused((lambda: replace(CONFIG, **change), ConfigError, message))
+    assert_raises((lambda: replace(CONFIG, **change), ConfigError, message))
 
 
 def test_features_of_another_shape_are_named():
-    lift, good = lift_of(CONFIG), noise(2, 2, 3, 5, 3, 5)
-    assert_refused(
-        (lambda: lift(noise(2, 2, 3, 5, 5, 3), rig()), GeometryError, ("features", "(…, 3, 5)")),
+    lift = make_lift(CONFIG)
+    features, turned_features = make_noise(2, 2, 3, 5, 3, 5), make_noise(2, 2, 3, 5, 5, 3)
+    assert_raises(
+        (lambda: lift(turned_features, make_rig()), GeometryError, ("features", "(…, 3, 5)")),
         (
-            lambda: lift(good, rig(shape=(2, 2, 2))),
+            lambda: lift(features, make_rig(shape=(2, 2, 2))),
             GeometryError,
             ("cameras", "cells (2, 2, 3, 8, 3, 5)"),
         ),

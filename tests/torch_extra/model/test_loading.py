@@ -1,6 +1,4 @@
-"""Batches of worker processes: whatever befalls a worker, its reader gets an error with the cause
-and a remedy.
-"""
+"""Batches of worker processes: when a worker fails, the error names the cause and a remedy."""
 
 import multiprocessing
 import os
@@ -11,10 +9,10 @@ from typing import Any
 
 import pytest
 import torch
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import SensorFileError, WorkerError
-from deepaccident_devkit.plugins.model.loading import read_batches, worker_faults_named
+from deepaccident_devkit.plugins.model.loading import name_worker_faults, read_batches
 
 REMEDY = ("shared memory", "fewer workers", "without --workers")
 
@@ -24,26 +22,26 @@ class Unsendable:
         raise MemoryError("no room for the batch")
 
 
-def killed() -> None:
+def kill_worker() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def without_shared_memory() -> torch.Tensor:
-    """As when /dev/shm is full: none of its files can grow."""
+def fill_shared_memory() -> torch.Tensor:
+    """Return a tensor while no file can grow, as when /dev/shm is full."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     return torch.zeros(100_000)
 
 
-def failing() -> None:
+def raise_key_error() -> None:
     raise KeyError("a fault of the reader")
 
 
-def without_a_file() -> None:
+def raise_file_error() -> None:
     raise SensorFileError("image.jpg: cannot be read; restore it from its archive")
 
 
 class Items:
-    """Items of which the second is made by a function that may fail."""
+    """Three items; a function, which may fail, makes the second one."""
 
     def __init__(self, make: Callable[[], object]) -> None:
         self.make = make
@@ -55,8 +53,8 @@ class Items:
         return self.make() if number == 1 else number
 
 
-def read(make: Callable[[], object]) -> list[Any]:
-    with worker_faults_named():
+def read_items(make: Callable[[], object]) -> list[Any]:
+    with name_worker_faults():
         return list(read_batches(Items(make), list, 1, timeout=60))
 
 
@@ -64,24 +62,24 @@ def read(make: Callable[[], object]) -> list[Any]:
 @pytest.mark.parametrize(
     ("make", "error", "facts"),
     [
-        (killed, WorkerError, ("DataLoader worker", *REMEDY)),
-        (without_shared_memory, WorkerError, ("shared memory", *REMEDY)),
-        (failing, WorkerError, ("KeyError", "a fault of the reader", *REMEDY)),
+        (kill_worker, WorkerError, ("DataLoader worker", *REMEDY)),
+        (fill_shared_memory, WorkerError, ("shared memory", *REMEDY)),
+        (raise_key_error, WorkerError, ("KeyError", "a fault of the reader", *REMEDY)),
         (Unsendable, WorkerError, ("no room for the batch", *REMEDY)),
-        (without_a_file, SensorFileError, ("image.jpg", "restore it")),
+        (raise_file_error, SensorFileError, ("image.jpg", "restore it")),
     ],
 )
 def test_a_worker_that_fails_ends_the_reading(
     make: Callable[[], object], error: type[Exception], facts: Any
 ) -> None:
-    assert_refused((lambda: read(make), error, facts))
+    assert_raises((lambda: read_items(make), error, facts))
 
 
 def test_workers_that_cannot_start_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_room() -> None:
+    def make_no_queue() -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(multiprocessing, "Queue", no_room)
-    assert_refused(
-        (lambda: read(int), WorkerError, ("cannot be started", "No space left", *REMEDY))
+    monkeypatch.setattr(multiprocessing, "Queue", make_no_queue)
+    assert_raises(
+        (lambda: read_items(int), WorkerError, ("cannot be started", "No space left", *REMEDY))
     )

@@ -1,4 +1,4 @@
-"""Presets, what is changed in them, and configurations whose parts do not fit."""
+"""Presets, their options, and configurations with parts that do not fit together."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from refusals import assert_refused
-from torch_extra.compared import same
-from torch_extra.model.small_model import small
+from support.expected_errors import assert_raises
+from torch_extra.compared import are_identical
+from torch_extra.model.small_model import small_config
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.images import ImageConfig
@@ -37,7 +37,7 @@ from deepaccident_devkit.plugins.model.presets import (
 )
 from deepaccident_devkit.taxonomy import ModelFusion
 
-SIZES = [
+PARAMETER_COUNTS = [
     (tiny, 0.4e6, 0.6e6),
     (tiny_lidar, 0.2e6, 1e6),
     (tiny_both, 0.4e6, 1e6),
@@ -45,13 +45,14 @@ SIZES = [
 ]
 
 
-@pytest.mark.parametrize(("preset", "least", "most"), SIZES)
+@pytest.mark.parametrize(("preset", "minimum", "maximum"), PARAMETER_COUNTS)
 def test_presets_have_their_sizes(
-    preset: Callable[[], ModelConfig], least: float, most: float
+    preset: Callable[[], ModelConfig], minimum: float, maximum: float
 ) -> None:
-    """The released one: 83.0 million, less the frustum."""
+    """The released model has 83.0 million parameters without its frustum."""
     with torch.device("meta"):
-        assert least < sum(each.numel() for each in V2XFormer(preset()).parameters()) < most
+        model = V2XFormer(preset())
+    assert minimum < sum(weight.numel() for weight in model.parameters()) < maximum
 
 
 @pytest.mark.parametrize(
@@ -79,11 +80,11 @@ def test_a_horizon_is_a_number_of_frames(horizon: float, frames: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("choice", "error", "named"),
+    ("choice", "error", "facts"),
     [
         *(
-            ({"horizon": each}, ConfigError, ("horizon", "0.5 s", "choose"))
-            for each in (0.0, -1.0, 0.7, 1e3, np.nan)
+            ({"horizon": horizon}, ConfigError, ("horizon", "0.5 s", "choose"))
+            for horizon in (0.0, -1.0, 0.7, 1e3, np.nan)
         ),
         ({"preset": "large"}, ChoiceError, ("preset", "released, tiny")),
         ({"preset": "tiny_lidar", "focal": 100.0}, ConfigError, ("focal", "no cameras")),
@@ -92,26 +93,25 @@ def test_a_horizon_is_a_number_of_frames(horizon: float, frames: int) -> None:
     ],
 )
 def test_other_choices_are_refused(
-    choice: dict[str, Any], error: type[Exception], named: tuple[str, ...]
+    choice: dict[str, Any], error: type[Exception], facts: tuple[str, ...]
 ) -> None:
-    """The released fusion has channels that a small model lacks."""
-    assert_refused((lambda: ModelChoice(**choice), error, named))
+    """The released fusion, for example, has channels that a small model lacks."""
+    assert_raises((lambda: ModelChoice(**choice), error, facts))
 
 
 def test_a_choice_can_be_noted_and_made_again() -> None:
-    choice, path = (
-        ModelChoice(preset="released", fusion="cobevt", horizon=3),
-        Path("weights.safetensors"),
-    )
-    assert ModelChoice.from_dict({**choice.as_dict(), "step": 7}, path) == choice
-    untold = ("weights.safetensors: does not say which model its weights are of",)
-    assert_refused(
-        (lambda: ModelChoice.from_dict({}, path), ConfigError, untold),
-        (lambda: ModelChoice.from_dict({"preset": "tiny"}, path), ConfigError, untold),
+    choice = ModelChoice(preset="released", fusion="cobevt", horizon=3)
+    notes, path = choice.as_dict(), Path("weights.safetensors")
+    assert ModelChoice.from_dict({**notes, "step": 7}, path) == choice
+
+    facts = ("weights.safetensors: does not say which model its weights are for",)
+    assert_raises(
+        (lambda: ModelChoice.from_dict({}, path), ConfigError, facts),
+        (lambda: ModelChoice.from_dict({"preset": "tiny"}, path), ConfigError, facts),
         (
-            lambda: ModelChoice.from_dict({**choice.as_dict(), "preset": "large"}, path),
+            lambda: ModelChoice.from_dict({**notes, "preset": "large"}, path),
             ConfigError,
-            untold,
+            facts,
         ),
         (
             lambda: ModelChoice.from_dict(
@@ -124,31 +124,33 @@ def test_a_choice_can_be_noted_and_made_again() -> None:
 
 
 def test_a_model_is_loaded_by_its_notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(presets, "MODEL_PRESETS", {"tiny": small})
+    monkeypatch.setattr(presets, "MODEL_PRESETS", {"tiny": small_config})
     choice = ModelChoice(fusion="cobevt")
-    model, notes = V2XFormer(choice.config), {**choice.as_dict(), "step": 7}
+    model = V2XFormer(choice.config)
 
-    def loaded(notes: dict[str, Any]) -> V2XFormer:
+    def load_with_notes(notes: dict[str, Any]) -> V2XFormer:
         write_weights(tmp_path / FINAL_FILE, model.state_dict(), notes)
         return load_model(tmp_path)
 
-    found = loaded(notes)
-    assert (found.config, found.notes) == (model.config, notes)
-    assert same(dict(found.state_dict()), dict(model.state_dict()))
-    assert loaded({**notes, "fusion": "mean"}).config.fusion == PoolFusionConfig()
-    assert_refused(
+    notes = {**choice.as_dict(), "step": 7}
+    loaded = load_with_notes(notes)
+    assert (loaded.config, loaded.notes) == (model.config, notes)
+    assert are_identical(dict(loaded.state_dict()), dict(model.state_dict()))
+
+    mean_model = load_with_notes({**notes, "fusion": "mean"})
+    assert mean_model.config.fusion == PoolFusionConfig()
+    assert_raises(
         (
-            lambda: loaded({**notes, "fusion": "disconet"}),
+            lambda: load_with_notes({**notes, "fusion": "disconet"}),
             ConfigError,
-            ("of the model are missing (v2x_fusion.score",),
+            (" tensors missing (v2x_fusion.score",),
         ),
-        (lambda: loaded({}), ConfigError, "does not say which model"),
+        (lambda: load_with_notes({}), ConfigError, "does not say which model"),
     )
 
 
-def small_with(**lift: Any) -> CameraConfig:
-    """The cameras of `small` with another lift."""
-    cameras = small().cameras
+def cameras_with_lift(**lift: Any) -> CameraConfig:
+    cameras = small_config().cameras
     assert cameras is not None
     return replace(cameras, lift=replace(cameras.lift, **lift))
 
@@ -156,57 +158,55 @@ def small_with(**lift: Any) -> CameraConfig:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cameras": None}, "cameras, pillars: expected one of them or both"),
+        ({"cameras": None}, "cameras, pillars: expected cameras, pillars or both"),
         (
-            {"cameras": replace(small().cameras, images=ImageConfig(resize=(36, 64)))},
+            {"cameras": replace(small_config().cameras, images=ImageConfig(resize=(36, 64)))},
             "images.dtype: expected 'uint8'",
         ),
         (
-            {"cameras": small_with(channels=9)},
+            {"cameras": cameras_with_lift(channels=9)},
             "lift.channels: expected 8, as temporal.channels, found 9",
         ),
         (
-            {"pillars": PillarConfig(channels=9, grid=small().grid)},
+            {"pillars": PillarConfig(channels=9, grid=small_config().grid)},
             "pillars.channels: expected 8, as temporal.channels",
         ),
         ({"pillars": PillarConfig(channels=8, grid=BevGrid())}, "pillars.grid: expected BevGrid"),
         ({"bev": BevUNetConfig(in_channels=9, out_channels=16)}, "bev.in_channels: expected 8"),
         (
-            {"motion": replace(small().motion, in_channels=9)},
+            {"motion": replace(small_config().motion, in_channels=9)},
             "motion.in_channels: expected 16, as bev.out_channels",
         ),
         (
-            {"detection": replace(small().detection, in_channels=9)},
+            {"detection": replace(small_config().detection, in_channels=9)},
             "detection.in_channels: expected 16",
         ),
         (
-            {"motion": replace(small().motion, future_frames=9)},
+            {"motion": replace(small_config().motion, future_frames=9)},
             "motion.future_frames: expected 2, as labels.future",
         ),
         (
-            {"temporal": replace(small().temporal, frames=3)},
+            {"temporal": replace(small_config().temporal, frames=3)},
             "temporal.frames: expected 2, as labels.receptive_field",
         ),
     ],
 )
 def test_parts_that_do_not_fit_are_named(changes: dict[str, Any], message: str) -> None:
-    assert_refused((lambda: replace(small(), **changes), ConfigError, message))
+    assert_raises((lambda: replace(small_config(), **changes), ConfigError, message))
 
 
 def test_a_virtual_camera_and_fierys_labels_are_noted_where_they_are_chosen(tmp_path: Path) -> None:
+    # runs before these options noted only three entries
     assert ModelChoice().as_dict() == {
         "preset": "tiny",
         "fusion": None,
         "horizon": None,
-    }  # as runs before noted it
+    }
+
     choice = ModelChoice(focal=100.0, labels="fiery", horizon=1.0)
     assert ModelChoice.from_dict(choice.as_dict(), tmp_path) == choice
-    config = choice.config
-    assert config.cameras.images == ImageConfig(
+    assert choice.config.cameras.images == ImageConfig(
         virtual_camera=(100.0, 90, 160), dtype="uint8", decode="scaled"
     )
-    assert (config.labels.protocol, config.labels.future_frames, config.labels.only_vehicle) == (
-        "fiery",
-        2,
-        True,
-    )
+    labels = choice.config.labels
+    assert (labels.protocol, labels.future_frames, labels.only_vehicle) == ("fiery", 2, True)

@@ -1,6 +1,4 @@
-"""The weights that come with the devkit: their size and notes, what they score, and where they are
-used.
-"""
+"""The weights that come with the devkit: their size, notes, scores and uses."""
 
 import importlib
 from pathlib import Path
@@ -21,32 +19,34 @@ demo: Any = importlib.import_module("deepaccident_devkit.plugins.synth.demo")
 
 
 @pytest.mark.parametrize("name", SHIPPED_FILES)
-def test_they_are_small_halves_with_their_provenance(name: str) -> None:
+def test_shipped_weights_are_small_float16_files_with_their_provenance(name: str) -> None:
     weights = read_weights(name)
-    assert (weights.path, {each.dtype for each in weights.tensors.values()}) == (
-        SHIPPED_FILES[name],
-        {torch.float16},
-    )
+    assert weights.path == SHIPPED_FILES[name]
+    assert {tensor.dtype for tensor in weights.tensors.values()} == {torch.float16}
     assert weights.path.stat().st_size < 1.3e6
-    made = weights.meta["made"]
-    assert (weights.meta["preset"], made["seed"], len(made["release"]) > 10) == (name, 1, True)
+
+    provenance = weights.meta["made"]
+    assert (weights.meta["preset"], provenance["seed"]) == (name, 1)
+    assert len(provenance["release"]) > 10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED_FILES)
-def test_they_score_what_their_notes_say(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a release that is made again from its seed; another machine may round otherwise, a
-    little.
-    """
+def test_shipped_weights_score_what_their_notes_say(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The release is generated again from its seed; another machine may round differently."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[3]))
     from benchmarks.shipping import scores
 
-    told = read_weights(name).meta["scored"]
-    assert scores(SHIPPED_FILES[name], told) == pytest.approx(told["scores"], abs=0.01)
-    assert told["scores"]["iou"] > 0.1
+    notes = read_weights(name).meta["scored"]
+    assert scores(SHIPPED_FILES[name], notes) == pytest.approx(notes["scores"], abs=0.01)
+    assert notes["scores"]["iou"] > 0.1
 
 
-def test_a_folder_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_of_the_same_name_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert read_weights("tiny").path == SHIPPED_FILES["tiny"]
     Path("tiny").mkdir()
@@ -55,39 +55,38 @@ def test_a_folder_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("name", SHIPPED_FILES)
-def test_predict_takes_them_by_their_name(name: str, release_root: Path, tmp_path: Path) -> None:
-    words = (
-        "predict",
-        name,
-        str(release_root),
-        "--split",
-        "train_mini",
-        "--out",
-        str(tmp_path / "results"),
-    )
-    result = CliRunner().invoke(deepaccident, words, catch_exceptions=False)
-    assert (tmp_path / "results" / "accident.json").is_file()
-    told = read_weights(name).meta["scored"]["scores"]
+def test_predict_takes_shipped_weights_by_name(
+    name: str, release_root: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "results"
+    command = ("predict", name, str(release_root), "--split", "train_mini", "--out", str(out))
+
+    result = CliRunner().invoke(deepaccident, command, catch_exceptions=False)
+
+    assert (out / "accident.json").is_file()
     line = result.stdout.splitlines()[-1]
     assert line.startswith("motion, labels clean: IoU ")
-    assert f"here; IoU {told['iou']:.1%}, VPQ {told['vpq']:.1%} on 2 synthetic scenarios" in line
+    scores = read_weights(name).meta["scored"]["scores"]
+    noted = f"IoU {scores['iou']:.1%}, VPQ {scores['vpq']:.1%} on 2 synthetic scenarios"
+    assert f"on these samples; {noted}" in line
 
 
-def test_the_demo_shows_their_prediction(
+def test_the_demo_shows_the_prediction_of_shipped_weights(
     da: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(demo, "_SECONDS_BEFORE", 0.1)  # the release is short
-    written = Mock(side_effect=demo.write_beside)
-    monkeypatch.setattr(demo, "write_beside", written)
+    write_beside = Mock(side_effect=demo.write_beside)
+    monkeypatch.setattr(demo, "write_beside", write_beside)
+    picture = tmp_path / demo.MODEL_PICTURE
+
     assert demo.draw_model(da, tmp_path)
-    assert (
-        sorted(call.args[1] for call in written.call_args_list) == ["ego"] * 4 + ["other"] * 4
-    )  # in four panels
-    name = demo.MODEL_PICTURE
-    assert (tmp_path / name).stat().st_size > 20_000
+    titles = sorted(call.args[1] for call in write_beside.call_args_list)
+    assert titles == ["ego"] * 4 + ["other"] * 4  # in four panels
+    assert picture.stat().st_size > 20_000
+
     monkeypatch.setattr(
         "deepaccident_devkit.plugins.model.load_model",
         Mock(side_effect=MissingExtraError("no torch")),
     )
     assert not demo.draw_model(da, tmp_path)
-    assert not (tmp_path / name).exists()
+    assert not picture.exists()

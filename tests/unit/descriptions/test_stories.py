@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from refusals import assert_refused
-from wording import holding, lacking
+from support.expected_errors import assert_raises
+from support.text_contents import contained_parts, missing_parts
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.descriptions import stories, story_text
@@ -84,7 +84,7 @@ CLAUSES = {
     ("accident", "braking", "slack"): "1.1 s",
     ("accident", "braking", "by"): "by the ego",
 }
-OF_NORMAL = {
+NORMAL_CLAUSES = {
     ("collision",): "nobody collides",
     ("duration",): "9.9 s",
     ("nearest",): "come nearest",
@@ -95,29 +95,31 @@ OF_NORMAL = {
 }
 
 
-def without(facts: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
-    result = copy.deepcopy(facts)
-    functools.reduce(operator.getitem, path[:-1], result)[path[-1]] = None
-    return result
+def remove_value(facts: dict[str, Any], path: tuple[Any, ...]) -> dict[str, Any]:
+    changed_facts = copy.deepcopy(facts)
+    parent = functools.reduce(operator.getitem, path[:-1], changed_facts)
+    parent[path[-1]] = None
+    return changed_facts
 
 
 @pytest.mark.parametrize(
     ("facts", "path", "clause"),
     [
         *((ACCIDENT, path, clause) for path, clause in CLAUSES.items()),
-        *((NORMAL | {"duration": 9.9}, path, clause) for path, clause in OF_NORMAL.items()),
+        *((NORMAL | {"duration": 9.9}, path, clause) for path, clause in NORMAL_CLAUSES.items()),
     ],
 )
 def test_a_clause_goes_with_its_value(
     facts: dict[str, Any], path: tuple[Any, ...], clause: str
 ) -> None:
-    text = story_text(without(facts, path))
     assert clause in story_text(facts)
-    assert (holding(text, clause, "None"), text[-1]) == ([], ".")
+    text = story_text(remove_value(facts, path))
+    assert contained_parts(text, clause, "None") == []
+    assert text.endswith(".")
 
 
 @pytest.mark.parametrize(
-    ("sides", "braking", "said"),
+    ("sides", "braking", "words"),
     [
         (("front", "front"), {}, "head-on"),
         (("front", "rear"), {}, "hit from behind by the ego"),
@@ -125,50 +127,60 @@ def test_a_clause_goes_with_its_value(
         (("left", "rear"), {"avoidable": False, "slack": None}, "would not have avoided"),
     ],
 )
-def test_ends_in_words(sides: tuple[str, str], braking: dict[str, Any], said: str) -> None:
+def test_ends_in_words(sides: tuple[str, str], braking: dict[str, Any], words: str) -> None:
     facts = copy.deepcopy(ACCIDENT)
     for road_user, side in zip(facts["accident"]["pair"], sides, strict=True):
         road_user["side"] = side
     facts["accident"]["braking"] |= braking
-    assert said in story_text(facts)
+    assert words in story_text(facts)
 
 
 def test_a_pair_that_is_apart_is_not_told_as_hit() -> None:
-    text = story_text(ACCIDENT | {"accident": ACCIDENT["accident"] | {"apart": True, "gap": 1.3}})
+    accident = ACCIDENT["accident"] | {"apart": True, "gap": 1.3}
+    text = story_text(ACCIDENT | {"accident": accident})
     assert "1.3 m apart" in text
-    assert holding(text, "is hit", "Braking", "delta-v") == []
+    assert contained_parts(text, "is hit", "Braking", "delta-v") == []
 
 
 def test_stories_of_a_release(da_motion: DeepAccident) -> None:
-    (accident,), (normal,) = (da_motion.find(collision=ends) for ends in (True, False))
-    story, contact = da_motion.describe(accident), da_motion.collision(accident)
-    pair, seen = story.facts["accident"]["pair"], story.facts["accident"]["seen"]
-    assert [each["actor_id"] for each in pair] == list(contact.actor_ids)
-    assert [each["speed"] for each in pair] == pytest.approx(contact.speeds, abs=0.01)
-    assert seen["ego_vehicle"] == pytest.approx(lead_times(da_motion, accident).leads[0], abs=1e-6)
-    assert f"{pair[0]['speed']:.1f} m/s" in str(story)
+    (accident,) = da_motion.find(collision=True)
+    story = da_motion.describe(accident)
+    contact = da_motion.collision(accident)
+    pair = story.facts["accident"]["pair"]
+    assert [road_user["actor_id"] for road_user in pair] == list(contact.actor_ids)
+    speeds = [road_user["speed"] for road_user in pair]
+    assert speeds == pytest.approx(contact.speeds, abs=0.01)
+    ego_lead = lead_times(da_motion, accident).leads[0]
+    assert story.facts["accident"]["seen"]["ego_vehicle"] == pytest.approx(ego_lead, abs=1e-6)
+    assert f"{speeds[0]:.1f} m/s" in str(story)
     assert json.loads(story.to_json())["text"] == story.text
+
+    (normal,) = da_motion.find(collision=False)
     assert "nobody collides in 3.4 s" in da_motion.describe(normal).text
-    assert list(stories(da_motion, workers=1)) == [
-        da_motion.describe(each) for each in da_motion.scenario
-    ]
-    assert_refused(
+    expected = [da_motion.describe(scenario) for scenario in da_motion.scenario]
+    assert list(stories(da_motion, workers=1)) == expected
+    assert_raises(
         (lambda: da_motion.describe("type1/nowhere"), TokenError, ("no scenario", "type1/nowhere"))
     )
 
 
 def test_the_command(da_motion: DeepAccident, tmp_path: Path) -> None:
-    out, root = tmp_path / "stories.jsonl", str(da_motion.dataroot)
-    every = CliRunner().invoke(safety, ["describe", root, "--workers", "1", "--out", str(out)])
-    lines = [json.loads(line) for line in out.read_text().splitlines()]
-    assert [each["scenario"] for each in lines] == [each["token"] for each in da_motion.scenario]
-    assert (every.exit_code, lacking(every.output, *(each["text"] for each in lines))) == (0, [])
-    one = CliRunner().invoke(safety, ["describe", root, lines[0]["scenario"], "--json"])
-    assert json.loads(one.output) == lines[0]
+    out = tmp_path / "stories.jsonl"
+    root = str(da_motion.dataroot)
+    result = CliRunner().invoke(safety, ["describe", root, "--workers", "1", "--out", str(out)])
+    assert result.exit_code == 0
+    records = [json.loads(line) for line in out.read_text().splitlines()]
+    tokens = [scenario["token"] for scenario in da_motion.scenario]
+    assert [record["scenario"] for record in records] == tokens
+    assert missing_parts(result.output, *(record["text"] for record in records)) == []
+
+    result = CliRunner().invoke(safety, ["describe", root, tokens[0], "--json"])
+    assert json.loads(result.output) == records[0]
 
 
 def test_what_a_release_lacks_is_said(tmp_path: Path) -> None:
-    da = DeepAccident("v1", write_small_release(tmp_path, SmallRelease(channels=())), verbose=False)
-    story = da.describe(next(each for each in da.scenario if each["weather"] is None))
+    root = write_small_release(tmp_path, SmallRelease(channels=()))
+    da = DeepAccident("v1", root, verbose=False)
+    story = da.describe(da.find(weather=None)[0])
     assert "it is not known whether anybody collides" in story.text
-    assert not lacking(" ".join(story.facts["unknown"]), "no meta file", "no labels")
+    assert not missing_parts(" ".join(story.facts["unknown"]), "no meta file", "no labels")

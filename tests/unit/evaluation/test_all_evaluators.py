@@ -1,5 +1,5 @@
-"""What holds of every evaluator, on the labels of a synthetic release: order, parts, pauses,
-nothing and perfection.
+"""Laws of every evaluator, on the labels of a synthetic release: order, parts, resumed runs, empty
+and perfect predictions.
 """
 
 import json
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, GeometryError
@@ -29,28 +29,28 @@ from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.detection import DETECTION_PROTOCOLS
 from deepaccident_devkit.motion import MotionHeads
 
-MOTION: dict[str, Callable[[], Evaluator[Any]]] = {
+MOTION_EVALUATORS: dict[str, Callable[[], Evaluator[Any]]] = {
     "motion released": MotionEvaluator,
     "motion paper": lambda: MotionEvaluator("paper"),
 }
-ACCIDENT = {
+ACCIDENT_EVALUATORS = {
     f"accident {name}": lambda name=name: AccidentEvaluator(name)
     for name in ("released", "paper", "boxes")
 }
-DETECTION = {
+DETECTION_EVALUATORS = {
     **{
         f"detection {name}": lambda name=name: DetectionEvaluator(name)
         for name in DETECTION_PROTOCOLS
     },
     "detection opencood by sample": lambda: DetectionEvaluator("opencood", global_sort=False),
 }
-ALL = {**MOTION, **ACCIDENT, **DETECTION}
-of_all = pytest.mark.parametrize("name", ALL)
+EVALUATORS = {**MOTION_EVALUATORS, **ACCIDENT_EVALUATORS, **DETECTION_EVALUATORS}
+for_every_evaluator = pytest.mark.parametrize("name", EVALUATORS)
 
 
 @pytest.fixture(scope="module")
 def tokens(da_motion: DeepAccident) -> list[str]:
-    """Of two agents, from 2 s to 0.5 s before the accident."""
+    """Select samples of two agents, from 2 s to 0.5 s before the accident."""
     return [
         token
         for token in da_motion.samples("train", "evaluate")
@@ -58,8 +58,12 @@ def tokens(da_motion: DeepAccident) -> list[str]:
     ]
 
 
-class Samples:
-    """What each kind of evaluator takes of a sample."""
+class SampleArguments:
+    """Arguments of each kind of evaluator, by sample, with predictions of a quality.
+
+    The quality `perfect` is the truth itself (motion as instance maps), `empty` is nothing, and
+    `some` is neither right nor wrong: of another sample, or all a little off.
+    """
 
     def __init__(self, dataset: DeepAccident, tokens: Sequence[str]) -> None:
         self.dataset = dataset
@@ -68,169 +72,182 @@ class Samples:
         }
         self.contexts = {token: accident_context(dataset, token, 2.0) for token in tokens}
 
-    def given(self, how: str, name: str, token: str) -> Sequence[Any]:
-        """Predictions with their truth: the truth itself (`perfect`, motion as instance maps),
-        nothing (`empty`), or `some` that are neither right nor wrong: of another sample, or all a
-        little off."""
-        if name in MOTION | ACCIDENT:
-            label, other = self.labels[token], self.labels[min(self.labels)]
-            output = instances_of(label.instance * (how == "perfect"), label.config.grid)
-            if how == "some":
-                output = MotionOutput(
-                    grid=label.config.grid,
-                    heads=tuple(map(MotionHeads.from_labels, (label, other))),
-                )
-            return (output, label, *([self.contexts[token]] if name in ACCIDENT else []))
-        truth = detection_truth(self.dataset, token, DETECTION[name]().protocol)
-        source, share = (
-            np.random.default_rng(int(token[-3:])),
-            {"perfect": 1.0, "empty": 0.0, "some": 0.8}[how],
-        )
-        boxes = truth.select(source.uniform(size=len(truth)) < share)
-        off = source.normal(0, 0.5, (len(boxes), 3)) * (how == "some")
-        scores = (
-            np.round(source.uniform(size=len(boxes)), 1) if how == "some" else np.ones(len(boxes))
-        )
-        return DetectedBoxes(boxes=replace(boxes, center=boxes.center + off), scores=scores), truth
+    def arguments(self, quality: str, name: str, token: str) -> Sequence[Any]:
+        """Return a prediction and its truth."""
+        if name in DETECTION_EVALUATORS:
+            return self.detection_arguments(quality, name, token)
 
-    def evaluated(self, how: str, name: str, tokens: Sequence[str]) -> Evaluator[Any]:
-        evaluator = ALL[name]()
+        label = self.labels[token]
+        grid = label.config.grid
+        if quality == "some":
+            other_label = self.labels[min(self.labels)]
+            heads = tuple(map(MotionHeads.from_labels, (label, other_label)))
+            output = MotionOutput(grid=grid, heads=heads)
+        else:
+            output = instances_of(label.instance * (quality == "perfect"), grid)
+        if name in ACCIDENT_EVALUATORS:
+            return output, label, self.contexts[token]
+        return output, label
+
+    def detection_arguments(self, quality: str, name: str, token: str) -> Sequence[Any]:
+        truth = detection_truth(self.dataset, token, DETECTION_EVALUATORS[name]().protocol)
+        if quality == "perfect":
+            return DetectedBoxes(boxes=truth, scores=np.ones(len(truth))), truth
+        if quality == "empty":
+            boxes = truth.select(np.zeros(len(truth), dtype=bool))
+            return DetectedBoxes(boxes=boxes, scores=np.ones(0)), truth
+
+        generator = np.random.default_rng(int(token[-3:]))
+        boxes = truth.select(generator.uniform(size=len(truth)) < 0.8)
+        center = boxes.center + generator.normal(0, 0.5, (len(boxes), 3))
+        scores = np.round(generator.uniform(size=len(boxes)), 1)
+        return DetectedBoxes(boxes=replace(boxes, center=center), scores=scores), truth
+
+    def evaluate(self, quality: str, name: str, tokens: Sequence[str]) -> Evaluator[Any]:
+        evaluator = EVALUATORS[name]()
         for token in tokens:
-            evaluator.update(token, *self.given(how, name, token))
+            evaluator.update(token, *self.arguments(quality, name, token))
         return evaluator
 
 
 @pytest.fixture(scope="module")
-def samples(da_motion: DeepAccident, tokens: list[str]) -> Samples:
-    return Samples(da_motion, tokens)
+def samples(da_motion: DeepAccident, tokens: list[str]) -> SampleArguments:
+    return SampleArguments(da_motion, tokens)
 
 
 @pytest.mark.slow
-@of_all
-def test_order_parts_and_pauses_change_no_bit(
-    samples: Samples, tokens: list[str], name: str, tmp_path: Path
+@for_every_evaluator
+def test_order_parts_and_resuming_change_no_bit(
+    samples: SampleArguments, tokens: list[str], name: str, tmp_path: Path
 ) -> None:
-    arguments = {token: samples.given("some", name, token) for token in tokens}
-    whole = samples.evaluated("some", name, tokens)
-    expected = bits(whole.compute())
+    arguments = {token: samples.arguments("some", name, token) for token in tokens}
+    whole = samples.evaluate("some", name, tokens)
+    expected = bits_of(whole.compute())
     shuffled = np.random.default_rng(1).permutation(tokens).tolist()
+
     for parts in (1, 3):
-        merged = ALL[name]()
+        merged = EVALUATORS[name]()
         for part in range(parts):
-            evaluator = ALL[name]()
+            evaluator = EVALUATORS[name]()
             for token in shuffled[part::parts]:
                 evaluator.update(token, *arguments[token])
             path = evaluator.save(tmp_path / f"{part}.json")
-            merged.merge(ALL[name]().resume(path) if part % 2 == 0 else evaluator)
-        assert bits(merged.compute()) == expected
-        assert bits(merged.compute(tokens[:3])) == bits(whole.compute(tokens[:3]))
+            if part % 2 == 0:
+                evaluator = EVALUATORS[name]().resume(path)
+            merged.merge(evaluator)
+        assert bits_of(merged.compute()) == expected
+        assert bits_of(merged.compute(tokens[:3])) == bits_of(whole.compute(tokens[:3]))
         assert not merged.repeated
-    resumed = ALL[name]().resume(whole.save(tmp_path / "whole.json"))
+
+    resumed = EVALUATORS[name]().resume(whole.save(tmp_path / "whole.json"))
     resumed.update(tokens[0], *arguments[tokens[0]])
     assert resumed.repeated == {tokens[0]}
-    assert bits(resumed.compute()) == expected
+    assert bits_of(resumed.compute()) == expected
 
 
-@of_all
-def test_counts_are_json_and_pooled_they_have_the_same_result(
-    samples: Samples, tokens: list[str], name: str
+@for_every_evaluator
+def test_counts_are_json_and_pooled_counts_have_the_same_result(
+    samples: SampleArguments, tokens: list[str], name: str
 ) -> None:
-    evaluator = samples.evaluated("some", name, tokens[::3])
+    evaluator = samples.evaluate("some", name, tokens[::3])
     counts = [evaluator.counts[token] for token in tokens[::3]]
+
     assert json.loads(json.dumps(counts, allow_nan=False)) == counts
-    assert bits(evaluator.result_of(evaluator.pooled(counts))) == bits(evaluator.compute())
+    assert bits_of(evaluator.result_of(evaluator.pooled(counts))) == bits_of(evaluator.compute())
 
 
-@of_all
-def test_empty_predictions_score_0(samples: Samples, tokens: list[str], name: str) -> None:
-    evaluator = samples.evaluated("empty", name, tokens)
+def qualities_of(result: Any) -> list[float]:
+    """Return IoU and the three panoptic qualities of both ranges."""
+    values = []
+    for part in result.ranges.values():
+        values += [part.iou, part.pq, part.sq, part.rq]
+    return values
+
+
+@for_every_evaluator
+def test_empty_predictions_score_0(samples: SampleArguments, tokens: list[str], name: str) -> None:
+    evaluator = samples.evaluate("empty", name, tokens)
     result = evaluator.compute()
-    if name in MOTION:
-        assert [
-            value
-            for each in result.ranges.values()
-            for value in (each.iou, each.pq, each.sq, each.rq)
-        ] == [0] * 8
+    if name in MOTION_EVALUATORS:
+        assert qualities_of(result) == [0] * 8
         assert (result.path_accuracy, result.paths) == (0, 0)
-    elif name in ACCIDENT:
-        assert (result.positives > 0, result.apa) == (True, 0)
-        assert [(each.tp, each.fp, each.fn) for each in result.within.values()] == [
-            (0, 0, result.positives)
-        ] * 3
+    elif name in ACCIDENT_EVALUATORS:
+        assert result.positives > 0
+        assert result.apa == 0
+        cases = [(within.tp, within.fp, within.fn) for within in result.within.values()]
+        assert cases == [(0, 0, result.positives)] * 3
     else:
         assert result.mean_average_precision == 0
-    for some in ((), tokens[:1]):
-        evaluator.compute(some)  # of nothing at all, too
-    ALL[name]().compute()
+
+    for some_tokens in ((), tokens[:1]):
+        evaluator.compute(some_tokens)  # no samples have a result, too
+
+    EVALUATORS[name]().compute()
 
 
-@pytest.mark.parametrize("name", MOTION | DETECTION)
-@pytest.mark.parametrize("given", [None, np.zeros((2, 5, 200, 200), dtype=int)])
-def test_predictions_that_are_none(
-    samples: Samples, tokens: list[str], name: str, given: object
+@pytest.mark.parametrize("name", MOTION_EVALUATORS | DETECTION_EVALUATORS)
+@pytest.mark.parametrize("other", [None, np.zeros((2, 5, 200, 200), dtype=int)])
+def test_arguments_of_another_kind_are_refused(
+    samples: SampleArguments, tokens: list[str], name: str, other: object
 ) -> None:
-    prediction, truth = samples.given("perfect", name, tokens[0])
-    update, wrong = ALL[name]().update, type(given).__name__
-    kind, of_truth = (
-        ("a MotionOutput", "MotionLabels") if name in MOTION else ("DetectedBoxes", "Boxes")
-    )
-    error = EvaluationError if name in MOTION else GeometryError
-    assert_refused(
+    prediction, truth = samples.arguments("perfect", name, tokens[0])
+    update = EVALUATORS[name]().update
+    if name in MOTION_EVALUATORS:
+        prediction_kind, truth_kind = "a MotionOutput", "MotionLabels"
+        error: type[Exception] = EvaluationError
+    else:
+        prediction_kind, truth_kind = "DetectedBoxes", "Boxes"
+        error = GeometryError
+
+    other_kind = type(other).__name__
+    assert_raises(
         (
-            lambda: update(tokens[0], given, truth),
+            lambda: update(tokens[0], other, truth),
             EvaluationError,
-            (f"expected {kind}", "from_arrays(", wrong),
+            (f"expected {prediction_kind}", "from_arrays(", other_kind),
         ),
-        (lambda: update(tokens[0], prediction, given), error, (f"expected {of_truth}", wrong)),
+        (
+            lambda: update(tokens[0], prediction, other),
+            error,
+            (f"expected {truth_kind}", other_kind),
+        ),
     )
 
 
-@of_all
-def test_perfect_predictions(samples: Samples, tokens: list[str], name: str) -> None:
-    result = samples.evaluated("perfect", name, tokens).compute()
-    if name in MOTION:
-        assert [
-            value
-            for each in result.ranges.values()
-            for value in (each.iou, each.pq, each.sq, each.rq)
-        ] == [100] * 8
-        assert (result.min_ade, result.min_fde, result.miss_rate, result.path_accuracy) == (
-            0,
-            0,
-            0,
-            1,
-        )
+@for_every_evaluator
+def test_perfect_predictions(samples: SampleArguments, tokens: list[str], name: str) -> None:
+    result = samples.evaluate("perfect", name, tokens).compute()
+    if name in MOTION_EVALUATORS:
+        assert qualities_of(result) == [100] * 8
+        assert (result.min_ade, result.min_fde, result.miss_rate) == (0, 0, 0)
+        assert result.path_accuracy == 1
     elif name == "accident paper":
-        assert (result.apa, result.id_error, result.position_error, result.time_error) == (
-            1,
-            0,
-            0,
-            0,
-        )
-        assert [(each.tp > 0, each.fp, each.fn) for each in result.within.values()] == [
-            (True, 0, 0)
-        ] * 3
+        assert result.apa == 1
+        assert (result.id_error, result.position_error, result.time_error) == (0, 0, 0)
+        cases = [(within.tp > 0, within.fp, within.fn) for within in result.within.values()]
+        assert cases == [(True, 0, 0)] * 3
     elif name.startswith("detection opencood"):
         assert result.mean_average_precision == pytest.approx(100, abs=1e-9)
-    elif name in DETECTION:
-        # The released curve counts what has no truth as 0, and no recall exceeds the last of its 36
-        # points. So the mean says how many classes a scene has; each class that it has says what is
-        # lost.
+    elif name in DETECTION_EVALUATORS:
+        # The released curve scores a class without truth as 0, so the mean depends on the classes
+        # of the scene. No recall exceeds the last of its 36 points, so a perfect class stays
+        # below 100.
         assert result.average_precision[result.truths > 0].min() > 97
 
 
-def bits(value: Any) -> Any:
-    """A result to its last bit, whatever the order of its mappings."""
+def bits_of(value: Any) -> Any:
+    """Return a result to its last bit, whatever the order of its mappings."""
     if is_dataclass(value):
-        return type(value).__name__, [
-            (field.name, bits(getattr(value, field.name))) for field in fields(value)
+        field_values = [
+            (field.name, bits_of(getattr(value, field.name))) for field in fields(value)
         ]
+        return type(value).__name__, field_values
     if isinstance(value, np.ndarray):
         return value.shape, value.dtype.str, value.tobytes()
     if isinstance(value, dict):
-        return sorted((str(key), bits(each)) for key, each in value.items())
+        return sorted((str(key), bits_of(item)) for key, item in value.items())
     if isinstance(value, list | tuple):
-        return [bits(each) for each in value]
+        return [bits_of(item) for item in value]
     if isinstance(value, float):
         return "nan" if math.isnan(value) else value.hex()
     return value

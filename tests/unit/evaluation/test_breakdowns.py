@@ -1,4 +1,4 @@
-"""The attributes of samples, and results by them, of any evaluator, with intervals over
+"""The attributes of samples, and breakdowns by them of any evaluator's results, with intervals over
 scenarios.
 """
 
@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from evaluating import Ratios
-from refusals import assert_refused
+from support.expected_errors import assert_raises
+from support.spawned_evaluation import RatioEvaluator
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
@@ -44,15 +44,15 @@ STORY = {
 }
 
 
-class PooledRatios(Ratios):
-    """The same from sums."""
+class PooledRatioEvaluator(RatioEvaluator):
+    """An evaluator of the same ratio that pools its counts."""
 
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         return [{name: total(counts, name) for name in ("above", "below")}]
 
 
 def attributes_of(number: int, **changes: Any) -> SampleAttributes:
-    """Of a sample of scenario `number // 10`."""
+    """Return the attributes of a sample of scenario `number // 10`."""
     values: dict[str, Any] = {
         "scenario": f"s{number // 10}",
         "agent": "ego_vehicle",
@@ -65,74 +65,81 @@ def attributes_of(number: int, **changes: Any) -> SampleAttributes:
     return SampleAttributes(**(values | changes))
 
 
-def filled(numbers: range = range(100), kind: type[Ratios] = Ratios) -> Ratios:
+def evaluator_of(
+    numbers: range = range(100), kind: type[RatioEvaluator] = RatioEvaluator
+) -> RatioEvaluator:
     evaluator = kind()
     for number in numbers:
-        evaluator.add(
-            f"{number:03d}", {"above": float(number % 7 == 0 or number // 10 == 3), "below": 1.0}
-        )
+        is_hit = number % 7 == 0 or number // 10 == 3
+        evaluator.add(f"{number:03d}", {"above": float(is_hit), "below": 1.0})
     return evaluator
 
 
-MANY = {f"{number:03d}": attributes_of(number) for number in range(100)}
+ATTRIBUTES_BY_TOKEN = {f"{number:03d}": attributes_of(number) for number in range(100)}
 
 
-ALL_AT_ONCE = Resampling(resamples=0)
+NO_RESAMPLES = Resampling(resamples=0)
 
 
-def shown(groups: Sequence[Any]) -> dict[Any, int]:
+def sizes_of(groups: Sequence[Any]) -> dict[Any, int]:
     return {group.value: group.samples for group in groups}
 
 
 def test_groups_are_the_results_of_their_samples() -> None:
-    evaluator = filled()
-    found = breakdown(evaluator, MANY, "town")
-    assert (found.by, found.resampling) == ("town", Resampling())
-    assert [group.value for group in found.groups] == ["Town00", "Town01", "Town02"]
-    for index, group in enumerate(found.groups):
-        tokens = [token for token in MANY if int(token) // 10 % 3 == index]
-        count = len(tokens) // 10
-        text = (
-            f"no intervals: of {count} clusters (an accident and its twin are "
-            f"one); at least 6 are needed"
-        )
+    evaluator = evaluator_of()
+    by_town = breakdown(evaluator, ATTRIBUTES_BY_TOKEN, "town")
+    assert (by_town.by, by_town.resampling) == ("town", Resampling())
+    assert [group.value for group in by_town.groups] == ["Town00", "Town01", "Town02"]
+
+    for index, group in enumerate(by_town.groups):
+        tokens = [token for token in ATTRIBUTES_BY_TOKEN if int(token) // 10 % 3 == index]
+        scenarios = len(tokens) // 10
+        note = f"no confidence intervals: {scenarios} scenario pairs, at least 6 needed"
         assert group.result == evaluator.compute(tokens)
-        assert (group.samples, group.scenarios, group.clusters) == (len(tokens), count, count)
-        assert (group.intervals, group.notes) == ({}, (text,))
+        sizes = (group.samples, group.scenarios, group.clusters)
+        assert sizes == (len(tokens), scenarios, scenarios)
+        assert (group.intervals, group.notes) == ({}, (note,))
 
 
-def test_everything_is_a_breakdown_too() -> None:
-    (group,) = breakdown(filled(), MANY, "all").groups
+def test_all_samples_are_a_breakdown_too() -> None:
+    evaluator = evaluator_of()
+    (group,) = breakdown(evaluator, ATTRIBUTES_BY_TOKEN, "all").groups
     assert (group.value, group.samples, group.scenarios) == ("all", 100, 10)
-    assert group.result == filled().compute()
+    assert group.result == evaluator.compute()
+
     low, high = group.intervals["ratio"]
     assert 0 < low < group.result.ratio < high < 1
     assert (set(group.intervals), group.notes) == ({"ratio"}, ())
 
 
-def changed(some: Callable[[int], bool], **changes: Any) -> dict[str, SampleAttributes]:
+def change_some(is_changed: Callable[[int], bool], **changes: Any) -> dict[str, SampleAttributes]:
     return {
-        token: replace(each, **changes) if some(int(token)) else each
-        for token, each in MANY.items()
+        token: replace(attributes, **changes) if is_changed(int(token)) else attributes
+        for token, attributes in ATTRIBUTES_BY_TOKEN.items()
     }
 
 
-FIRST_TWO = changed(lambda number: number in (0, 13), time_to_impact=None, impact_step=NO_IMPACT)
-POLES = changed(lambda number: number % 10 < 4, agent=INFRASTRUCTURE)
-AGENT_EACH = {token: replace(each, agent=AGENTS[int(token) % 5]) for token, each in MANY.items()}
+TWO_WITHOUT_IMPACT = change_some(
+    lambda number: number in (0, 13), time_to_impact=None, impact_step=NO_IMPACT
+)
+WITH_POLES = change_some(lambda number: number % 10 < 4, agent=INFRASTRUCTURE)
+EVERY_AGENT = {
+    token: replace(attributes, agent=AGENTS[int(token) % 5])
+    for token, attributes in ATTRIBUTES_BY_TOKEN.items()
+}
 
 
 @pytest.mark.parametrize(
-    ("attributes", "by", "groups", "without"),
+    ("attributes", "by", "groups", "groups_of_vehicles"),
     [
         (
-            FIRST_TWO,
+            TWO_WITHOUT_IMPACT,
             "time_to_impact",
             {"0 s": 19, "1 s": 19, **dict.fromkeys(("2 s", "3 s", "4 s"), 20), None: 2},
             None,
         ),
         (
-            FIRST_TWO,
+            TWO_WITHOUT_IMPACT,
             "impact_step",
             {
                 "0 s": 9,
@@ -145,28 +152,32 @@ AGENT_EACH = {token: replace(each, agent=AGENTS[int(token) % 5]) for token, each
             None,
         ),
         (
-            POLES,
+            WITH_POLES,
             "town",
             {"Town00": 40, "Town01": 30, "Town02": 30},
             {"Town00": 24, "Town01": 18, "Town02": 18},
         ),
-        (POLES, "agent", {"ego_vehicle": 60, INFRASTRUCTURE: 40}, {"ego_vehicle": 60}),
+        (WITH_POLES, "agent", {"ego_vehicle": 60, INFRASTRUCTURE: 40}, {"ego_vehicle": 60}),
+        # agents are in their usual order
         (
-            AGENT_EACH,
+            EVERY_AGENT,
             "agent",
             dict.fromkeys(AGENTS, 20),
             dict.fromkeys(AGENTS[:-1], 20),
-        ),  # in their usual order
+        ),
     ],
 )
-def test_groups_are_in_order_and_the_pole_is_left_out_beside(
-    attributes, by, groups, without
+def test_groups_are_in_order_with_and_without_infrastructure(
+    attributes, by, groups, groups_of_vehicles
 ) -> None:
-    """What is unknown comes last."""
-    found = breakdown(filled(), attributes, by, ALL_AT_ONCE)
-    assert list(shown(found.groups).items()) == list(groups.items())
-    assert list(shown(found.without_infrastructure).items()) == list((without or groups).items())
-    assert {len(group.intervals) for group in found.groups} == {0}
+    """Unknown values come last."""
+    result = breakdown(evaluator_of(), attributes, by, NO_RESAMPLES)
+    sizes = sizes_of(result.groups)
+    assert list(sizes.items()) == list(groups.items())
+
+    sizes = sizes_of(result.without_infrastructure)
+    assert list(sizes.items()) == list((groups_of_vehicles or groups).items())
+    assert {len(group.intervals) for group in result.groups} == {0}
 
 
 @pytest.mark.parametrize(
@@ -188,45 +199,66 @@ def test_a_cluster_has_no_ending(scenario: str, cluster: str) -> None:
     assert cluster_of(scenario) == cluster
 
 
-@pytest.mark.parametrize("kind", [Ratios, PooledRatios])
-def test_no_order_makes_a_difference(kind: type[Ratios]) -> None:
-    expected = breakdown(filled(kind=kind), MANY, "town")
-    backwards = dict(reversed(list(MANY.items())))
-    assert breakdown(filled(range(99, -1, -1), kind), backwards, "town") == expected
-    parts = filled(range(50, 100), kind).merge(filled(range(60), kind))
-    assert breakdown(parts, backwards, "town") == expected
-    assert expected.groups == breakdown(filled(), MANY, "town").groups
+@pytest.mark.parametrize("kind", [RatioEvaluator, PooledRatioEvaluator])
+def test_the_order_of_samples_makes_no_difference(kind: type[RatioEvaluator]) -> None:
+    expected = breakdown(evaluator_of(kind=kind), ATTRIBUTES_BY_TOKEN, "town")
+    reversed_attributes = dict(reversed(list(ATTRIBUTES_BY_TOKEN.items())))
+    reversed_evaluator = evaluator_of(range(99, -1, -1), kind)
+    assert breakdown(reversed_evaluator, reversed_attributes, "town") == expected
+
+    merged_evaluator = evaluator_of(range(50, 100), kind).merge(evaluator_of(range(60), kind))
+    assert breakdown(merged_evaluator, reversed_attributes, "town") == expected
+
+    plain = breakdown(evaluator_of(), ATTRIBUTES_BY_TOKEN, "town")
+    assert expected.groups == plain.groups
 
 
 def test_an_accident_and_its_twin_are_one_cluster() -> None:
-    """Twins that are equal tell nothing new: the interval is that of the accidents alone."""
-    accidents, both, attributes = Ratios(), Ratios(), {}
+    """Equal twins add no information: the interval is that of the accidents only."""
+    accidents, both = RatioEvaluator(), RatioEvaluator()
+    attributes = {}
     for number in range(80):
+        cluster = number // 10
+        counts = {"above": float(cluster % 2), "below": 1.0}
         for kind in ("accident", "normal"):
-            token, story = f"{number:03d} {kind}", f"type1_subtype1_{kind}/Town03_{number // 10}"
-            attributes[token] = attributes_of(number, scenario=story)
-            for evaluator in (accidents, both) if kind == "accident" else (both,):
-                evaluator.add(token, {"above": float(number // 10 % 2), "below": 1.0})
-    [one], [two] = (breakdown(each, attributes, "all").groups for each in (accidents, both))
-    assert (two.scenarios, two.clusters, one.scenarios, one.clusters) == (16, 8, 8, 8)
-    assert two.intervals["ratio"] == pytest.approx(one.intervals["ratio"])
+            token = f"{number:03d} {kind}"
+            scenario = f"type1_subtype1_{kind}/Town03_{cluster}"
+            attributes[token] = attributes_of(number, scenario=scenario)
+            both.add(token, counts)
+        accidents.add(f"{number:03d} accident", counts)
+
+    (accident_group,) = breakdown(accidents, attributes, "all").groups
+    (group,) = breakdown(both, attributes, "all").groups
+    assert (group.scenarios, group.clusters) == (16, 8)
+    assert (accident_group.scenarios, accident_group.clusters) == (8, 8)
+    assert group.intervals["ratio"] == pytest.approx(accident_group.intervals["ratio"])
 
 
-def test_what_cannot_be_broken_down() -> None:
-    few = dict(list(MANY.items())[:-1])
-    assert_refused(
+def test_unknown_samples_and_attributes_are_refused() -> None:
+    evaluator = evaluator_of()
+    all_but_one = dict(list(ATTRIBUTES_BY_TOKEN.items())[:-1])
+
+    assert_raises(
         (
-            lambda: breakdown(filled(), few, "town"),
+            lambda: breakdown(evaluator, all_but_one, "town"),
             EvaluationError,
             ("1 samples", "such as 099", "sample_attributes"),
         ),
-        (lambda: breakdown(filled(), {}, "town"), EvaluationError, ("100 samples", "such as 000")),
         (
-            lambda: breakdown(filled(), MANY, "moon"),
+            lambda: breakdown(evaluator, {}, "town"),
+            EvaluationError,
+            ("100 samples", "such as 000"),
+        ),
+        (
+            lambda: breakdown(evaluator, ATTRIBUTES_BY_TOKEN, "moon"),
             ChoiceError,
             ("by: expected one of", "town", "'moon'"),
         ),
-        (lambda: MANY["000"].value("moon"), ChoiceError, ("by: expected one of", "'moon'")),
+        (
+            lambda: ATTRIBUTES_BY_TOKEN["000"].value("moon"),
+            ChoiceError,
+            ("by: expected one of", "'moon'"),
+        ),
     )
 
 
@@ -246,65 +278,60 @@ def test_bins_of_time_have_their_upper_edge(frames: int, second: str, step: str)
 
 
 def test_the_attributes_of_samples_are_those_of_their_records(da_motion: DeepAccident) -> None:
-    """Of two recordings of 3.5 s: every tenth of a second of one agent, and the samples that are
-    evaluated.
-    """
+    """Read two recordings of 3.5 s: every frame of one agent, and the samples to evaluate."""
     evaluated = da_motion.samples("train", "evaluate")
-    tokens = [sample["token"] for sample in da_motion.sample if sample["agent"] == AGENTS[-1]]
-    attributes = sample_attributes(da_motion, [*evaluated, *tokens])
-    assert list(attributes) == list(dict.fromkeys([*evaluated, *tokens]))
-    words = {True: "visible", False: "invisible", None: None}
-    for token, each in attributes.items():
+    frames = [sample["token"] for sample in da_motion.sample if sample["agent"] == AGENTS[-1]]
+    attributes_by_token = sample_attributes(da_motion, [*evaluated, *frames])
+    assert list(attributes_by_token) == list(dict.fromkeys([*evaluated, *frames]))
+
+    visibilities = {True: "visible", False: "invisible", None: None}
+    for token, attributes in attributes_by_token.items():
         sample = da_motion.sample.get(token)
         scenario = da_motion.scenario.get(sample["scenario_token"])
-        tenths = round(10 * (sample["time_to_impact"] or 0))
-        bins = f"{math.ceil(tenths / 10)} s", f"{math.ceil(tenths / 5) / 2:g} s"
-        assert (each.scenario, each.agent, each.time_to_end) == (
-            sample["scenario_token"],
-            sample["agent"],
-            f"{(35 - int(token[-3:])) / 10:.1f}",
-        )
-        assert (each.time_to_impact, each.impact_step) == (
-            bins if scenario["collision"] else (NO_IMPACT, NO_IMPACT)
-        )
-        assert each.accident_visibility == words[accident_visible(da_motion, token)]
-        assert [each.value(name) for name in ("agent", "all", "town", "Weather")] == [
-            sample["agent"],
-            "all",
-            scenario["town"],
-            scenario["weather"],
-        ]
+        assert attributes.scenario == sample["scenario_token"]
+        assert attributes.agent == sample["agent"]
+        assert attributes.time_to_end == f"{(35 - int(token[-3:])) / 10:.1f}"
+
+        bins = (NO_IMPACT, NO_IMPACT)
+        if scenario["collision"]:
+            tenths = round(10 * (sample["time_to_impact"] or 0))
+            bins = (f"{math.ceil(tenths / 10)} s", f"{math.ceil(tenths / 5) / 2:g} s")
+        assert (attributes.time_to_impact, attributes.impact_step) == bins
+        visibility = visibilities[accident_visible(da_motion, token)]
+        assert attributes.accident_visibility == visibility
+
+        assert attributes.value("agent") == sample["agent"]
+        assert attributes.value("all") == "all"
+        assert attributes.value("town") == scenario["town"]
+        assert attributes.value("Weather") == scenario["weather"]
+
     within = ("accident_visibility", "time_to_impact", "impact_step", "time_to_end")
-    assert (ATTRIBUTES[0], ATTRIBUTES[-5:], {*WITHIN_RECORDINGS}) == (
-        "all",
-        ("agent", *within),
-        {*within},
-    )
-    chosen = {token: attributes[token] for token in evaluated}
-    by_value = {name: tokens_by_value(chosen, name) for name in ATTRIBUTES}
-    assert {sum(map(len, each.values())) for each in by_value.values()} == {len(evaluated)}
-    assert {value: len(each) for value, each in by_value["time_to_impact"].items()} == {
-        "2 s": 10,
-        "1 s": 10,
-    }
+    assert (ATTRIBUTES[0], ATTRIBUTES[-5:]) == ("all", ("agent", *within))
+    assert {*WITHIN_RECORDINGS} == {*within}
+
+    evaluated_attributes = {token: attributes_by_token[token] for token in evaluated}
+    for name in ATTRIBUTES:
+        groups = tokens_by_value(evaluated_attributes, name).values()
+        assert sum(map(len, groups)) == len(evaluated)
+
+    tokens_by_time = tokens_by_value(evaluated_attributes, "time_to_impact")
+    sizes = {value: len(tokens) for value, tokens in tokens_by_time.items()}
+    assert sizes == {"2 s": 10, "1 s": 10}
 
 
-def test_without_meta_it_is_not_known_whether_there_is_an_impact(
+def test_without_a_meta_file_times_to_impact_are_unknown(
     da_motion: DeepAccident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    [record, *_] = [each for each in da_motion.scenario if each["collision"] is None]
+    unknown = [scenario for scenario in da_motion.scenario if scenario["collision"] is None]
+    record = dict(unknown[0])
+    for name, value in record.items():
+        if name != "token" and not isinstance(value, int):
+            record[name] = None
+
+    monkeypatch.setattr(type(da_motion), "scenario", {record["token"]: record}, raising=False)
+
     token = f"{record['token']}/ego_vehicle/010"
-    unknown = {
-        name: None
-        for name, value in record.items()
-        if name != "token" and not isinstance(value, int)
-    }
-    monkeypatch.setattr(
-        type(da_motion), "scenario", {record["token"]: record | unknown}, raising=False
-    )
-    [each] = sample_attributes(da_motion, [token]).values()
-    assert (each.time_to_impact, each.impact_step, each.value("collision_status")) == (
-        None,
-        None,
-        None,
-    )
+    (attributes,) = sample_attributes(da_motion, [token]).values()
+    assert attributes.time_to_impact is None
+    assert attributes.impact_step is None
+    assert attributes.value("collision_status") is None

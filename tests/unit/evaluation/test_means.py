@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,8 +27,8 @@ from deepaccident_devkit.evaluation.means import (
 from deepaccident_devkit.evaluation.task import Row, headlines
 
 
-class Lengths(MeansResult):
-    """Of a test."""
+class LengthsResult(MeansResult):
+    """The result of `LengthsEvaluator`."""
 
     __slots__ = ()
     rows: ClassVar[tuple[Row, ...]] = table_rows(
@@ -37,10 +38,10 @@ class Lengths(MeansResult):
     )
 
 
-class LengthsEvaluator(MeansEvaluator[Lengths]):
-    """Of a test."""
+class LengthsEvaluator(MeansEvaluator[LengthsResult]):
+    """An evaluator of means in two tables."""
 
-    result_class = Lengths
+    result_class = LengthsResult
     protocols: ClassVar[Mapping[str, Any]] = {"clean": Resampling(), "other": Resampling(seed=1)}
     order: ClassVar[Sequence[str]] = ("late", "early", "all")
     main_row = "all"
@@ -54,51 +55,51 @@ class LengthsEvaluator(MeansEvaluator[Lengths]):
         self.add(token, sums.counts(scenario))
 
 
-def filled(values: Sequence[Sequence[float]], scenarios: int = 8) -> LengthsEvaluator:
+def evaluator_of(values: Sequence[Sequence[float]], scenarios: int = 8) -> LengthsEvaluator:
     evaluator = LengthsEvaluator()
-    for number, each in enumerate(values):
-        evaluator.update(f"{number:04d}", f"s{number % scenarios}", each)
+    for number, sample_values in enumerate(values):
+        evaluator.update(f"{number:04d}", f"s{number % scenarios}", sample_values)
     return evaluator
 
 
 @pytest.fixture
 def values() -> list[list[float]]:
-    source = np.random.default_rng(3)
-    return [source.exponential(3, source.integers(0, 4)).tolist() for _ in range(40)]
+    generator = np.random.default_rng(3)
+    return [generator.exponential(3, generator.integers(0, 4)).tolist() for _ in range(40)]
 
 
-def test_tables_rows_and_columns_stand_in_their_order() -> None:
+def test_tables_rows_and_columns_are_in_order() -> None:
     sums = Sums()
     for row in ("10 s", "b", "2 s", "all", "a"):
         for value in (1.0, 2.0):
             sums.add("early", row, "near", value)
+
     sums.add("late", "a", "near", np.nan)
     sums.add("late", "a", "far", np.nan)
     evaluator = LengthsEvaluator()
     evaluator.add("t", sums.counts())
     result = evaluator.compute()
+
     assert {table: [*rows] for table, rows in result.means.items()} == {
         "late": ["a"],
         "early": ["all", "2 s", "10 s", "a", "b"],
     }
     assert [*result.means["late"]["a"]] == ["far", "near"]
-    assert (result.counted["late"]["a"], result.counted["early"]["a"]) == (
-        {"far": 0, "near": 0},
-        {"near": 2},
-    )
+    assert result.counted["late"]["a"] == {"far": 0, "near": 0}
+    assert result.counted["early"]["a"] == {"near": 2}
     assert headlines(result) == ()
     assert LengthsEvaluator("other").settings["seed"] == 1
 
 
-def test_rows_are_those_of_their_masks() -> None:
+def test_rows_are_means_over_their_masks() -> None:
     sums = Sums()
     masks = {"all": np.ones(3, dtype=bool), "few": np.array([True, False, True])}
-    sums.add_rows(
-        "late", masks, {"far": np.array([1.0, 2.0, np.nan]), "near": np.array([np.inf, 5.0, 7.0])}
-    )
+    columns = {"far": np.array([1.0, 2.0, np.nan]), "near": np.array([np.inf, 5.0, 7.0])}
+    sums.add_rows("late", masks, columns)
     evaluator = LengthsEvaluator()
     evaluator.add("t", sums.counts())
     result = evaluator.compute()
+
     assert result.means["late"] == {
         "all": {"far": 1.5, "near": 6.0},
         "few": {"far": 1.0, "near": 7.0},
@@ -107,56 +108,61 @@ def test_rows_are_those_of_their_masks() -> None:
 
 
 def test_sums_are_the_same_in_any_order_and_parts(values: list[list[float]]) -> None:
-    whole = filled(values)
-    counts = [whole.counts[token] for token in sorted(whole.tokens)]
-    expected = whole.compute()
-    assert whole.result_of(counts[::-1]) == expected
-    assert (
-        whole.result_of([*whole.pooled(counts[:16]), *whole.pooled(counts[16:])]).means["late"][
-            "all"
-        ]
-        == (expected.means["late"]["all"])
-    )
+    evaluator = evaluator_of(values)
+    counts = [evaluator.counts[token] for token in sorted(evaluator.tokens)]
+    expected = evaluator.compute()
+    assert evaluator.result_of(counts[::-1]) == expected
+
+    pooled = [*evaluator.pooled(counts[:16]), *evaluator.pooled(counts[16:])]
+    pooled_means = evaluator.result_of(pooled).means["late"]["all"]
+    assert pooled_means == expected.means["late"]["all"]
+
     stored = json.loads(json.dumps(counts))
-    assert whole.result_of(stored) == expected
-    every = [value for each in values for value in each]
-    assert expected.means["late"]["all"]["far"] == pytest.approx(np.mean(every), abs=1e-9)
+    assert evaluator.result_of(stored) == expected
+
+    mean = np.mean([*chain(*values)])
+    assert expected.means["late"]["all"]["far"] == pytest.approx(mean, abs=1e-9)
 
 
 def test_the_mean_of_scenarios(values: list[list[float]]) -> None:
-    result = filled(values).compute()
-    by_scenario = [[value for each in values[first::8] for value in each] for first in range(8)]
-    expected = np.mean([np.mean(each) for each in by_scenario if each])
-    assert result.means["late"][MEAN_OF_SCENARIOS]["far"] == pytest.approx(expected, abs=1e-8)
-    assert result.counted["late"][MEAN_OF_SCENARIOS]["far"] == sum(map(bool, by_scenario))
+    result = evaluator_of(values).compute()
+    scenarios = [[*chain(*values[first::8])] for first in range(8)]
+    scenario_means = [np.mean(scenario) for scenario in scenarios if scenario]
+
+    mean = result.means["late"][MEAN_OF_SCENARIOS]["far"]
+    assert mean == pytest.approx(np.mean(scenario_means), abs=1e-8)
+    assert result.counted["late"][MEAN_OF_SCENARIOS]["far"] == len(scenario_means)
     assert MEAN_OF_SCENARIOS not in result.means["early"]
 
 
-def test_draws_at_once_are_those_of_one_after_another(values: list[list[float]]) -> None:
-    evaluator = filled(values)
-    clusters = evaluator.clustered(
-        {token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)}
-    )
-    times = np.random.default_rng(1).integers(0, 3, (20, len(clusters)))
+def test_draws_at_once_equal_draws_one_after_another(values: list[list[float]]) -> None:
+    evaluator = evaluator_of(values)
+    cluster_names = {token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)}
+    clusters = evaluator.clustered(cluster_names)
+    repetitions = np.random.default_rng(1).integers(0, 3, (20, len(clusters)))
     names = [*numbers_of(evaluator.compute()), "means/late/nobody/far"]
-    slowly = [numbers_of(each) for each in Evaluator.resampled(evaluator, clusters, times)]
-    expected = [[each.get(name, np.nan) for name in names] for each in slowly]
-    assert_array_equal(numbers_of_draws(evaluator, clusters, times, names), expected)
+
+    expected = []
+    for result in Evaluator.resampled(evaluator, clusters, repetitions):
+        numbers = numbers_of(result)
+        expected.append([numbers.get(name, np.nan) for name in names])
+
+    assert_array_equal(numbers_of_draws(evaluator, clusters, repetitions, names), expected)
 
 
 def test_a_cluster_without_a_number_does_not_change_it() -> None:
-    """The jackknife counts the clusters that change a number; rounding must not make them more."""
-    source = np.random.default_rng(5)
-    evaluator = filled(
-        [[value] if number % 8 < 5 else [] for number, value in enumerate(source.uniform(0, 9, 80))]
+    """The jackknife counts the clusters that change a number, and rounding must add none."""
+    draws = np.random.default_rng(5).uniform(0, 9, 80)
+    evaluator = evaluator_of(
+        [[value] if number % 8 < 5 else [] for number, value in enumerate(draws)]
     )
-    clusters = evaluator.clustered(
-        {token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)}
-    )
-    found = intervals_of(evaluator, clusters, evaluator.compute())
-    assert found.ends == {}
+    cluster_names = {token: f"c{int(token) % 8}" for token in sorted(evaluator.tokens)}
+    clusters = evaluator.clustered(cluster_names)
+
+    intervals = intervals_of(evaluator, clusters, evaluator.compute())
+    assert intervals.ends == {}
     assert any(
-        "fewer than 6 clusters" in note and "means/late/all/far" in note for note in found.notes
+        "fewer than 6 clusters" in note and "means/late/all/far" in note for note in intervals.notes
     )
 
 
@@ -167,8 +173,11 @@ def test_notes_count_over_the_samples(tmp_path: Path) -> None:
         sums.note("left out: {sample}", 500 * number)
         sums.note("{plan} of {0.__class__}", number == 2)
         evaluator.add(str(number), sums.counts())
+
     result = evaluator.compute()
     assert result.notes == ("left out: 1,500 samples", "1 plan of 1 0.__class__")
     assert (result.samples, result.means) == (3, {})
     assert evaluator.compute([]).samples == 0
-    assert LengthsEvaluator("other").resume(evaluator.save(tmp_path / "kept")).compute() == result
+
+    resumed = LengthsEvaluator("other").resume(evaluator.save(tmp_path / "kept"))
+    assert resumed.compute() == result

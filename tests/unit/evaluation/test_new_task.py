@@ -1,6 +1,4 @@
-"""A task that somebody adds: a class and its name in `TASKS`, and everything from results to a
-bundle works.
-"""
+"""A new task: a class and its name in `TASKS` are all that results, bundles and reports need."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -9,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from evaluation_runs import stored_run
+from support.evaluation_runs import stored_run
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import DetectedBoxes, Evaluator
@@ -29,7 +27,7 @@ from deepaccident_devkit.render.evaluation import save_report
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentCountResult(TaskResult):
-    """How many agents are predicted for each true one."""
+    """The number of predicted agents for each true one."""
 
     rows: ClassVar[tuple[Row, ...]] = (Row("predicted_share", "share", "neither"),)
     predicted_share: float
@@ -38,13 +36,13 @@ class AgentCountResult(TaskResult):
 
 @dataclass(frozen=True)
 class AgentCountRules:
-    """Which predictions count."""
+    """Rules that choose the predictions to count."""
 
     min_score: float = 0.0
 
 
 class AgentCountEvaluator(Evaluator[AgentCountResult]):
-    """Counts predicted and true agents."""
+    """An evaluator that counts predicted and true agents."""
 
     task = "agent_count"
     description = "Evaluate how many agents are predicted."
@@ -70,23 +68,24 @@ class AgentCountEvaluator(Evaluator[AgentCountResult]):
 def test_a_new_task_is_a_class_and_its_name(
     da_motion: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, results = stored_run(
-        da_motion, EvaluationSetup(task="detection", protocol="paper"), tmp_path / "results"
-    )
+    detection = EvaluationSetup(task="detection", protocol="paper")
+    _, results = stored_run(da_motion, detection, tmp_path / "results")
     monkeypatch.setitem(TASKS, "agent_count", AgentCountEvaluator)
+
     shares = {}
     for protocol in AgentCountEvaluator.protocols:
         setup = EvaluationSetup(task="agent_count", protocol=protocol)
         run = evaluate_results(da_motion, results, setup, "train", workers=1).broken_down()
-        report = partial(save_report, run, dataset=da_motion, results=results)
-        save_run(run, tmp_path / protocol, extras=[report])
-        shares[protocol] = run.result.predicted_share
-        [headline] = read_bundle(tmp_path / protocol).summary["headlines"]
-        assert (headline["name"], headline["value"]) == ("predicted_share", shares[protocol])
+        save_our_report = partial(save_report, run, dataset=da_motion, results=results)
+        bundle = save_run(run, tmp_path / protocol, extras=[save_our_report])
+        share = run.result.predicted_share
+        shares[protocol] = share
+
+        (headline,) = read_bundle(bundle).summary["headlines"]
+        assert (headline["name"], headline["value"]) == ("predicted_share", share)
         assert {row["predicted_share"] is None for row in sample_rows(run)} == {False}
-        assert (
-            verify_bundle(tmp_path / protocol, da_motion, results=results, workers=1).differences
-            == ()
-        )
+        verification = verify_bundle(bundle, da_motion, results=results, workers=1)
+        assert verification.differences == ()
+
     assert 0 < shares["sure"] < shares["all"] < 1
     assert compare_bundles(tmp_path / "all", tmp_path / "all").numbers

@@ -1,4 +1,4 @@
-"""What models say: motion in maps of any framework, and explicit accidents."""
+"""Predictions of models: motion in maps of any framework, and explicit accidents."""
 
 import pickle
 from functools import partial
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
@@ -23,125 +23,143 @@ from deepaccident_devkit.geometry.bev_grid import ORIENTATIONS
 from deepaccident_devkit.motion import MotionLabelConfig
 
 GRID = BevGrid((-4.0, 4.0, 0.5), (-3.0, 3.0, 0.5))
-NAMES = ("segmentation", "centerness", "offset", "flow")
+HEAD_NAMES = ("segmentation", "centerness", "offset", "flow")
 
 
-def stacked(count: int = 3, shape: tuple[int, int] = GRID.shape) -> list[np.ndarray]:
-    """Heads of so many predictions of 5 frames, no two values alike."""
-    source = np.random.default_rng(0)
-    return [
-        source.normal(size=(count, 5, channels, *shape)).astype(np.float32)
-        for channels in (2, 1, 2, 2)
-    ]
+def make_heads(count: int = 3, shape: tuple[int, int] = GRID.shape) -> list[np.ndarray]:
+    """Make random heads of `count` predictions with 5 frames."""
+    generator = np.random.default_rng(0)
+    heads = []
+    for channels in (2, 1, 2, 2):
+        values = generator.normal(size=(count, 5, channels, *shape))
+        heads.append(values.astype(np.float32))
+
+    return heads
 
 
 def assert_same(output: MotionOutput, *arrays: np.ndarray, orientation: str = "devkit") -> None:
-    """Heads of these maps, one a prediction."""
-    found = [{name: getattr(each, name) for name in NAMES} for each in output.heads or ()]
-    np.testing.assert_equal(
-        found, [dict(zip(NAMES, each, strict=True)) for each in zip(*arrays, strict=True)]
-    )
+    """Assert that the output has heads of these arrays, (K, T, channels, H, W)."""
+    heads = output.heads or ()
+    for index, name in enumerate(HEAD_NAMES):
+        values = [getattr(prediction_heads, name) for prediction_heads in heads]
+        np.testing.assert_equal(values, list(arrays[index]))
     assert (output.grid, output.orientation) == (GRID.with_orientation(orientation), None)
-    assert {each.orientation for each in output.heads or ()} == {orientation}
+    assert {prediction_heads.orientation for prediction_heads in heads} == {orientation}
 
 
 class TestMotionOutput:
     def test_arrays_are_heads_in_several_ways(self) -> None:
-        arrays = segmentation, centerness, offset, flow = stacked()
+        arrays = segmentation, centerness, offset, flow = make_heads()
         output = MotionOutput.from_arrays(*arrays, grid=GRID)
-        assert (len(output), np.shares_memory(output.heads[0].flow, flow)) == (3, True)
-        for given in (
+        assert len(output) == 3
+        assert np.shares_memory(output.heads[0].flow, flow)
+        for same_arrays in (
             arrays,
             (segmentation, centerness[:, :, 0], offset, flow),
             (segmentation.tolist(), centerness, offset.astype(float), flow),
         ):
-            assert_same(MotionOutput.from_arrays(*given, grid=GRID), *arrays)
-        one, of_one = output.heads[1], [each[1:2] for each in arrays]
-        for some in (
-            MotionOutput(grid=GRID, heads=one),  # type: ignore[arg-type]  # a lone one is taken
-            MotionOutput(grid=GRID, heads=[one]),  # type: ignore[arg-type]  # any sequence is
-            pickle.loads(pickle.dumps(MotionOutput(grid=GRID, heads=(one,)))),
-            MotionOutput.from_arrays(*(each[1] for each in arrays), grid=GRID),
+            assert_same(MotionOutput.from_arrays(*same_arrays, grid=GRID), *arrays)
+
+        heads = output.heads[1]
+        heads_arrays = [array[1:2] for array in arrays]
+        for single_output in (
+            MotionOutput(grid=GRID, heads=heads),  # type: ignore[arg-type]  # a lone one is taken
+            MotionOutput(grid=GRID, heads=[heads]),  # type: ignore[arg-type]  # any sequence is
+            pickle.loads(pickle.dumps(MotionOutput(grid=GRID, heads=(heads,)))),
+            MotionOutput.from_arrays(*(array[1] for array in arrays), grid=GRID),
             MotionOutput.from_arrays(
                 segmentation[1], centerness[1, :, 0], offset[1], flow[1], grid=GRID
             ),
         ):
-            assert_same(some, *of_one)
+            assert_same(single_output, *heads_arrays)
 
-    def test_the_orientation_is_the_grids_unless_it_is_given(self) -> None:
-        arrays, maps = (
-            stacked(shape=GRID.shape[::-1]),
-            np.zeros((1, 5, *GRID.shape[::-1]), dtype=np.int32),
-        )
+    def test_the_orientation_is_the_grids_unless_another_is_given(self) -> None:
+        arrays = make_heads(shape=GRID.shape[::-1])
         output = MotionOutput.from_arrays(*arrays, grid=GRID, orientation="fiery")
-        for some in (output, MotionOutput(grid=GRID, heads=output.heads, orientation="fiery")):
-            assert_same(some, *arrays, orientation="fiery")
-        assert (
-            MotionOutput(grid=GRID, instances=maps, orientation="fiery").grid.orientation == "fiery"
-        )
-        north = partial(MotionOutput, grid=GRID, instances=maps, orientation="north")
-        assert_refused(
+        assert_same(output, *arrays, orientation="fiery")
+
+        output = MotionOutput(grid=GRID, heads=output.heads, orientation="fiery")
+        assert_same(output, *arrays, orientation="fiery")
+
+        maps = np.zeros((1, 5, *GRID.shape[::-1]), dtype=np.int32)
+        maps_output = MotionOutput(grid=GRID, instances=maps, orientation="fiery")
+        assert maps_output.grid.orientation == "fiery"
+
+        assert_raises(
             (
                 lambda: MotionOutput(grid=GRID, heads=output.heads),
                 GeometryError,
                 ("orientation devkit", "in fiery"),
             ),
-            (north, ChoiceError, ("orientation: expected one of", "north")),
+            (
+                partial(MotionOutput, grid=GRID, instances=maps, orientation="north"),
+                ChoiceError,
+                ("orientation: expected one of", "north"),
+            ),
         )
 
     @pytest.mark.parametrize(
-        "heads", [stacked()[0], stacked(), dict(zip(NAMES, stacked(), strict=True)), 3, [None]]
+        "heads",
+        [
+            make_heads()[0],
+            make_heads(),
+            dict(zip(HEAD_NAMES, make_heads(), strict=True)),
+            3,
+            [None],
+        ],
     )
-    def test_arrays_are_no_heads(self, heads: Any) -> None:
-        words = ("heads: expected MotionHeads, found", "MotionOutput.from_arrays(")
-        assert_refused((lambda: MotionOutput(grid=GRID, heads=heads), GeometryError, words))
+    def test_arrays_instead_of_heads_are_refused(self, heads: Any) -> None:
+        message = ("heads: expected MotionHeads, found", "MotionOutput.from_arrays(")
+        assert_raises((lambda: MotionOutput(grid=GRID, heads=heads), GeometryError, message))
 
-    def test_boxes_are_no_prediction_and_none_of_them_no_quiet_one(self) -> None:
-        none = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
-        words = ("a MotionOutput or a list of Accidents", "Boxes", "instances_of")
-        assert_refused(
-            *(
-                (lambda given=given: checked_prediction(given), EvaluationError, words)
-                for given in (none, [none])
-            )
+    def test_boxes_instead_of_accidents_are_refused_even_if_empty(self) -> None:
+        boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
+        message = ("a MotionOutput or a list of Accidents", "Boxes", "instances_of")
+
+        assert_raises(
+            (lambda: checked_prediction(boxes), EvaluationError, message),
+            (lambda: checked_prediction([boxes]), EvaluationError, message),
         )
 
-    def test_what_is_no_output(self) -> None:
-        segmentation, centerness, offset, flow = stacked()
-        coarse = MotionOutput.from_arrays(
-            *stacked(1, (6, 8)), grid=BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0))
-        )
-        none = np.zeros((0, 5, *GRID.shape), dtype=int)
-        assert_refused(
-            *(
-                (partial(MotionOutput.from_arrays, *arrays, grid=GRID), GeometryError, words)
-                for arrays, words in (
-                    (
-                        (segmentation, centerness, offset[:2], flow),
-                        ("offset", "(K, T, channels, H, W)", "(2, 5"),
-                    ),
-                    (
-                        (segmentation[0, 0], centerness, offset, flow),
-                        ("segmentation", "(K, T, channels, H, W)"),
-                    ),
-                    ((segmentation, centerness, offset, flow[:, :4]), ("flow", "expected shape")),
-                    ([each[:0] for each in stacked()], ("at least one prediction",)),
-                )
-            ),
-            *(
-                (partial(MotionOutput, grid=GRID, **given), GeometryError, words)
-                for given, words in (
-                    ({}, ("heads, or instances", "not both")),
-                    (
-                        {"heads": coarse.heads},
-                        ("(12, 16) cells in orientation devkit", "(6, 8) in devkit"),
-                    ),
-                    ({"heads": ()}, ("at least one prediction",)),
-                    ({"instances": none}, ("at least one prediction",)),
-                )
+    def test_arrays_that_are_no_output_are_refused(self) -> None:
+        segmentation, centerness, offset, flow = make_heads()
+        from_arrays = partial(MotionOutput.from_arrays, grid=GRID)
+        output = partial(MotionOutput, grid=GRID)
+        coarse_grid = BevGrid((-4.0, 4.0, 1.0), (-3.0, 3.0, 1.0))
+        coarse = MotionOutput.from_arrays(*make_heads(1, (6, 8)), grid=coarse_grid)
+        no_maps = np.zeros((0, 5, *GRID.shape), dtype=int)
+
+        assert_raises(
+            (
+                partial(from_arrays, segmentation, centerness, offset[:2], flow),
+                GeometryError,
+                ("offset", "(K, T, channels, H, W)", "(2, 5"),
             ),
             (
-                partial(MotionOutput.from_arrays, *stacked(), grid=None),
+                partial(from_arrays, segmentation[0, 0], centerness, offset, flow),
+                GeometryError,
+                ("segmentation", "(K, T, channels, H, W)"),
+            ),
+            (
+                partial(from_arrays, segmentation, centerness, offset, flow[:, :4]),
+                GeometryError,
+                ("flow", "expected shape"),
+            ),
+            (
+                partial(from_arrays, *make_heads(count=0)),
+                GeometryError,
+                ("at least one prediction",),
+            ),
+            (output, GeometryError, ("give either heads or instances",)),
+            (
+                partial(output, heads=coarse.heads),
+                GeometryError,
+                ("(12, 16) cells in orientation devkit", "(6, 8) in devkit"),
+            ),
+            (partial(output, heads=()), GeometryError, ("at least one prediction",)),
+            (partial(output, instances=no_maps), GeometryError, ("at least one prediction",)),
+            (
+                partial(MotionOutput.from_arrays, *make_heads(), grid=None),
                 GeometryError,
                 ("grid", "BevGrid", "NoneType"),
             ),
@@ -149,9 +167,9 @@ class TestMotionOutput:
 
 
 class TestAccident:
-    def test_what_is_not_given(self) -> None:
-        now = Accident(positions=np.zeros((2, 2)), time=0.0)
-        assert (now.time, now.score, now.ids) == (0.0, 1.0, None)
+    def test_accidents_have_defaults(self) -> None:
+        accident = Accident(positions=np.zeros((2, 2)), time=0.0)
+        assert (accident.time, accident.score, accident.ids) == (0.0, 1.0, None)
 
     def test_numbers_of_numpy_become_pythons(self) -> None:
         accident = Accident(
@@ -178,30 +196,34 @@ class TestAccident:
             ({"time": float("inf")}, "accident: time inf and score 1.0 must be finite"),
         ],
     )
-    def test_what_is_no_accident(self, changes: dict[str, Any], message: str) -> None:
-        given = {"positions": np.zeros((2, 2)), "time": 1.0} | changes
-        assert_refused((lambda: Accident(**given), GeometryError, message))
+    def test_values_that_are_no_accident_are_refused(
+        self, changes: dict[str, Any], message: str
+    ) -> None:
+        fields = {"positions": np.zeros((2, 2)), "time": 1.0} | changes
+        assert_raises((lambda: Accident(**fields), GeometryError, message))
 
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
 @pytest.mark.parametrize("extent", [30.0, 30.5, 41.0, 1.0, 300.0])
-def test_the_cells_of_a_range(orientation, extent: float) -> None:
-    """A centre on the edge is in on one side."""
+def test_cells_within_a_range_are_judged_by_their_centres(orientation, extent: float) -> None:
+    """A centre on the edge is inside on one side only."""
     for grid in (
         BevGrid((-20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation),
         BevGrid((20.0, 60.0, 0.5), (-30.0, 10.0, 0.25), orientation),
     ):
-        inside = (grid.centers() >= -extent / 2) & (grid.centers() < extent / 2)
-        found = np.zeros(grid.shape, dtype=bool)
-        found[cells_within(grid, extent)] = True
-        np.testing.assert_array_equal(found, inside.all(axis=-1))
+        centers = grid.centers()
+        expected = (centers >= -extent / 2) & (centers < extent / 2)
+        is_within = np.zeros(grid.shape, dtype=bool)
+        is_within[cells_within(grid, extent)] = True
+        np.testing.assert_array_equal(is_within, expected.all(axis=-1))
 
 
 def test_labels_are_compared_at_the_present_with_bilinear_centres(da_motion: DeepAccident) -> None:
     label = da_motion.motion_labels(f"{da_motion.scenario[0]['token']}/ego_vehicle/010")
-    moved = label.to_present(centerness="bilinear")
-    assert (labels_at_present(label).centerness == moved.centerness).all()
-    assert labels_at_present(moved) is moved
+    at_present = label.to_present(centerness="bilinear")
+
+    assert (labels_at_present(label).centerness == at_present.centerness).all()
+    assert labels_at_present(at_present) is at_present
 
 
 @pytest.mark.parametrize(
@@ -215,9 +237,16 @@ def test_labels_are_compared_at_the_present_with_bilinear_centres(da_motion: Dee
         ({"labels": "clean"}, {"step": 0.5, "labels": "released"}, 2.0, ("clean", 5, 4)),
     ],
 )
-def test_which_labels_predictions_are_compared_with(rules, form, horizon, expected) -> None:
-    """By the rules' label protocol, or else by the form's."""
-    given = form and SimpleNamespace(grid=GRID, **form)
-    names, grid = ("protocol", "step", "future_frames"), BevGrid() if form is None else GRID
-    made = expected and MotionLabelConfig(grid=grid, **dict(zip(names, expected, strict=True)))
-    assert label_config(SimpleNamespace(**rules), given, horizon) == made
+def test_labels_are_chosen_by_the_rules_or_otherwise_by_the_form(
+    rules, form, horizon, expected
+) -> None:
+    motion_form = None if form is None else SimpleNamespace(grid=GRID, **form)
+    config = label_config(SimpleNamespace(**rules), motion_form, horizon)
+    if expected is None:
+        assert config is None
+    else:
+        protocol, step, future_frames = expected
+        grid = BevGrid() if form is None else GRID
+        assert config == MotionLabelConfig(
+            grid=grid, protocol=protocol, step=step, future_frames=future_frames
+        )

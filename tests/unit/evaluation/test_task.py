@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluation_runs import stored_run
-from refusals import assert_refused
+from support.evaluation_runs import stored_run
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -30,7 +30,7 @@ from deepaccident_devkit.evaluation.task import (
     value_text,
 )
 
-every_protocol = pytest.mark.parametrize(
+for_every_protocol = pytest.mark.parametrize(
     ("task", "protocol"), [(task, protocol) for task in TASKS for protocol in TASKS[task].protocols]
 )
 
@@ -46,37 +46,44 @@ every_protocol = pytest.mark.parametrize(
         pytest.param("forecasting", "clean", marks=pytest.mark.slow),
     ],
 )
-def test_read_truth_update_compute(
+def test_read_truth_update_and_compute_give_the_result_of_a_run(
     task: str, protocol: str, da_motion: DeepAccident, tmp_path: Path
 ) -> None:
     setup = EvaluationSetup(task=task, protocol=protocol)
     run, results = stored_run(da_motion, setup, tmp_path / "results")
     evaluator = TASKS[task](protocol)
+
     assert results.task in TASKS[task].result_kinds
     for token in results.tokens:
         prediction = evaluator.read(results, da_motion, token)
         truth = evaluator.truth(da_motion, token, results.form, setup.horizon)
         evaluator.update(token, prediction, *truth)
+
     assert evaluator.compute().samples == len(results) > 1
     assert evaluator.compute().as_dict() == run.result.as_dict()
 
 
-@every_protocol
+@for_every_protocol
 def test_every_protocol_makes_an_evaluator_and_its_kind_of_result(task: str, protocol: str) -> None:
-    rules, evaluator = TASKS[task].protocols[protocol], TASKS[task](protocol)
-    assert (evaluator.protocol, TASKS[task](rules).protocol) == (rules, rules)
-    assert isinstance(evaluator.compute(), TASKS[task].result_class)
+    evaluator_class = TASKS[task]
+    rules = evaluator_class.protocols[protocol]
+    evaluator = evaluator_class(protocol)
+    by_rules = evaluator_class(rules)
+
+    assert (evaluator.protocol, by_rules.protocol) == (rules, rules)
+    assert isinstance(evaluator.compute(), evaluator_class.result_class)
     assert evaluator.compute().samples == 0
-    assert evaluator.settings == TASKS[task](rules).settings
-    assert_refused((lambda: TASKS[task]("none"), ChoiceError, ("protocol", protocol, "'none'")))
+    assert evaluator.settings == by_rules.settings
+    assert_raises((lambda: evaluator_class("none"), ChoiceError, ("protocol", protocol, "'none'")))
 
 
-def test_what_each_task_is() -> None:
-    facts = {
-        name: (each.result_kinds, each.needs_whole_recordings, each.needs_meta)
-        for name, each in TASKS.items()
+def test_properties_of_each_task() -> None:
+    properties = {
+        name: (task.result_kinds, task.needs_whole_recordings, task.needs_meta)
+        for name, task in TASKS.items()
     }
-    assert facts == {
+
+    assert properties == {
         "motion": (("motion",), False, False),
         "accident": (("motion", "accident"), False, True),
         "detection": (("detection",), False, False),
@@ -84,40 +91,43 @@ def test_what_each_task_is() -> None:
         "planning": (("planning",), True, True),
         "forecasting": (("forecasting",), True, False),
     }
-    assert [name for name, each in TASKS.items() if each.vehicles_only] == ["planning"]
-    assert [name for name, each in TASKS.items() if not each.has_horizon] == [
-        "detection",
-        "planning",
-        "forecasting",
-    ]
+    assert [name for name, task in TASKS.items() if task.vehicles_only] == ["planning"]
+
+    without_horizon = [name for name, task in TASKS.items() if not task.has_horizon]
+    assert without_horizon == ["detection", "planning", "forecasting"]
 
 
-@every_protocol
+@for_every_protocol
 def test_each_choice_of_every_protocol_can_be_given(task: str, protocol: str) -> None:
     rules = TASKS[task].protocols[protocol]
     for name in switch_names(rules):
         value: Any = rules
         for part in name.split("."):
             value = getattr(value, part)
-        assert (
-            switched(rules, {name: json.loads(json.dumps(value)) if value != np.inf else value})
-            == rules
-        )
+        if value != np.inf:
+            value = json.loads(json.dumps(value))
+        assert switched(rules, {name: value}) == rules
+
     assert switched(rules, {}) is rules
 
 
-def test_choices_may_be_of_a_part_lists_for_tuples_and_null_where_one_takes_it() -> None:
-    released, paper = DETECTION_PROTOCOLS["released"], DETECTION_PROTOCOLS["paper"]
-    changed = switched(
+def test_choices_may_be_parts_lists_for_tuples_and_null() -> None:
+    accidents = switched(
         PaperAccidents(), {"reading.danger_distance": 2, "sample_choice": "mean_first"}
     )
-    assert switch_names(changed) == ["reading.danger_distance", "sample_choice"]
-    assert (changed.reading.danger_distance, changed.sample_choice) == (2, "mean_first")
-    assert switched(released, {"area": None, "error_threshold": None}).error_threshold is None
-    rings = switched(
-        paper, {"ranges": [[0, 30], [30, 50]], "error_threshold": None}
-    )  # which go together alone
-    assert rings.ranges == ((0, 30), (30, 50))
+    assert switch_names(accidents) == ["reading.danger_distance", "sample_choice"]
+    assert (accidents.reading.danger_distance, accidents.sample_choice) == (2, "mean_first")
+
+    without_area = switched(
+        DETECTION_PROTOCOLS["released"], {"area": None, "error_threshold": None}
+    )
+    assert without_area.error_threshold is None
+
+    # ranges go together only with no error threshold
+    by_ranges = switched(
+        DETECTION_PROTOCOLS["paper"], {"ranges": [[0, 30], [30, 50]], "error_threshold": None}
+    )
+    assert by_ranges.ranges == ((0, 30), (30, 50))
 
 
 @pytest.mark.parametrize(
@@ -167,28 +177,28 @@ def test_choices_may_be_of_a_part_lists_for_tuples_and_null_where_one_takes_it()
         ),
     ],
 )
-def test_choices_that_are_none(
+def test_wrong_choices_are_refused(
     rules: Any, switches: dict[str, Any], words: tuple[str, ...]
 ) -> None:
-    assert_refused((lambda: switched(rules, switches), ChoiceError, words))
+    assert_raises((lambda: switched(rules, switches), ChoiceError, words))
 
 
-@every_protocol
+@for_every_protocol
 def test_each_headline_is_a_number_of_the_result_by_its_path(task: str, protocol: str) -> None:
     result = EvaluationSetup(task=task, protocol=protocol).evaluator().compute()
-    known, found = numbers_of(result), headlines(result)
-    assert len({each.name for each in found}) == len(found)
-    assert len(found) > 2 or task in (
-        "warning",
-        "planning",
-        "forecasting",
-    )  # by group, of which there is none yet
-    for each in found:
-        value = known.get(each.path, math.nan)
-        assert each.value == (None if math.isnan(value) else value)
+    numbers = numbers_of(result)
+    result_headlines = headlines(result)
+
+    names = {headline.name for headline in result_headlines}
+    assert len(names) == len(result_headlines)
+    # headlines by group: an empty result has no groups
+    assert len(names) > 2 or task in ("warning", "planning", "forecasting")
+    for headline in result_headlines:
+        value = numbers.get(headline.path, math.nan)
+        assert headline.value == (None if math.isnan(value) else value)
 
 
-HEADLINES = {
+HEADLINE_TEXTS = {
     "motion": "iou 30x30 %+, iou 100x100 %+, vpq 30x30 %+, vpq 100x100 %+, min_ade m-, "
     "min_fde m-, miss_rate share-",
     "accident": "apa share+, precision share+, recall share+, false_alarm_rate share-, "
@@ -204,11 +214,13 @@ HEADLINES = {
     ("task", "protocol"), [("motion", "released"), ("accident", "boxes"), ("detection", "opencood")]
 )
 def test_headlines_have_names_units_and_a_better_side(task: str, protocol: str) -> None:
-    found = headlines(EvaluationSetup(task=task, protocol=protocol).evaluator().compute())
+    result = EvaluationSetup(task=task, protocol=protocol).evaluator().compute()
     sides = {True: "+", False: "-", None: " "}
-    assert [
-        f"{each.name} {each.unit}{sides[each.higher_is_better]}" for each in found
-    ] == HEADLINES[task].split(", ")
+    texts = []
+    for headline in headlines(result):
+        texts.append(f"{headline.name} {headline.unit}{sides[headline.higher_is_better]}")
+
+    assert texts == HEADLINE_TEXTS[task].split(", ")
 
 
 @pytest.mark.parametrize(
@@ -229,7 +241,7 @@ def test_texts_of_values(value: float | None, unit: Any, signed: bool, text: str
 
 def test_mappings_of_results_are_frozen_and_have_a_hash() -> None:
     frozen = FrozenDict({"a": 1, "b": 2})
-    changes = (
+    for name in (
         "__setitem__",
         "__delitem__",
         "__ior__",
@@ -238,11 +250,13 @@ def test_mappings_of_results_are_frozen_and_have_a_hash() -> None:
         "popitem",
         "setdefault",
         "update",
-    )
-    assert_refused(
-        *((getattr(frozen, name), TypeError, ("make a dict of it",)) for name in changes)
-    )
-    assert [pickle.loads(pickle.dumps(frozen)), copy.deepcopy(frozen)] == [frozen] * 2
-    nested = replace(MotionEvaluator().compute(), ranges={"a": {"b": 1}}).ranges["a"]
+    ):
+        assert_raises((getattr(frozen, name), TypeError, ("copy the mapping into a dict",)))
+
+    assert pickle.loads(pickle.dumps(frozen)) == frozen
+    assert copy.deepcopy(frozen) == frozen
+
+    result = replace(MotionEvaluator().compute(), ranges={"a": {"b": 1}})
+    nested = result.ranges["a"]
     assert (type(nested), nested) == (FrozenDict, {"b": 1})
     assert hash(frozen) == hash(FrozenDict({"b": 2, "a": 1})) != hash(FrozenDict({"a": 1}))

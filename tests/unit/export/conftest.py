@@ -1,4 +1,4 @@
-"""A small release with pictures, and what is in a folder."""
+"""Make small releases for exports."""
 
 import shutil
 from pathlib import Path
@@ -11,23 +11,23 @@ from deepaccident_devkit.testing import SmallRelease, write_small_release
 
 @pytest.fixture(scope="session")
 def small_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three scenarios of three frames and two agents; indexed; read-only by agreement."""
-    wanted = SmallRelease(
+    """An indexed release of three scenarios with three frames and two agents, only to be read."""
+    content = SmallRelease(
         splits=("train", "val"), agents=("ego_vehicle", "other_vehicle"), channels=("Camera_Front",)
     )
     root = tmp_path_factory.mktemp("small") / "release"
-    write_small_release(root, wanted)
+    write_small_release(root, content)
     DeepAccident(dataroot=root, verbose=False)
     return root
 
 
 @pytest.fixture(scope="session")
-def small(small_root: Path) -> DeepAccident:
+def small_dataset(small_root: Path) -> DeepAccident:
     return DeepAccident(dataroot=small_root, verbose=False)
 
 
 @pytest.fixture
-def unlabelled(own_release: Path) -> DeepAccident:
+def unlabelled_dataset(own_release: Path) -> DeepAccident:
     """A release without labels."""
     for path in own_release.rglob("label/*/*.txt"):
         path.unlink()
@@ -35,6 +35,6 @@ def unlabelled(own_release: Path) -> DeepAccident:
 
 
 @pytest.fixture
-def changing(small_root: Path, tmp_path: Path) -> Path:
-    """A copy of it that a test may change."""
+def release_copy(small_root: Path, tmp_path: Path) -> Path:
+    """A copy of the small release that a test may change."""
     return shutil.copytree(small_root, tmp_path / "changing")

@@ -1,11 +1,11 @@
-"""`python -m benchmarks export`, on a release that is small enough for a test."""
+"""`python -m benchmarks export` on a release that is small enough for a test."""
 
 import pytest
-from scripts import of_checkout
+from support.repository_scripts import import_from_checkout
 
 from deepaccident_devkit.plugins.synth import SynthConfig
 
-benchmark = of_checkout("benchmarks.export")
+benchmark = import_from_checkout("benchmarks.export")
 
 
 @pytest.mark.slow
@@ -17,11 +17,13 @@ def test_every_format_is_measured_with_links_and_with_copies(
     )
     for name in ("SCENARIOS", "REPEATS"):
         monkeypatch.setattr(benchmark, name, 1)
-    found = {figure.name: figure for figure in benchmark.measure()}
-    names = [form.name for form in benchmark.FORMATS]
-    for name in [*names, "opencood_copies"]:
-        speed, size = found[f"export_{name}_samples_per_s"], found[f"export_{name}_kb_per_sample"]
+
+    figures = {figure.name: figure for figure in benchmark.measure()}
+    for name in [*(form.name for form in benchmark.FORMATS), "opencood_copies"]:
+        speed = figures[f"export_{name}_samples_per_s"]
+        size = figures[f"export_{name}_kb_per_sample"]
         assert min(speed.value, speed.bound or 0, size.value) > 0
-    sizes = [found[f"export_opencood{way}_kb_per_sample"].value for way in ("", "_copies")]
-    assert sizes[0] < sizes[1]
-    assert "export_parquet_copies_samples_per_s" not in found  # it links nothing
+    linked_size = figures["export_opencood_kb_per_sample"].value
+
+    assert linked_size < figures["export_opencood_copies_kb_per_sample"].value
+    assert "export_parquet_copies_samples_per_s" not in figures  # it links nothing

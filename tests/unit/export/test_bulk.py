@@ -1,6 +1,4 @@
-"""Exports: what is written, whom a folder refuses, what is kept, and calls that are stopped or
-share a folder.
-"""
+"""Exports write complete files, refuse unfit folders, and survive stops and shared folders."""
 
 import errno
 import json
@@ -22,10 +20,10 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import killed
 import pytest
-from refusals import assert_refused
-from tiny_format import KilledFormat, TinyFormat
+from support import stopped_index_process
+from support.expected_errors import assert_raises
+from support.tiny_format import KilledFormat, TinyFormat
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import (
@@ -66,73 +64,87 @@ from deepaccident_devkit.training.image_cache import CachedImages
 
 pytestmark = pytest.mark.slow
 
-SCENARIOS, PICTURES = 3, 18
-MANIFEST, ARCHIVE = "tiny.manifest.json", ".deepaccident-tiny.zip"
+NUM_SCENARIOS = 3
+NUM_PICTURES = 18
+MANIFEST = "tiny.manifest.json"
+ARCHIVE = ".deepaccident-tiny.zip"
 
 
 Contents = dict[str, bytes | None]
 
 
-def contents(folder: Path) -> Contents:
-    """Path → content; None for a folder."""
-    return {
-        path.relative_to(folder).as_posix(): None if path.is_dir() else path.read_bytes()
-        for path in folder.rglob("*")
-    }
+def read_contents(folder: Path) -> Contents:
+    """Read the content of each path below a folder; it is None for a folder."""
+    contents: Contents = {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        contents[name] = None if path.is_dir() else path.read_bytes()
+    return contents
 
 
-def states(folder: Path) -> dict[str, tuple[int, ...]]:
-    """Path → what changes when something is written there."""
-    return {
-        str(path): (path.lstat().st_mtime_ns, path.lstat().st_ino, path.lstat().st_size)
-        for path in [folder, *folder.rglob("*")]
-    }
+def read_states(folder: Path) -> dict[str, tuple[int, ...]]:
+    """Read the modification time, inode and size of each path, which change with any write."""
+    states = {}
+    for path in [folder, *folder.rglob("*")]:
+        status = path.lstat()
+        states[str(path)] = (status.st_mtime_ns, status.st_ino, status.st_size)
+    return states
 
 
-def written(
+def export(
     dataset: DeepAccident, folder: Path, form: TinyFormat | None = None, **options: Any
 ) -> Exported:
-    return export_release(dataset, folder, form or TinyFormat(), **{"workers": 1, **options})
+    return export_release(
+        dataset,
+        folder,
+        form or TinyFormat(),
+        **{"workers": 1, **options},
+    )
 
 
-def reopened(root: Path) -> DeepAccident:
+def open_release(root: Path) -> DeepAccident:
     return DeepAccident(dataroot=root, verbose=False)
 
 
-def stopped(
+def stop_export(
     dataset: DeepAccident, folder: Path, units: int, form: TinyFormat | None = None
 ) -> None:
-    """An export that comes to an end when so many units are done."""
+    """Begin an export and interrupt it when `units` units are done."""
+    write_unit = TinyFormat.write
+    remaining = iter(range(units))
+
+    def write_or_stop(self: TinyFormat, *arguments: Any) -> None:
+        if next(remaining, None) is None:
+            raise KeyboardInterrupt
+        write_unit(self, *arguments)
+
     with pytest.MonkeyPatch.context() as patch:
-        whole, left = TinyFormat.write, iter(range(units))
-
-        def write(self: TinyFormat, *arguments: Any) -> None:
-            if next(left, None) is None:
-                raise KeyboardInterrupt
-            whole(self, *arguments)
-
-        patch.setattr(TinyFormat, "write", write)
+        patch.setattr(TinyFormat, "write", write_or_stop)
         with pytest.raises(KeyboardInterrupt):
-            written(dataset, folder, form)
+            export(dataset, folder, form)
 
 
-def begun(dataset: DeepAccident, folder: Path, units: int) -> None:
-    """An export that is complete, or comes to an end when so many units are done."""
-    stopped(dataset, folder, units) if units < SCENARIOS else written(dataset, folder)
+def begin_export(dataset: DeepAccident, folder: Path, units: int) -> None:
+    """Export all units, or interrupt the export when `units` units are done."""
+    if units < NUM_SCENARIOS:
+        stop_export(dataset, folder, units)
+    else:
+        export(dataset, folder)
 
 
 @pytest.fixture(scope="module")
-def whole(small: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Contents:
-    """What a whole export of the small release holds."""
-    return contents(written(small, tmp_path_factory.mktemp("whole") / "out").folder)
+def whole_export(small_dataset: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Contents:
+    """The contents of a complete export of the small release."""
+    return read_contents(export(small_dataset, tmp_path_factory.mktemp("whole") / "out").folder)
 
 
 def edit_label(root: Path, token: str) -> None:
-    """Put a label file without its last box in the place of one."""
+    """Replace a label file by one without its last box."""
     scenario_type, name = token.split("/")
     path = root / scenario_type / "ego_vehicle" / "label" / name / f"{name}_002.txt"
+    lines = path.read_text().splitlines(keepends=True)
     edited = path.with_name("edited")
-    edited.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    edited.write_text("".join(lines[:-1]))
     edited.replace(path)
 
 
@@ -142,37 +154,32 @@ def remove_scenario(root: Path, token: str) -> None:
         shutil.rmtree(folder)
 
 
-def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
-    done = written(small, tmp_path / "deep" / "out")
-    files = {
-        name
-        for name, content in contents(done.folder).items()
-        if content is not None and name != ARCHIVE
-    }
-    assert len(files) == PICTURES + SCENARIOS * (1 + 3 + 1) + 1 + 1
-    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (
-        3,
-        0,
-        PICTURES,
-        SCENARIOS * 5 + 1,
-    )
-    told = json.loads((done.folder / MANIFEST).read_bytes())
-    assert (told["written"], told["written"]["left_out"]) == (
-        asdict(done.tally),
-        {"clouds": PICTURES, "maps": 1},
-    )
-    assert told["written"]["bytes"] == sum(
-        (done.folder / name).stat().st_size
-        for name in files - {MANIFEST}
-        if not name.endswith(".jpg")
-    )
-    hashes = scenario_hashes(small, [record["token"] for record in small.scenario])
-    assert told["release"]["fingerprint"] == fingerprint(hashes)
-    assert told["settings"].items() >= {"split": None, "greeting": "hello", "version": "v1"}.items()
+def test_an_export_counts_its_files_and_describes_itself(
+    small_dataset: DeepAccident, tmp_path: Path
+) -> None:
+    done = export(small_dataset, tmp_path / "deep" / "out")
+    files = set(list_files(done.folder)) - {ARCHIVE}
+    assert len(files) == NUM_PICTURES + NUM_SCENARIOS * (1 + 3 + 1) + 1 + 1
+    assert (done.written, done.kept) == (3, 0)
+    assert (done.tally.samples, done.tally.files) == (NUM_PICTURES, NUM_SCENARIOS * 5 + 1)
+
+    manifest = json.loads((done.folder / MANIFEST).read_bytes())
+    assert manifest["written"] == asdict(done.tally)
+    assert manifest["written"]["left_out"] == {"clouds": NUM_PICTURES, "maps": 1}
+
+    own_files = [name for name in files - {MANIFEST} if not name.endswith(".jpg")]
+    num_bytes = sum((done.folder / name).stat().st_size for name in own_files)
+    assert manifest["written"]["bytes"] == num_bytes
+
+    hashes = scenario_hashes(small_dataset, [record["token"] for record in small_dataset.scenario])
+    assert manifest["release"]["fingerprint"] == fingerprint(hashes)
+
+    settings = {"split": None, "greeting": "hello", "version": "v1"}
+    assert manifest["settings"].items() >= settings.items()
 
 
 @pytest.mark.parametrize(
-    ("option", "value"),
+    ("option", "open_value"),
     [
         ("workers", lambda: nullcontext(2)),
         ("workers", nullcontext),
@@ -181,41 +188,46 @@ def test_what_is_there(small: DeepAccident, tmp_path: Path) -> None:
     ],
 )
 def test_workers_and_executors_write_the_same(
-    small: DeepAccident, whole: Contents, tmp_path: Path, option: str, value: Callable[[], Any]
-) -> None:
-    with value() as given:
-        assert contents(written(small, tmp_path / "out", **{option: given}).folder) == whole
-        assert written(small, tmp_path / "out", **{option: given}).kept == SCENARIOS
-
-
-def test_a_killed_worker_is_told_and_leaves_nothing_half_written(
-    small: DeepAccident, whole: Contents, tmp_path: Path
+    small_dataset: DeepAccident,
+    whole_export: Contents,
+    tmp_path: Path,
+    option: str,
+    open_value: Callable[[], Any],
 ) -> None:
     out = tmp_path / "out"
-    assert_refused(
-        (lambda: export_release(small, out, KilledFormat(), workers=2), WorkerError, "was killed")
-    )
-    assert not [name for name in contents(out) if temporary_of(Path(name).name)]
-    assert contents(written(small, out).folder) == whole
+    with open_value() as value:
+        export(small_dataset, out, **{option: value})
+        assert read_contents(out) == whole_export
+        assert export(small_dataset, out, **{option: value}).kept == NUM_SCENARIOS
 
 
-def test_a_complete_export_is_kept_as_it_is_whatever_the_way_of_links(
-    small: DeepAccident, tmp_path: Path
+def test_a_killed_worker_is_an_error_and_leaves_nothing_half_written(
+    small_dataset: DeepAccident, whole_export: Contents, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(WorkerError, match="was killed"):
+        export_release(small_dataset, out, KilledFormat(), workers=2)
+    assert not [name for name in read_contents(out) if temporary_of(Path(name).name)]
+    assert read_contents(export(small_dataset, out).folder) == whole_export
+
+
+def test_a_complete_export_stays_unchanged_for_any_kind_of_link(
+    small_dataset: DeepAccident, tmp_path: Path
 ) -> None:
     shares: list[float] = []
-    first, before = (
-        written(small, tmp_path / "out", progress=shares.append),
-        states(tmp_path / "out"),
-    )
-    assert shares == pytest.approx([1 / SCENARIOS] * SCENARIOS)
+    first = export(small_dataset, tmp_path / "out", progress=shares.append)
+    before = read_states(tmp_path / "out")
+    assert shares == pytest.approx([1 / NUM_SCENARIOS] * NUM_SCENARIOS)
+
     for form in (TinyFormat(), TinyFormat(link="copy")):
-        again = written(small, tmp_path / "out", form)
-        assert (again.written, again.kept, again.tally) == (0, SCENARIOS, first.tally)
-        assert states(first.folder) == before
+        second = export(small_dataset, tmp_path / "out", form)
+        assert (second.written, second.kept) == (0, NUM_SCENARIOS)
+        assert second.tally == first.tally
+        assert read_states(first.folder) == before
 
 
 @pytest.mark.parametrize(
-    ("form", "facts"),
+    ("form", "message"),
     [
         (TinyFormat(greeting="hi"), "greeting: 'hello', asked for 'hi'"),
         (TinyFormat(split="train"), "split: None, asked for 'train'"),
@@ -225,306 +237,322 @@ def test_a_complete_export_is_kept_as_it_is_whatever_the_way_of_links(
         ),
     ],
 )
-@pytest.mark.parametrize("units", [1, SCENARIOS])
+@pytest.mark.parametrize("units", [1, NUM_SCENARIOS])
 def test_a_folder_of_other_settings_is_refused(
-    small: DeepAccident, tmp_path: Path, form: TinyFormat, facts: str, units: int
+    small_dataset: DeepAccident, tmp_path: Path, form: TinyFormat, message: str, units: int
 ) -> None:
-    begun(small, tmp_path / "out", units)
-    before = states(tmp_path)
-    with pytest.raises(ConfigError, match=f"out: .*{facts}"):
-        written(small, tmp_path / "out", form)
-    assert states(tmp_path) == before
+    begin_export(small_dataset, tmp_path / "out", units)
+    before = read_states(tmp_path)
+    with pytest.raises(ConfigError, match=f"out: .*{message}"):
+        export(small_dataset, tmp_path / "out", form)
+    assert read_states(tmp_path) == before
 
 
-def test_a_folder_with_other_things_is_refused(small: DeepAccident, tmp_path: Path) -> None:
-    notes, locked = tmp_path / "other" / "notes.txt", tmp_path / "locked"
+def test_a_folder_with_other_things_is_refused(small_dataset: DeepAccident, tmp_path: Path) -> None:
+    notes = tmp_path / "other" / "notes.txt"
+    locked = tmp_path / "locked"
     notes.parent.mkdir()
     notes.touch()
     (locked / ".deepaccident-parts" / ".lock").mkdir(parents=True)
-    before = states(tmp_path)
-    assert_refused(
+    before = read_states(tmp_path)
+
+    assert_raises(
         (
-            lambda: written(small, notes.parent),
+            lambda: export(small_dataset, notes.parent),
             ExportError,
             ("not empty (notes.txt)", "tiny", "choose a new folder"),
         ),
-        (lambda: written(small, notes), ExportError, ("notes.txt: is a file", "give a folder")),
         (
-            lambda: written(small, notes / "out"),
+            lambda: export(small_dataset, notes),
+            ExportError,
+            ("notes.txt: is a file", "give a folder"),
+        ),
+        (
+            lambda: export(small_dataset, notes / "out"),
             ExportError,
             ("cannot be written", "Not a directory"),
         ),
         (
-            lambda: written(small, Path("/proc/out")),
+            lambda: export(small_dataset, Path("/proc/out")),
             ExportError,
-            ("/proc/out: cannot be written", "make room there"),
+            ("/proc/out: cannot be written", "free space there"),
         ),
-        (lambda: written(small, locked), ExportError, "cannot be written"),
+        (lambda: export(small_dataset, locked), ExportError, "cannot be written"),
         (
-            lambda: written(small, tmp_path / "out", workers=-3),
+            lambda: export(small_dataset, tmp_path / "out", workers=-3),
             ChoiceError,
             ("workers", "at least 1", "-3"),
         ),
     )
-    assert states(tmp_path) == before
+    assert read_states(tmp_path) == before
 
 
-def test_what_was_left_before_the_manifest_is_no_other_thing(
-    small: DeepAccident, whole: Contents, tmp_path: Path
+def test_leftovers_from_before_the_manifest_are_accepted(
+    small_dataset: DeepAccident, whole_export: Contents, tmp_path: Path
 ) -> None:
     (tmp_path / ".deepaccident-parts" / "kept" / "tiny").mkdir(parents=True)
     (tmp_path / ".deepaccident-parts" / ".lock").touch()
     temporary_path(tmp_path / MANIFEST).touch()
-    assert contents(written(small, tmp_path).folder) == whole
+    assert read_contents(export(small_dataset, tmp_path).folder) == whole_export
 
 
-def test_a_damaged_archive_of_a_complete_export_is_named(changing: Path, tmp_path: Path) -> None:
-    out = written(reopened(changing), tmp_path / "out").folder
-    next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
-    whole = (out / ARCHIVE).read_bytes()
-    for content in (b"", whole[:-40], whole[:200] + b"?" + whole[201:]):
+def test_a_damaged_archive_of_a_complete_export_is_named(
+    release_copy: Path, tmp_path: Path
+) -> None:
+    out = export(open_release(release_copy), tmp_path / "out").folder
+    next(release_copy.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
+    intact = (out / ARCHIVE).read_bytes()
+    for content in (b"", intact[:-40], intact[:200] + b"?" + intact[201:]):
         (out / ARCHIVE).write_bytes(content)
-        assert_refused(
+        assert_raises(
             (
-                lambda: written(reopened(changing), out),
+                lambda: export(open_release(release_copy), out),
                 ExportError,
-                (ARCHIVE, "remove it", "as a whole"),
+                (ARCHIVE, "remove this file", "the whole export again"),
             )
         )
     for name in ("../../kept.txt", str(tmp_path / "kept.txt")):
         with zipfile.ZipFile(out / ARCHIVE, "w") as archive:
             archive.writestr(name, b"")
-        assert_refused((lambda: written(reopened(changing), out), OutputFolderError, "kept.txt"))
+        assert_raises(
+            (lambda: export(open_release(release_copy), out), OutputFolderError, "kept.txt")
+        )
     (out / ARCHIVE).unlink()
-    assert written(reopened(changing), out).written == SCENARIOS
-    assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
+
+    assert export(open_release(release_copy), out).written == NUM_SCENARIOS
+    assert read_contents(out) == read_contents(
+        export(open_release(release_copy), tmp_path / "fresh").folder
+    )
     assert not list(tmp_path.rglob("kept.txt"))
 
 
 class TestRelease:
-    """What it was made from has changed since."""
+    """The release has changed since the export."""
 
-    def test_a_complete_export_is_refused(self, changing: Path, tmp_path: Path) -> None:
-        dataset = reopened(changing)
-        out = written(dataset, tmp_path / "out").folder
-        before, token = states(out), dataset.scenario[1]["token"]
-        edit_label(changing, token)
-        sentence = (
-            "another state of the release",
-            "1 scenarios have changed, come or gone since",
+    def test_a_complete_export_is_refused(self, release_copy: Path, tmp_path: Path) -> None:
+        dataset = open_release(release_copy)
+        out = export(dataset, tmp_path / "out").folder
+        before = read_states(out)
+        token = dataset.scenario[1]["token"]
+        edit_label(release_copy, token)
+        parts = (
+            "the release or the split file has changed since this export",
+            "1 scenario, such as",
             token,
         )
-        assert_refused(*[(lambda: written(reopened(changing), out), ExportError, sentence)] * 2)
-        assert states(out) == before
+
+        for _ in range(2):
+            assert_raises((lambda: export(open_release(release_copy), out), ExportError, parts))
+        assert read_states(out) == before
 
     def test_files_that_the_index_was_not_made_from_are_refused(
-        self, changing: Path, tmp_path: Path
+        self, release_copy: Path, tmp_path: Path
     ) -> None:
-        """What is written comes from the index, and the hashes beside it would be of other
-        files.
-        """
-        dataset = reopened(changing)
+        """Otherwise the export would hold data of the index with hashes of other files."""
+        dataset = open_release(release_copy)
         token = dataset.scenario[1]["token"]
-        label = next(changing.glob(f"{token.replace('/', '/ego_vehicle/label/')}/*_002.txt"))
+        label = next(release_copy.glob(f"{token.replace('/', '/ego_vehicle/label/')}/*_002.txt"))
         label.write_text(label.read_text() + "\n")
-        named = ("the index is out of date", token, "deepaccident check index DATAROOT")
-        assert_refused((lambda: written(dataset, tmp_path / "out"), IndexStoreError, named))
+        parts = ("the index is out of date", token, "deepaccident check index DATAROOT")
+
+        assert_raises((lambda: export(dataset, tmp_path / "out"), IndexStoreError, parts))
         assert not (tmp_path / "out").exists()
 
     @pytest.mark.parametrize("grows", [True, False])
     def test_a_complete_export_of_another_split_file_is_refused(
-        self, small: DeepAccident, tmp_path: Path, grows: bool
+        self, small_dataset: DeepAccident, tmp_path: Path, grows: bool
     ) -> None:
-        names = [record["token"].replace("/", " ") for record in small.scenario]
-        mine = tmp_path / "mine.txt"
-        mine.write_text("\n".join(names[: 1 if grows else 3]))
-        form = TinyFormat(split=mine)
-        written(small, tmp_path / "out", form)
-        mine.write_text("\n".join(names[:2]))
-        assert_refused(
-            (
-                lambda: written(small, tmp_path / "out", form),
-                ExportError,
-                rf"1 scenarios .*such as {names[1 if grows else 2].replace(' ', '/')}",
-            )
-        )
+        names = [record["token"].replace("/", " ") for record in small_dataset.scenario]
+        split_file = tmp_path / "mine.txt"
+        split_file.write_text("\n".join(names[: 1 if grows else 3]))
+        form = TinyFormat(split=split_file)
+        export(small_dataset, tmp_path / "out", form)
+        split_file.write_text("\n".join(names[:2]))
+        changed = names[1 if grows else 2].replace(" ", "/")
 
-    @pytest.mark.parametrize("units", [1, SCENARIOS])
+        with pytest.raises(ExportError, match=rf"1 scenario, such as {changed}"):
+            export(small_dataset, tmp_path / "out", form)
+
+    @pytest.mark.parametrize("units", [1, NUM_SCENARIOS])
     @pytest.mark.parametrize("change", ["comes", "goes", "another size"])
-    def test_only_what_has_other_sensor_files_is_made_again(
-        self, changing: Path, tmp_path: Path, units: int, change: str
+    def test_only_scenarios_with_other_sensor_files_are_exported_again(
+        self, release_copy: Path, tmp_path: Path, units: int, change: str
     ) -> None:
-        """Of a complete export, and of one that was stopped; then the same as one that was made
-        now.
-        """
-        token = next(iter(DeepAccident(dataroot=changing, verbose=False).scenario))["token"]
-        path, *_ = changing.glob(f"{token.replace('/', '/ego_vehicle/Camera_Front/')}/*_002.jpg")
-        content = path.read_bytes()
+        """The folder, with a complete or a stopped export, ends up equal to a fresh export."""
+        token = open_release(release_copy).scenario[0]["token"]
+        pattern = f"{token.replace('/', '/ego_vehicle/Camera_Front/')}/*_002.jpg"
+        picture = next(release_copy.glob(pattern))
+        content = picture.read_bytes()
         if change == "comes":
-            path.unlink()
+            picture.unlink()
         out = tmp_path / "out"
-        begun(reopened(changing), out, units)
-        before = states(out)
-        path.unlink(missing_ok=True)
+        begin_export(open_release(release_copy), out, units)
+        before = read_states(out)
+        picture.unlink(missing_ok=True)
         if change != "goes":
-            path.write_bytes(content + (b"\0" if change == "another size" else b""))
-        done = written(reopened(changing), out)
-        assert (done.written, done.kept) == (SCENARIOS - units + 1, units - 1)
-        fresh = written(reopened(changing), tmp_path / "fresh")
-        assert (contents(out), done.tally) == (contents(fresh.folder), fresh.tally)
-        kept = {
-            name
-            for name, state in states(out).items()
-            if before.get(name) == state and name.endswith(".txt")
-        }
-        assert len(kept) >= (units - 1) * 4
-        assert written(reopened(changing), out).written == 0
+            picture.write_bytes(content + (b"\0" if change == "another size" else b""))
+        done = export(open_release(release_copy), out)
 
-    def test_links_to_its_files_leave_the_index_as_it_is(
-        self, changing: Path, tmp_path: Path
+        assert (done.written, done.kept) == (NUM_SCENARIOS - units + 1, units - 1)
+
+        fresh = export(open_release(release_copy), tmp_path / "fresh")
+        assert read_contents(out) == read_contents(fresh.folder)
+        assert done.tally == fresh.tally
+
+        unchanged = read_states(out).items() & before.items()
+        num_unchanged_texts = sum(name.endswith(".txt") for name, _ in unchanged)
+        assert num_unchanged_texts >= (units - 1) * 4
+        assert export(open_release(release_copy), out).written == 0
+
+    def test_links_to_release_files_leave_the_index_valid(
+        self, release_copy: Path, tmp_path: Path
     ) -> None:
-        """A link changes a file's ctime."""
-        done = written(reopened(changing), tmp_path / "out")
+        """A new link changes the ctime of a file."""
+        done = export(open_release(release_copy), tmp_path / "out")
         assert done.tally.linked
-        assert current_index(find_release(changing)) is not None
+        assert current_index(find_release(release_copy)) is not None
 
     def test_sensor_files_that_a_format_does_not_need_change_nothing(
-        self, changing: Path, tmp_path: Path
+        self, release_copy: Path, tmp_path: Path
     ) -> None:
         form = TinyFormat(agents=("other_vehicle",))
-        written(reopened(changing), tmp_path / "out", form)
-        for path in changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg"):
+        export(open_release(release_copy), tmp_path / "out", form)
+        for path in release_copy.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg"):
             path.unlink()
-        assert written(reopened(changing), tmp_path / "out", form).written == 0
+        assert export(open_release(release_copy), tmp_path / "out", form).written == 0
 
     @pytest.mark.parametrize(
         "moment", ["Store.drop", "Store.remove", "Manifest.write", "Export._remove_other_units"]
     )
-    def test_a_call_that_is_killed_as_it_packs_or_unpacks(
-        self, changing: Path, tmp_path: Path, moment: str
+    def test_a_call_that_is_killed_while_it_packs_or_unpacks_can_be_repeated(
+        self, release_copy: Path, tmp_path: Path, moment: str
     ) -> None:
         name, method = moment.split(".")
         kind = {"Store": Store, "Manifest": Manifest, "Export": Export}[name]
-        out = written(reopened(changing), tmp_path / "out").folder
-        next(changing.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
+        out = export(open_release(release_copy), tmp_path / "out").folder
+        next(release_copy.glob("*/ego_vehicle/Camera_Front/*/*_002.jpg")).unlink()
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(kind, method, Mock(side_effect=KeyboardInterrupt))
-            assert_refused((lambda: written(reopened(changing), out), KeyboardInterrupt, ()))
-        assert written(reopened(changing), out).folder == out
-        assert contents(out) == contents(written(reopened(changing), tmp_path / "fresh").folder)
+            with pytest.raises(KeyboardInterrupt):
+                export(open_release(release_copy), out)
+
+        assert export(open_release(release_copy), out).folder == out
+        assert read_contents(out) == read_contents(
+            export(open_release(release_copy), tmp_path / "fresh").folder
+        )
 
     @pytest.mark.parametrize("units", [0, 1, 2])
-    def test_nothing_is_left_of_what_went(self, changing: Path, tmp_path: Path, units: int) -> None:
-        """Of a whole scenario, and of a frame; whether they were written before or not."""
-        dataset = reopened(changing)
-        stopped(dataset, tmp_path / "out", units)
-        gone, shorter, _ = (record["token"] for record in dataset.scenario)
-        remove_scenario(changing, gone)
-        for path in changing.glob(f"{shorter.replace('/', '/*/*/')}/*_003.*"):
-            path.unlink()
-        dataset = reopened(changing)
-        assert [record["num_frames"] for record in dataset.scenario] == [2, 3]
-        done = written(dataset, tmp_path / "out")
-        assert contents(done.folder) == contents(written(dataset, tmp_path / "fresh").folder)
-
-    def test_a_scenario_that_went_after_opening_is_told(
-        self, changing: Path, tmp_path: Path
+    def test_nothing_is_left_of_removed_scenarios_and_frames(
+        self, release_copy: Path, tmp_path: Path, units: int
     ) -> None:
-        dataset = reopened(changing)
-        token = dataset.scenario[2]["token"]
-        remove_scenario(changing, token)
-        assert_refused(
-            (
-                lambda: written(dataset, tmp_path / "out"),
-                MissingFileError,
-                f"scenario {token} is gone; open the release again",
-            )
+        """This holds whether they were exported before or not."""
+        dataset = open_release(release_copy)
+        stop_export(dataset, tmp_path / "out", units)
+        removed, shortened, _ = (record["token"] for record in dataset.scenario)
+        remove_scenario(release_copy, removed)
+        for path in release_copy.glob(f"{shortened.replace('/', '/*/*/')}/*_003.*"):
+            path.unlink()
+        dataset = open_release(release_copy)
+
+        assert [record["num_frames"] for record in dataset.scenario] == [2, 3]
+
+        done = export(dataset, tmp_path / "out")
+        assert read_contents(done.folder) == read_contents(
+            export(dataset, tmp_path / "fresh").folder
         )
+
+    def test_a_scenario_that_is_removed_after_opening_is_an_error(
+        self, release_copy: Path, tmp_path: Path
+    ) -> None:
+        dataset = open_release(release_copy)
+        token = dataset.scenario[2]["token"]
+        remove_scenario(release_copy, token)
+        with pytest.raises(
+            MissingFileError, match=f"scenario {token} no longer exists; open the release again"
+        ):
+            export(dataset, tmp_path / "out")
 
 
 def test_another_devkits_units_are_written_again(
-    small: DeepAccident, whole: Contents, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small_dataset: DeepAccident,
+    whole_export: Contents,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr("deepaccident_devkit.export.bulk.__version__", "0.0.1")
-        stopped(small, tmp_path / "out", 2)
-    done = written(small, tmp_path / "out")
-    assert (done.written, contents(done.folder)) == (SCENARIOS, whole)
+        stop_export(small_dataset, tmp_path / "out", 2)
+    assert export(small_dataset, tmp_path / "out").written == NUM_SCENARIOS
+    assert read_contents(tmp_path / "out") == whole_export
 
 
-def test_splits_filters_and_agents_are_chosen(small: DeepAccident, tmp_path: Path) -> None:
-    train = [record["token"] for record in small.scenario if record["split"] == "train"]
-    accident = [token for token in train if "accident" in token]
-    both = ["designed_accident=true", "length>=3"]
-    for number, (options, tokens) in enumerate(
-        (
-            ({"split": "Train"}, train),
-            ({"split": "train", "where": both}, accident),
-            ({"split": "train", "where": both[0]}, accident),
-        )
-    ):
-        folder = written(small, tmp_path / str(number), TinyFormat(**options)).folder
+def test_splits_filters_and_agents_are_chosen(small_dataset: DeepAccident, tmp_path: Path) -> None:
+    train = [record["token"] for record in small_dataset.scenario if record["split"] == "train"]
+    accidents = [token for token in train if "accident" in token]
+    filters = ["designed_accident=true", "length>=3"]
+    cases = (
+        ({"split": "Train"}, train),
+        ({"split": "train", "where": filters}, accidents),
+        ({"split": "train", "where": filters[0]}, accidents),
+    )
+    for number, (options, tokens) in enumerate(cases):
+        folder = export(small_dataset, tmp_path / str(number), TinyFormat(**options)).folder
         assert list(json.loads((folder / MANIFEST).read_bytes())["release"]["scenarios"]) == tokens
-    written(small, tmp_path / "out", TinyFormat(agents="Ego_Vehicle"))  # type: ignore[arg-type]
+    export(small_dataset, tmp_path / "out", TinyFormat(agents="Ego_Vehicle"))  # type: ignore[arg-type]
     pictures = {path.name for path in tmp_path.glob("out/folders/*/pictures/*")}
+
     assert pictures == {f"ego_vehicle-{number}.jpg" for number in (1, 2, 3)}
 
 
-def test_a_file_that_cannot_be_read_costs_its_scenario(changing: Path, tmp_path: Path) -> None:
-    """Also if it goes after the export is complete: then nothing is written."""
-    dataset = reopened(changing)
-    label = next(changing.glob("*/ego_vehicle/label/*/*_002.txt"))
+def test_a_file_that_cannot_be_read_costs_its_scenario(release_copy: Path, tmp_path: Path) -> None:
+    """If the file is lost after the export is complete, nothing is written."""
+    dataset = open_release(release_copy)
+    label = next(release_copy.glob("*/ego_vehicle/label/*/*_002.txt"))
     content = label.read_bytes()
-    written(dataset, tmp_path / "whole")
+    export(dataset, tmp_path / "whole")
     label.unlink()
     label.mkdir()
-    assert_refused(
-        *(
-            (
-                partial(written, dataset, tmp_path / name),
-                SomeFailedError,
-                (f"{name}: 1 of 3 failed:\n", f": {label}: not a regular file"),
-            )
-            for name in ("out", "whole")
-        )
-    )
-    assert written(dataset, tmp_path / "out", dry_run=True).written == 1
+    for name in ("out", "whole"):
+        parts = (f"{name}: 1 of 3 failed:\n", f": {label}: not a regular file")
+        assert_raises((partial(export, dataset, tmp_path / name), SomeFailedError, parts))
+
+    assert export(dataset, tmp_path / "out", dry_run=True).written == 1
+
     label.rmdir()
     label.write_bytes(content)
-    assert [written(dataset, tmp_path / name).written for name in ("whole", "out")] == [0, 1]
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    assert export(dataset, tmp_path / "whole").written == 0
+    assert export(dataset, tmp_path / "out").written == 1
+    assert read_contents(tmp_path / "out") == read_contents(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("after", [0, 7, 14])
-def test_a_disk_that_is_full_amid_writing(
-    small: DeepAccident,
-    whole: Contents,
+@pytest.mark.parametrize("num_files", [0, 7, 14])
+def test_a_full_disk_is_an_error_and_the_export_can_be_completed(
+    small_dataset: DeepAccident,
+    whole_export: Contents,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    after: int,
+    num_files: int,
 ) -> None:
+    write = Path.write_bytes
+    remaining = iter(range(num_files))
+
+    def write_or_fail(path: Path, content: bytes) -> int:
+        if next(remaining, None) is None:
+            raise OSError(28, "No space left on device", str(path))
+        return write(path, content)
+
+    message = r"cannot be written \(.*No space left.*free space there, or choose"
     with monkeypatch.context() as patch:
-        write, left = Path.write_bytes, iter(range(after))
+        patch.setattr(Path, "write_bytes", write_or_fail)
+        with pytest.raises(ExportError, match=message):
+            export(small_dataset, tmp_path / "out")
 
-        def filled(path: Path, content: bytes) -> int:
-            if next(left, None) is None:
-                raise OSError(28, "No space left on device", str(path))
-            return write(path, content)
-
-        patch.setattr(Path, "write_bytes", filled)
-        assert_refused(
-            (
-                lambda: written(small, tmp_path / "out"),
-                ExportError,
-                r"cannot be written \(.*No space left.*make room there, or choose",
-            )
-        )
-    assert not [name for name in contents(tmp_path / "out") if temporary_of(Path(name).name)]
-    assert contents(written(small, tmp_path / "out").folder) == whole
+    assert not [name for name in read_contents(tmp_path / "out") if temporary_of(Path(name).name)]
+    assert read_contents(export(small_dataset, tmp_path / "out").folder) == whole_export
 
 
 class TestDamage:
-    """What is in the way of a manifest or of a record."""
+    """Damaged manifests, records and journals."""
 
     TEXTS = (
         "",
@@ -553,62 +581,59 @@ class TestDamage:
     )
     def test_a_damaged_manifest_is_our_error(
         self,
-        small: DeepAccident,
-        whole: Contents,
+        small_dataset: DeepAccident,
+        whole_export: Contents,
         tmp_path: Path,
         damage: str | tuple[str, object] | None,
     ) -> None:
-        """A text, an entry with a wrong value, or a pipe in the file's place."""
+        """The damage is a wrong text, an entry with a wrong value, or a pipe."""
         if damage is None:
             os.mkfifo(tmp_path / MANIFEST)
         elif isinstance(damage, str):
             (tmp_path / MANIFEST).write_text(damage)
         else:
-            told = json.loads(whole[MANIFEST] or b"") | dict([damage])
-            (tmp_path / MANIFEST).write_text(json.dumps(told).replace('"INFINITE"', "1e999"))
-        assert_refused(
-            (
-                lambda: written(small, tmp_path),
-                ExportError,
-                (MANIFEST, "export again into an empty folder"),
-            )
-        )
+            entry, value = damage
+            manifest = {**json.loads(whole_export[MANIFEST] or b""), entry: value}
+            (tmp_path / MANIFEST).write_text(json.dumps(manifest).replace('"INFINITE"', "1e999"))
+        parts = (MANIFEST, "export again into an empty folder")
+
+        assert_raises((lambda: export(small_dataset, tmp_path), ExportError, parts))
         assert [path.name for path in tmp_path.iterdir()] == [MANIFEST]
 
     @pytest.mark.parametrize(
         "text", [*TEXTS, None, '{"devkit": "$", "scenarios": 3, "written": {}}']
     )
     def test_a_damaged_record_is_written_again(
-        self, small: DeepAccident, whole: Contents, tmp_path: Path, text: str | None
+        self, small_dataset: DeepAccident, whole_export: Contents, tmp_path: Path, text: str | None
     ) -> None:
-        stopped(small, tmp_path / "out", 2)
+        stop_export(small_dataset, tmp_path / "out", 2)
         record = next((tmp_path / "out").glob(".deepaccident-parts/kept/tiny/*/done"))
         if text is None:
             record.unlink()
             os.mkfifo(record)
         else:
             record.write_text(text.replace("$", __version__))
-        done = written(small, tmp_path / "out")
-        assert (done.written, contents(done.folder)) == (2, whole)
+
+        assert export(small_dataset, tmp_path / "out").written == 2
+        assert read_contents(tmp_path / "out") == whole_export
 
     @pytest.mark.parametrize(
         "path", ["../kept.txt", "{root}/kept.txt", ".", "", "frames/../../kept.txt", "\udcff"]
     )
     def test_a_strange_path_in_a_journal_removes_nothing(
-        self, small: DeepAccident, whole: Contents, tmp_path: Path, path: str
+        self, small_dataset: DeepAccident, whole_export: Contents, tmp_path: Path, path: str
     ) -> None:
-        """Somebody may have sent this folder."""
-        stopped(small, tmp_path / "out", 1)
-        kept = tmp_path / "kept.txt"
-        kept.touch()
+        """The folder may come from somebody else."""
+        stop_export(small_dataset, tmp_path / "out", 1)
+        outside = tmp_path / "kept.txt"
+        outside.touch()
         for journal in (tmp_path / "out" / ".deepaccident-parts" / "kept" / "tiny").glob("*.paths"):
             with journal.open("ab") as file:
                 file.write(f"{path.format(root=tmp_path)}\0".encode(errors="surrogateescape"))
-            shutil.rmtree(
-                journal.with_name(journal.name.removesuffix(".paths")), ignore_errors=True
-            )
-        assert contents(written(small, tmp_path / "out").folder) == whole
-        assert kept.exists()
+            shutil.rmtree(journal.with_suffix(""), ignore_errors=True)
+
+        assert read_contents(export(small_dataset, tmp_path / "out").folder) == whole_export
+        assert outside.exists()
 
 
 @pytest.fixture
@@ -618,28 +643,30 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-def output_of(
+def make_output(
     tmp_path: Path, link: LinkKind = "hard", note: Callable[[str], object] = lambda _: None
 ) -> Output:
-    return Output(tmp_path / "out", tmp_path / "parts", link, note=note)
+    return Output(
+        tmp_path / "out",
+        tmp_path / "parts",
+        link,
+        note=note,
+    )
 
 
-def refusing(code: int) -> Callable[..., None]:
-    def make(*_: object, **__: object) -> None:
-        raise OSError(code, os.strerror(code))
-
-    return make
+def make_refusal(code: int) -> Callable[..., None]:
+    return Mock(side_effect=OSError(code, os.strerror(code)))
 
 
-def names(folder: Path) -> list[str]:
+def list_files(folder: Path) -> list[str]:
     return sorted(
         path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()
     )
 
 
 def test_files_are_noted_counted_and_whole(tmp_path: Path, source: Path) -> None:
-    noted: list[str] = []
-    output = output_of(tmp_path, note=noted.append)
+    notes: list[str] = []
+    output = make_output(tmp_path, note=notes.append)
     output.write("a/b.txt", b"12")
     with output.file("c.txt") as path:
         path.write_bytes(b"345")
@@ -647,58 +674,66 @@ def test_files_are_noted_counted_and_whole(tmp_path: Path, source: Path) -> None
     with output.whole_folder("e/f") as folder:
         folder.write("g.txt", b"6")
         folder.link(source, "h/i.jpg")
-    assert noted == ["a/b.txt", "c.txt", "d.jpg", "e/f"]
-    assert names(tmp_path / "out") == ["a/b.txt", "c.txt", "d.jpg", "e/f/g.txt", "e/f/h/i.jpg"]
-    assert (output.tally.files, output.tally.bytes, output.tally.linked) == (3, 6, Counter(hard=2))
+
+    assert notes == ["a/b.txt", "c.txt", "d.jpg", "e/f"]
+    assert list_files(tmp_path / "out") == ["a/b.txt", "c.txt", "d.jpg", "e/f/g.txt", "e/f/h/i.jpg"]
+    assert (output.tally.files, output.tally.bytes) == (3, 6)
+    assert output.tally.linked == Counter(hard=2)
 
 
 class TestLinks:
     @pytest.mark.parametrize("link", ["hard", "symbolic", "copy"])
-    @pytest.mark.parametrize("by_link", [False, True])
-    def test_each_way(self, tmp_path: Path, source: Path, link: LinkKind, by_link: bool) -> None:
-        given = source
-        if by_link:  # a release may be a tree of links
-            given = tmp_path / "given.jpg"
-            given.symlink_to(source.name)
-        output, target = output_of(tmp_path, link), tmp_path / "out" / "a" / "b.png"
-        for _ in range(2):  # the second time over the first
-            output.link(given, "a/b.png")
+    @pytest.mark.parametrize("source_is_link", [False, True])
+    def test_each_kind_of_link(
+        self, tmp_path: Path, source: Path, link: LinkKind, source_is_link: bool
+    ) -> None:
+        path = source
+        if source_is_link:  # a release may be a tree of links
+            path = tmp_path / "given.jpg"
+            path.symlink_to(source.name)
+        output = make_output(tmp_path, link)
+        for _ in range(2):  # the second link replaces the first
+            output.link(path, "a/b.png")
+
         assert (output.tally.linked, output.tally.files) == ({link: 2}, 0)
-        assert (target.read_bytes(), list(target.parent.iterdir())) == (b"a picture", [target])
-        assert (target.readlink() if target.is_symlink() else None) == (
-            source if link == "symbolic" else None
-        )
-        assert (not target.is_symlink() and target.samefile(source)) == (link == "hard")
+
+        target = tmp_path / "out" / "a" / "b.png"
+        assert list(target.parent.iterdir()) == [target]
+        assert target.read_bytes() == b"a picture"
+
+        if link == "symbolic":
+            assert target.readlink() == source
+        else:
+            assert not target.is_symlink()
+            assert target.samefile(source) == (link == "hard")
 
     @pytest.mark.parametrize("code", [errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK])
-    def test_the_next_way_where_one_cannot_be(
+    def test_an_impossible_link_is_replaced_by_the_next_kind(
         self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, code: int
     ) -> None:
-        monkeypatch.setattr(os, "link", refusing(code))
-        output = output_of(tmp_path)
+        monkeypatch.setattr(os, "link", make_refusal(code))
+        output = make_output(tmp_path)
         output.link(source, "a.jpg")
-        monkeypatch.setattr(Path, "symlink_to", refusing(errno.EPERM))
+        monkeypatch.setattr(Path, "symlink_to", make_refusal(errno.EPERM))
         output.link(source, "b.jpg")
-        assert (
-            output.tally.linked,
-            (tmp_path / "out" / "a.jpg").is_symlink(),
-            (tmp_path / "out" / "b.jpg").is_symlink(),
-        ) == (Counter(symbolic=1, copy=1), True, False)
+
+        assert output.tally.linked == Counter(symbolic=1, copy=1)
+        assert (tmp_path / "out" / "a.jpg").is_symlink()
+        assert not (tmp_path / "out" / "b.jpg").is_symlink()
 
     @pytest.mark.parametrize("link", ["hard", "symbolic"])
-    def test_a_full_disk_is_no_reason_for_another_way(
+    def test_a_full_disk_is_no_reason_for_another_kind_of_link(
         self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch, link: LinkKind
     ) -> None:
-        monkeypatch.setattr(os, "link", refusing(errno.ENOSPC))
-        monkeypatch.setattr(Path, "symlink_to", refusing(errno.ENOSPC))
-        assert_refused(
-            (lambda: output_of(tmp_path, link).link(source, "a.jpg"), OSError, "No space left")
-        )
-        assert names(tmp_path / "out") == []
+        monkeypatch.setattr(os, "link", make_refusal(errno.ENOSPC))
+        monkeypatch.setattr(Path, "symlink_to", make_refusal(errno.ENOSPC))
+        with pytest.raises(OSError, match="No space left"):
+            make_output(tmp_path, link).link(source, "a.jpg")
+        assert list_files(tmp_path / "out") == []
 
     @pytest.mark.parametrize("link", ["hard", "symbolic", "copy"])
     @pytest.mark.parametrize(
-        ("make", "words"),
+        ("make", "message"),
         [
             (lambda _: None, r"cannot be read \(No such file or directory\)"),
             (os.mkfifo, r"not a regular file \(a named pipe\)"),
@@ -708,91 +743,97 @@ class TestLinks:
         ],
         ids=["missing", "pipe", "folder", "link to nothing", "link to itself"],
     )
-    def test_what_is_no_file(
-        self, tmp_path: Path, make: Callable[[Path], None], words: str, link: LinkKind
+    def test_anything_but_a_file_is_refused(
+        self, tmp_path: Path, make: Callable[[Path], None], message: str, link: LinkKind
     ) -> None:
         path = tmp_path / "odd.jpg"
         make(path)
-        assert_refused(
-            (
-                lambda: output_of(tmp_path, link).link(path, "a.jpg"),
-                SensorFileError,
-                rf"odd.jpg: .*{words}.*; restore it from its archive",
-            )
-        )
+        with pytest.raises(
+            SensorFileError, match=rf"odd.jpg: .*{message}.*; restore it from its archive"
+        ):
+            make_output(tmp_path, link).link(path, "a.jpg")
         assert not (tmp_path / "out").exists()
 
 
 def test_several_calls_share_the_scenarios(
-    small: DeepAccident, whole: Contents, tmp_path: Path
+    small_dataset: DeepAccident, whole_export: Contents, tmp_path: Path
 ) -> None:
     with ThreadPoolExecutor(3) as threads:
-        done = list(threads.map(lambda _: written(small, tmp_path / "shared"), range(3)))
-    assert (sum(each.written for each in done), {each.tally.files for each in done}) == (
-        SCENARIOS,
-        {SCENARIOS * 5 + 1},
-    )
-    assert contents(tmp_path / "shared") == whole
+        exports = list(threads.map(lambda _: export(small_dataset, tmp_path / "shared"), range(3)))
+    assert sum(done.written for done in exports) == NUM_SCENARIOS
+    assert {done.tally.files for done in exports} == {NUM_SCENARIOS * 5 + 1}
+    assert read_contents(tmp_path / "shared") == whole_export
 
 
-def test_a_worker_that_was_taken_for_lost_keeps_its_unit(
-    small: DeepAccident, whole: Contents, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_worker_that_seems_lost_keeps_its_unit(
+    small_dataset: DeepAccident,
+    whole_export: Contents,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of a scheduler that died: the next call neither takes its half-written files away nor writes
+    """Its scheduler has died; the next call must neither remove its half-written files nor write
     beside it.
     """
-    write_all, begun, go_on, first = (
-        TinyFormat.write,
-        threading.Event(),
-        threading.Event(),
-        iter([True]),
-    )
+    write_unit = TinyFormat.write
+    has_begun = threading.Event()
+    may_continue = threading.Event()
+    is_first = iter([True])
 
-    def write(self: TinyFormat, dataset: Any, unit: Any, output: Any) -> None:
-        if next(first, False):
+    def write_slowly(self: TinyFormat, dataset: Any, unit: Any, output: Any) -> None:
+        if next(is_first, False):
             with output.whole_folder(f"folders/{unit.name}") as folder:
                 folder.write("names.json", b"half")
-                begun.set()
-                assert go_on.wait(60)
-            output.tally.files, output.tally.bytes = 0, 0
-        write_all(self, dataset, unit, output)
+                has_begun.set()
+                assert may_continue.wait(60)
+            output.tally.files = output.tally.bytes = 0
+        write_unit(self, dataset, unit, output)
 
-    monkeypatch.setattr(TinyFormat, "write", write)
-    lost = threading.Thread(target=written, args=(small, tmp_path / "out"))
-    lost.start()
-    assert begun.wait(60)
-    (tmp_path / "out" / ".deepaccident-parts" / ".making").unlink()  # of a caller that is dead
-    again = threading.Thread(target=written, args=(small, tmp_path / "out"))
-    again.start()
+    monkeypatch.setattr(TinyFormat, "write", write_slowly)
+    out = tmp_path / "out"
+    lost_call = threading.Thread(target=export, args=(small_dataset, out))
+    lost_call.start()
+
+    assert has_begun.wait(60)
+
+    (out / ".deepaccident-parts" / ".making").unlink()  # the lock of the dead caller
+    next_call = threading.Thread(target=export, args=(small_dataset, out))
+    next_call.start()
     time.sleep(0.3)
-    assert again.is_alive()
-    go_on.set()
-    for each in (lost, again):
-        each.join()
-    found = contents(tmp_path / "out")
-    locks = {
-        name for name in found if name.startswith(".deepaccident-parts/locks")
-    }  # of the lost one's next units
-    assert {name: found[name] for name in found.keys() - locks} == whole
+    assert next_call.is_alive()
+
+    may_continue.set()
+    lost_call.join()
+    next_call.join()
+
+    contents = read_contents(out)
+    for name in list(contents):  # locks of the units that the lost call tried next
+        if name.startswith(".deepaccident-parts/locks"):
+            del contents[name]
+
+    assert contents == whole_export
 
 
-def test_what_another_host_left_of_a_unit_is_removed(small: DeepAccident, tmp_path: Path) -> None:
-    stopped(small, tmp_path / "out", 2)
-    kept = tmp_path / "out" / ".deepaccident-parts" / "kept" / "tiny"
-    unit = min(each.name.removesuffix(".paths") for each in kept.glob("[!.]*.paths"))
-    (kept / unit / "done").unlink()
-    left = tmp_path / "out" / "folders" / f".{unit[:50]}.0123abcd-77-99-1.tmp"
-    left.mkdir()
-    written(small, tmp_path / "out")
-    assert not left.exists()
+def test_half_written_files_of_another_host_are_removed(
+    small_dataset: DeepAccident, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    stop_export(small_dataset, out, 2)
+    records = out / ".deepaccident-parts" / "kept" / "tiny"
+    unit = min(path.stem for path in records.glob("[!.]*.paths"))
+    (records / unit / "done").unlink()
+    half_written = out / "folders" / f".{unit[:50]}.0123abcd-77-99-1.tmp"
+    half_written.mkdir()
+    export(small_dataset, out)
+
+    assert not half_written.exists()
 
 
-ABSENT = ("infrastructure",)
+ABSENT_AGENTS = ("infrastructure",)
 IMAGES = ImageConfig(resize=(9, 16), cameras=("Camera_Back",))
 
 
 @pytest.mark.parametrize(
-    ("form", "told"),
+    ("form", "message"),
     [
         (
             ReleasedInfos(),
@@ -806,79 +847,86 @@ IMAGES = ImageConfig(resize=(9, 16), cameras=("Camera_Back",))
             CachedImages(split="train", images=IMAGES),
             "none of these images is in this release; unpack",
         ),
-        (Questions(agents=ABSENT), "no recording is long enough"),
-        (OpenCood(agents=ABSENT, without_clouds=True), "no moment"),
+        (Questions(agents=ABSENT_AGENTS), "no recording is long enough"),
+        (OpenCood(agents=ABSENT_AGENTS, without_clouds=True), "no moment"),
         (
             TinyFormat(split="val", where=("length>=3", "designed_accident=false")),
             "is in that split and matches",
         ),
-        *(
-            (kind(agents=ABSENT), "no chosen agent recorded one of")
-            for kind in (NuScenes, Parquet, WebDataset)
-        ),
+        (NuScenes(agents=ABSENT_AGENTS), "none of the chosen agents recorded"),
+        (Parquet(agents=ABSENT_AGENTS), "none of the chosen agents recorded"),
+        (WebDataset(agents=ABSENT_AGENTS), "none of the chosen agents recorded"),
     ],
 )
 @pytest.mark.parametrize("dry_run", [False, True])
-def test_nothing_to_write(
-    small: DeepAccident, tmp_path: Path, form: Format, told: str, dry_run: bool
+def test_an_empty_export_is_refused(
+    small_dataset: DeepAccident, tmp_path: Path, form: Format, message: str, dry_run: bool
 ) -> None:
-    assert_refused(
-        (
-            lambda: export_release(small, tmp_path / "out", form, workers=1, dry_run=dry_run),
-            NotAvailableError,
-            told,
-        )
-    )
+    with pytest.raises(NotAvailableError, match=message):
+        export_release(small_dataset, tmp_path / "out", form, workers=1, dry_run=dry_run)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("after", [False, True])
-def test_killed_around_every_renaming_and_removal(
-    small: DeepAccident, small_root: Path, tmp_path: Path, whole: Contents, after: bool
+def test_an_export_that_is_killed_around_any_file_operation_can_be_completed(
+    small_dataset: DeepAccident,
+    small_root: Path,
+    tmp_path: Path,
+    whole_export: Contents,
+    after: bool,
 ) -> None:
-    command = [sys.executable, killed.__file__, "tiny_format"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        [sys.executable, stopped_index_process.__file__, "support.tiny_format"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     ) as server:
-        asked: Any = server.stdin
+        requests: Any = server.stdin
         answers: Any = server.stdout
 
-        def status(step: int) -> int:
-            """Of an export that is killed around its operation of that number."""
-            call = {"function": ["tiny_format", "export_tiny"], "step": step, "after": after}
-            asked.write(
-                json.dumps({**call, "arguments": [str(small_root), str(tmp_path / str(step)), 1]})
-                + "\n"
-            )
-            asked.flush()
+        def export_until(step: int) -> int:
+            """Export in the other process, killed around a file operation; return its status."""
+            request = {
+                "function": ["support.tiny_format", "export_tiny"],
+                "step": step,
+                "after": after,
+                "arguments": [str(small_root), str(tmp_path / str(step)), 1],
+            }
+            requests.write(json.dumps(request) + "\n")
+            requests.flush()
             return int(json.loads(answers.readline())["status"])
 
         step = 0
-        while status(step) == -9:
-            written(small, tmp_path / str(step))
-            assert contents(tmp_path / str(step)) == whole, step
+        while export_until(step) == -9:
+            export(small_dataset, tmp_path / str(step))
+            assert read_contents(tmp_path / str(step)) == whole_export, step
             step += 1
-        asked.close()
+        requests.close()
+
     assert step > 40
-    assert contents(tmp_path / str(step)) == whole
+    assert read_contents(tmp_path / str(step)) == whole_export
 
 
 def test_a_dry_run_writes_nothing_and_counts_what_is_left(
-    small: DeepAccident, tmp_path: Path
+    small_dataset: DeepAccident, tmp_path: Path
 ) -> None:
-    done = written(small, tmp_path / "out", dry_run=True)
-    assert (done.written, done.kept, done.tally.samples, done.tally.files) == (
-        SCENARIOS,
-        0,
-        PICTURES,
-        5 * SCENARIOS,
-    )
-    copies = written(small, tmp_path / "out", TinyFormat(link="copy"), dry_run=True)
-    assert (sum(done.tally.linked.values()), copies.tally.linked) == (PICTURES, {"copy": PICTURES})
-    pictures = sum(path.stat().st_size for path in small.dataroot.glob("*/*/Camera_Front/*/*.jpg"))
-    assert copies.tally.bytes == pytest.approx(done.tally.bytes + pictures, rel=0.1)
+    out = tmp_path / "out"
+    links = export(small_dataset, out, dry_run=True)
+    assert (links.written, links.kept) == (NUM_SCENARIOS, 0)
+    assert (links.tally.samples, links.tally.files) == (NUM_PICTURES, 5 * NUM_SCENARIOS)
+    assert sum(links.tally.linked.values()) == NUM_PICTURES
+
+    copies = export(small_dataset, out, TinyFormat(link="copy"), dry_run=True)
+    assert copies.tally.linked == {"copy": NUM_PICTURES}
+
+    pictures = small_dataset.dataroot.glob("*/*/Camera_Front/*/*.jpg")
+    num_picture_bytes = sum(path.stat().st_size for path in pictures)
+    expected_bytes = links.tally.bytes + num_picture_bytes
+    assert copies.tally.bytes == pytest.approx(expected_bytes, rel=0.1)
     assert not list(tmp_path.iterdir())
-    stopped(small, tmp_path / "out", 2)
-    left = written(small, tmp_path / "out", dry_run=True)
-    assert (left.written, left.kept, left.tally.samples) == (1, 2, PICTURES // 3)
+
+    stop_export(small_dataset, out, 2)
+    remaining = export(small_dataset, out, dry_run=True)
+    assert (remaining.written, remaining.kept) == (1, 2)
+    assert remaining.tally.samples == NUM_PICTURES // 3

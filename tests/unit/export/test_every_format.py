@@ -1,6 +1,4 @@
-"""All formats of `deepaccident export`: each is opened here, and has the K of the very images that
-it holds.
-"""
+"""Open every format of `deepaccident export`; its intrinsics must fit the images that it holds."""
 
 import json
 import pickle
@@ -12,10 +10,10 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from mcap_reading import read_mcap
-from nuscenes_reader import tables_of
-from opencood_reader import facts_of
-from verbs import called
+from support.command_calls import invoke_command
+from support.mcap_reader import read_mcap
+from support.nuscenes_reader import read_tables
+from support.opencood_reader import read_facts
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.export import export
@@ -30,14 +28,14 @@ from deepaccident_devkit.testing import SmallRelease, write_small_release
 pytestmark = pytest.mark.slow
 
 SIZE = (20, 30)
-Found = dict[str, tuple[Any, tuple[int, int] | None]]
-"""Camera → K and, where the format has it, the size."""
+Intrinsics = dict[str, tuple[Any, tuple[int, int] | None]]
+"""Intrinsic matrix by camera and, where the format has it, width and height of the image."""
 
 
 @pytest.fixture(scope="module")
 def resized(tmp_path_factory: pytest.TempPathFactory) -> tuple[DeepAccident, str]:
-    """A release in which one image of the last moment, here the token of its sample, has another
-    size and shape.
+    """A release in which one image of the last moment has another size and shape, and the token of
+    that sample.
     """
     root = tmp_path_factory.mktemp("resized") / "release"
     channels = ("Camera_Front", "Camera_Back", "lidar01")
@@ -46,96 +44,96 @@ def resized(tmp_path_factory: pytest.TempPathFactory) -> tuple[DeepAccident, str
     )
     dataset = DeepAccident("v1", root, verbose=False)
     token = f"{dataset.scenario[0]['token']}/ego_vehicle/003"
-    write_image(
-        dataset.get_sample_data_path(token, "Camera_Front"),
-        np.zeros((SIZE[1], SIZE[0], 3), np.uint8),
-    )
+    path = dataset.get_sample_data_path(token, "Camera_Front")
+    write_image(path, np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
     return dataset, token
 
 
-def opencood(out: Path, token: str) -> Found:
-    (scenario,) = out.glob(f"*/{token.split('/ego', maxsplit=1)[0].replace('/', '__')}")
-    facts = facts_of(scenario, "1", "000003")
-    return {
-        name: (facts[theirs]["intrinsic"], None)
-        for name, theirs in (("Front", "camera0"), ("Back", "camera3"))
-    }
+def read_opencood(out: Path, token: str) -> Intrinsics:
+    scenario_token, _, _ = token.partition("/ego")
+    (scenario,) = out.glob(f"*/{scenario_token.replace('/', '__')}")
+    facts = read_facts(scenario, "1", "000003")
+    front, back = facts["camera0"], facts["camera3"]
+    return {"Front": (front["intrinsic"], None), "Back": (back["intrinsic"], None)}
 
 
-def webdataset(out: Path, token: str) -> Found:
+def read_webdataset(out: Path, token: str) -> Intrinsics:
     (shard,) = out.glob("*.tar")
     with tarfile.open(shard) as archive:
         content = archive.extractfile(f"{token}.json")
         assert content is not None
         cameras = json.load(content)["cameras"]
-    found = {name: cameras[f"camera_{name.lower()}"] for name in ("Front", "Back")}
-    return {
-        name: (each["intrinsic"], (each["width"], each["height"])) for name, each in found.items()
-    }
+    intrinsics = {}
+    for name in ("Front", "Back"):
+        camera = cameras[f"camera_{name.lower()}"]
+        intrinsics[name] = (camera["intrinsic"], (camera["width"], camera["height"]))
+    return intrinsics
 
 
-def nuscenes(out: Path, token: str) -> Found:
-    tables, found = tables_of(out / "v1.0-deepaccident"), {}
+def read_nuscenes(out: Path, token: str) -> Intrinsics:
+    tables = read_tables(out / "v1.0-deepaccident")
+    intrinsics = {}
     for row in tables["sample_data"].values():
-        key = tables["sample"][row["sample_token"]]
-        if key["deepaccident_token"] == token and row["is_key_frame"]:
-            k = tables["calibrated_sensor"][row["calibrated_sensor_token"]]["camera_intrinsic"]
-            found[row["filename"].split("/")[1].removeprefix("CAM_").title()] = (
-                k,
-                (row["width"], row["height"]),
-            )
-    return found
+        sample = tables["sample"][row["sample_token"]]
+        if sample["deepaccident_token"] == token and row["is_key_frame"]:
+            name = row["filename"].split("/")[1].removeprefix("CAM_").title()
+            sensor = tables["calibrated_sensor"][row["calibrated_sensor_token"]]
+            intrinsics[name] = (sensor["camera_intrinsic"], (row["width"], row["height"]))
+    return intrinsics
 
 
-def mmdet3d(out: Path, token: str) -> Found:
+def read_mmdet3d(out: Path, token: str) -> Intrinsics:
     infos = pickle.loads((out / "deepaccident_infos_val.pkl").read_bytes())["data_list"]
-    frame = {"scenario": token.rsplit("/", 2)[0], "agent": "ego_vehicle", "frame": 3}
-    (info,) = (each for each in infos if each["deepaccident"] == frame)
-    return {
-        name: (info["images"][f"CAM_{name.upper()}"]["cam2img"], None) for name in ("Front", "Back")
-    }
+    source = {"scenario": token.rsplit("/", 2)[0], "agent": "ego_vehicle", "frame": 3}
+    (info,) = [info for info in infos if info["deepaccident"] == source]
+    front, back = info["images"]["CAM_FRONT"], info["images"]["CAM_BACK"]
+    return {"Front": (front["cam2img"], None), "Back": (back["cam2img"], None)}
 
 
 @pytest.mark.parametrize(
     ("forms", "read"),
     [
-        ((OpenCood(),), opencood),
-        ((WebDataset(),), webdataset),
-        ((NuScenes(),), nuscenes),
-        ((NuScenes(), Mmdet3d()), mmdet3d),
+        ((OpenCood(),), read_opencood),
+        ((WebDataset(),), read_webdataset),
+        ((NuScenes(),), read_nuscenes),
+        ((NuScenes(), Mmdet3d()), read_mmdet3d),
     ],
 )
-def test_k_is_of_the_file_that_is_there(
+def test_intrinsics_fit_the_size_of_each_image(
     resized: tuple[DeepAccident, str],
     tmp_path: Path,
     forms: tuple[Any, ...],
-    read: Callable[[Path, str], Found],
+    read: Callable[[Path, str], Intrinsics],
 ) -> None:
     dataset, token = resized
     for form in forms:
         export_release(dataset, tmp_path / "out", form, workers=1)
-    found = read(tmp_path / "out", token)
-    for name, size in (("Front", SIZE), ("Back", None)):
-        lens = dataset.camera(token, f"Camera_{name}")
-        width, height = size or (lens.width, lens.height)
-        k, told = found[name]
-        np.testing.assert_allclose(
-            k, np.diag([width / lens.width, height / lens.height, 1]) @ lens.intrinsic
-        )
-        assert told in (None, (width, height))
-        assert (lens.width, lens.height) != SIZE
+    intrinsics = read(tmp_path / "out", token)
+    for name, resized_size in (("Front", SIZE), ("Back", None)):
+        camera = dataset.camera(token, f"Camera_{name}")
+        assert (camera.width, camera.height) != SIZE
+        width, height = resized_size or (camera.width, camera.height)
+        scale = np.diag([width / camera.width, height / camera.height, 1])
+        intrinsic, size = intrinsics[name]
+        np.testing.assert_allclose(intrinsic, scale @ camera.intrinsic)
+        assert size in (None, (width, height))
 
 
-def first_line(out: Path) -> Any:
-    return json.loads(next(out.rglob("truth.jsonl")).read_text(encoding="utf-8").splitlines()[0])
+def read_first_truth(out: Path) -> Any:
+    path = next(out.rglob("truth.jsonl"))
+    return json.loads(path.read_text(encoding="utf-8").splitlines()[0])
 
 
-def tar_names(out: Path) -> list[str]:
+def list_tar_names(out: Path) -> list[str]:
     with tarfile.open(next(out.glob("*.tar"))) as archive:
         return archive.getnames()
 
 
-def parquet_tokens(out: Path) -> list[str]:
+def read_town_maps(out: Path) -> Any:
+    return json.loads(next(out.glob("*.geojson")).read_text(encoding="utf-8"))["features"]
+
+
+def read_parquet_tokens(out: Path) -> list[str]:
     from pyarrow.parquet import read_table
 
     return read_table(next(out.glob("sample/*.parquet")))["token"].to_pylist()
@@ -144,16 +142,16 @@ def parquet_tokens(out: Path) -> list[str]:
 OPENERS: dict[str, Callable[[Path], Any]] = {
     "mcap": lambda out: read_mcap(next(out.glob("*.mcap"))),
     "mmdet3d": lambda out: pickle.loads(next(out.glob("*_val.pkl")).read_bytes())["data_list"],
-    "nuscenes": lambda out: tables_of(out / "v1.0-deepaccident")["sample"],
+    "nuscenes": lambda out: read_tables(out / "v1.0-deepaccident")["sample"],
     "opencood": lambda out: sorted(out.rglob("*.yaml")),
-    "parquet": parquet_tokens,
-    "questions": first_line,
-    "town-maps": lambda out: json.loads(next(out.glob("*.geojson")).read_text(encoding="utf-8"))[
-        "features"
-    ],
-    "webdataset": tar_names,
+    "parquet": read_parquet_tokens,
+    "questions": read_first_truth,
+    "town-maps": read_town_maps,
+    "webdataset": list_tar_names,
 }
-"""Format → function that opens what `deepaccident export FORMAT` wrote and returns some of it."""
+"""Function that opens the output of `deepaccident export FORMAT` and returns a part of it, by
+format.
+"""
 
 
 @pytest.mark.parametrize("name", export.list_commands(click.Context(export)))
@@ -161,10 +159,12 @@ def test_every_format_of_the_command_line_can_be_opened(
     name: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     assert name in OPENERS, f"add a function that opens the format {name} to OPENERS"
+
     out = tmp_path / ("scene.mcap" if name == "mcap" else "out")
-    dataset = request.getfixturevalue(
-        "da_motion" if name == "questions" else "da"
-    )  # questions need longer recordings
-    options = ("--observe", "1", "--ahead", "1") if name == "questions" else ()
-    called("export", name, dataset.dataroot, "--out", out, *options)
+    fixture, options = "da", ()
+    if name == "questions":  # which need longer recordings
+        fixture, options = "da_motion", ("--observe", 1, "--ahead", 1)
+    dataset = request.getfixturevalue(fixture)
+    invoke_command("export", name, dataset.dataroot, "--out", out, *options)
+
     assert OPENERS[name](tmp_path if name == "mcap" else out)

@@ -1,4 +1,4 @@
-"""Settings of a format, and the names that scenarios get."""
+"""Settings of a format, and the flat names of scenarios."""
 
 import re
 from collections.abc import Callable
@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from refusals import assert_refused
-from tiny_format import TinyFormat
+from support.expected_errors import assert_raises
+from support.tiny_format import TinyFormat
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.bulk import Format, flat_name
@@ -34,10 +34,12 @@ def test_choices_get_their_usual_spelling_and_order() -> None:
         split="VAL",
         where="length>=3",
     )  # type: ignore[arg-type]
-    usual = TinyFormat(
+    usual_form = TinyFormat(
         agents=("ego_vehicle", "infrastructure"), link="copy", split="val", where=("length>=3",)
     )
-    assert (form, form.settings()) == (usual, usual.settings())
+
+    assert form == usual_form
+    assert form.settings() == usual_form.settings()
     assert TinyFormat(agents="ego_vehicle").agents == ("ego_vehicle",)  # type: ignore[arg-type]
 
 
@@ -45,7 +47,7 @@ ONE_SIZE = ImageConfig(resize=(18, 30))
 
 
 @pytest.mark.parametrize(
-    ("form", "options", "words"),
+    ("kind", "options", "message"),
     [
         (TinyFormat, {"agents": ("ego",)}, "agents: expected one of"),
         (TinyFormat, {"agents": ()}, "agents: expected some of .*found none"),
@@ -74,23 +76,23 @@ ONE_SIZE = ImageConfig(resize=(18, 30))
     ],
 )
 def test_a_wrong_choice_is_refused_before_a_release_is_opened(
-    form: type[Format], options: dict[str, Any], words: str
+    kind: type[Format], options: dict[str, Any], message: str
 ) -> None:
-    assert_refused((lambda: form(**options), ChoiceError, words))
+    assert_raises((lambda: kind(**options), ChoiceError, message))
 
 
 @pytest.mark.parametrize(
-    ("kind", "options", "words"),
+    ("kind", "options", "message"),
     [
         (WebDataset, {"shard_size": 0}, "shard_size: expected a number of bytes from 1, found 0"),
         (Parquet, {"shard_scenarios": 0}, "shard_scenarios: .*from 1.*0"),
         (
             CachedImages,
             {"images": ImageConfig()},
-            "a cache holds images of one size; give ImageConfig",
+            "a cache has images of one size; give ImageConfig",
         ),
         (ImageConfig, {"decode": "half"}, "decode: expected one of full, scaled"),
-        (Questions, {"seed": 3}, "^seed: expected a text, found 3"),
+        (Questions, {"seed": 3}, "^seed: expected text, found 3"),
         (Questions, {"window": 5}, "^window: expected WindowRules, found int"),
         (
             WindowRules,
@@ -105,13 +107,13 @@ def test_a_wrong_choice_is_refused_before_a_release_is_opened(
     ],
 )
 def test_impossible_settings_are_refused(
-    kind: Callable[..., object], options: dict[str, Any], words: str
+    kind: Callable[..., object], options: dict[str, Any], message: str
 ) -> None:
-    assert_refused((lambda: kind(**options), ConfigError, words))
+    assert_raises((lambda: kind(**options), ConfigError, message))
 
 
 class TestNames:
-    def test_published_ones_are_plain(self) -> None:
+    def test_published_names_stay_plain(self) -> None:
         name = "Town03_type001_subtype0001_scenario00024"
         assert flat_name(f"{TYPE}/{name}") == f"{TYPE}__{name}"
 
@@ -123,13 +125,8 @@ class TestNames:
         assert not set(first) & set('/\\:*?"<>|')
 
     @pytest.mark.parametrize("odd", ["a b", "a\nb", "ä_b", "a" * 240])
-    def test_those_that_would_be_alike(self, odd: str) -> None:
-        made = flat_name(f"{TYPE}/{odd}")
-        alike = [
-            made,
-            *(
-                flat_name(f"{TYPE}/{name}")
-                for name in (made.split("__")[1], "a_b", "__b", "a" * 241)
-            ),
-        ]
-        assert len(set(alike)) == len(alike)
+    def test_similar_names_stay_different(self, odd: str) -> None:
+        flat = flat_name(f"{TYPE}/{odd}")
+        similar_names = (flat.split("__")[1], "a_b", "__b", "a" * 241)
+        flat_names = {flat, *(flat_name(f"{TYPE}/{name}") for name in similar_names)}
+        assert len(flat_names) == 1 + len(similar_names)

@@ -1,10 +1,10 @@
-"""The moments that formats annotate."""
+"""The keyframes that formats annotate."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.export.frames import KEY_STEP, keyframe_after, keyframes
+from deepaccident_devkit.export.frames import KEY_STEP, keyframes, next_keyframe
 
 
 @given(last=st.integers(1, 400), number=st.integers(1, 400))
@@ -14,4 +14,4 @@ def test_keyframes_lead_to_the_last_frame(last: int, number: int) -> None:
     assert 1 <= keys[0] <= KEY_STEP
     assert set(np.diff(keys)) <= {KEY_STEP}
     if number <= last:
-        assert keyframe_after(number, last) == min(key for key in keys if key >= number)
+        assert next_keyframe(number, last) == min(key for key in keys if key >= number)

@@ -1,27 +1,23 @@
-"""Files of MCAP, read back by the format's own library: what is in them, what goes in, and what
-errors say.
-"""
+"""Export MCAP files and read them back with the official library."""
 
 import ast
 import json
 import logging
 import re
 import sys
-from functools import partial
 from io import BytesIO
-from operator import attrgetter
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from mcap_reading import McapFile, cloud_of, matrix_of, read_mcap, xyz_of
 from PIL import Image
-from refusals import assert_refused
+from support.command_calls import invoke_command
+from support.expected_errors import assert_raises
+from support.mcap_reader import McapFile, read_cloud, read_matrix, read_mcap, read_positions
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.errors import (
     ChoiceError,
     ConfigError,
@@ -41,9 +37,10 @@ from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, MAP_
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import cooperative_boxes
 
-FRAMES = 6
-ONCE = ("/log", "/road/points")
-"""Topics without a message a frame."""
+NUM_FRAMES = 6
+IRREGULAR_TOPICS = ("/log", "/road/points")
+"""Topics that do not have one message for each frame."""
+PAGE = (Path(__file__).parents[3] / "docs" / "pictures.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -53,333 +50,393 @@ def scenario(da: DeepAccident) -> str:
 
 @pytest.fixture(scope="module")
 def path(da: DeepAccident, scenario: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    wanted = tmp_path_factory.mktemp("mcap") / "new folder" / "accident.mcap"
-    assert export_mcap(da, scenario, wanted, motion_labels="deepaccident") == wanted
-    return wanted
+    out = tmp_path_factory.mktemp("mcap") / "new folder" / "accident.mcap"
+    assert export_mcap(da, scenario, out, motion_labels="deepaccident") == out
+    return out
 
 
 @pytest.fixture(scope="module")
-def file(path: Path) -> McapFile:
+def recording(path: Path) -> McapFile:
     return read_mcap(path)
 
 
-def sample(scenario: str, agent: str, index: int) -> str:
-    return f"{scenario}/{agent}/{index:03d}"
+def sample_token(scenario: str, agent: str, number: int) -> str:
+    return f"{scenario}/{agent}/{number:03d}"
 
 
-def test_every_topic_has_a_message_a_frame_and_the_schema_of_its_kind(file: McapFile) -> None:
-    cloud, update = "PointCloud", "SceneUpdate"
-    of_agent = {"pose": "PoseInFrame", f"{LIDAR}/points": cloud, "annotations": update}
-    of_agent |= {
-        "motion_labels/points": cloud,
-        **{f"{camera}/image": "CompressedImage" for camera in CAMERAS},
+def export_small(da: DeepAccident, scenario: str, folder: Path, **choices: Any) -> McapFile:
+    """Export one agent and one frame without sensors, unless `choices` ask for more."""
+    defaults = {"agents": ["ego_vehicle"], "channels": [], "frames": [2]}
+    return read_mcap(export_mcap(da, scenario, folder / "small.mcap", **{**defaults, **choices}))
+
+
+def test_every_topic_has_a_message_a_frame_and_the_schema_of_its_kind(recording: McapFile) -> None:
+    agent_schemas = {
+        "pose": "foxglove.PoseInFrame",
+        f"{LIDAR}/points": "foxglove.PointCloud",
+        "annotations": "foxglove.SceneUpdate",
+        "motion_labels/points": "foxglove.PointCloud",
     }
-    of_agent |= {f"{camera}/calibration": "CameraCalibration" for camera in CAMERAS}
+    for camera in CAMERAS:
+        agent_schemas[f"{camera}/image"] = "foxglove.CompressedImage"
+        agent_schemas[f"{camera}/calibration"] = "foxglove.CameraCalibration"
     expected = {
-        "/log": "Log",
-        "/tf": "FrameTransforms",
-        "/actors": update,
-        "/actors/points": cloud,
-        "/road/points": cloud,
+        "/log": "foxglove.Log",
+        "/tf": "foxglove.FrameTransforms",
+        "/actors": "foxglove.SceneUpdate",
+        "/actors/points": "foxglove.PointCloud",
+        "/road/points": "foxglove.PointCloud",
+        "/time_to_impact": "google.protobuf.DoubleValue",
     }
-    expected |= {f"/{agent}/{name}": kind for agent in AGENTS for name, kind in of_agent.items()}
-    wanted = {topic: f"foxglove.{name}" for topic, name in expected.items()}
-    numbers = [
-        "/time_to_impact",
-        *(f"/{agent}/speed" for agent in AGENTS if agent != INFRASTRUCTURE),
-    ]
-    assert file.schemas == {**wanted, **dict.fromkeys(numbers, "google.protobuf.DoubleValue")}
-    assert {len(messages) for topic, messages in file.messages.items() if topic not in ONCE} == {
-        FRAMES
-    }
-
-
-def test_there_is_one_timeline_of_ten_frames_a_second(file: McapFile) -> None:
-    assert file.log_times == sorted(file.log_times)
-    frames = [EPOCH * 10**9 + number * 10**8 for number in range(FRAMES)]
-    for topic, messages in file.messages.items():
-        assert {record.publish_time - record.log_time for record, _ in messages} == {0}
-        if topic not in ONCE:
-            assert [(record.sequence, record.log_time) for record, _ in messages] == [
-                *enumerate(frames)
-            ]
-    assert [
-        image.timestamp.ToNanoseconds() for image in file.only("/ego_vehicle/Camera_Front/image")
-    ] == frames
-
-
-def test_transforms_and_poses_are_those_of_the_dataset(
-    da: DeepAccident, scenario: str, file: McapFile
-) -> None:
-    for index, message in enumerate(file.only("/tf"), start=1):
-        parent_from = {
-            each.child_frame_id: (each.parent_frame_id, matrix_of(each.translation, each.rotation))
-            for each in message.transforms
-        }
-        assert len(parent_from) == len(AGENTS) * (1 + len(CAMERAS) + 1)
-        for agent in AGENTS:
-            parent, world_from_ego = parent_from[agent]
-            told = file.only(f"/{agent}/pose")[index - 1]
-            assert (parent, told.frame_id) == ("world", "world")
-            expected = da.world_from(sample(scenario, agent, index), "ego").matrix
-            for pose in (world_from_ego, matrix_of(told.pose.position, told.pose.orientation)):
-                np.testing.assert_allclose(pose, expected, atol=1e-5)
-            for channel in (*CAMERAS, LIDAR):
-                parent, ego_from_sensor = parent_from[f"{agent}/{channel}"]
-                assert parent == agent
-                expected = da.world_from(sample(scenario, agent, index), channel).matrix
-                np.testing.assert_allclose(world_from_ego @ ego_from_sensor, expected, atol=1e-4)
-
-
-def test_images_are_the_files_bytes(da: DeepAccident, scenario: str, file: McapFile) -> None:
     for agent in AGENTS:
-        for camera in CAMERAS:
-            for index, image in enumerate(file.only(f"/{agent}/{camera}/image"), start=1):
-                assert (
-                    image.data
-                    == da.get_sample_data_path(
-                        f"{sample(scenario, agent, index)}/{camera}"
-                    ).read_bytes()
-                )
-                assert (image.format, image.frame_id) == ("jpeg", f"{agent}/{camera}")
+        expected |= {f"/{agent}/{name}": schema for name, schema in agent_schemas.items()}
+        if agent != INFRASTRUCTURE:
+            expected[f"/{agent}/speed"] = "google.protobuf.DoubleValue"
+
+    assert recording.schemas == expected
+    for topic, messages in recording.messages.items():
+        assert topic in IRREGULAR_TOPICS or len(messages) == NUM_FRAMES, topic
+
+
+def test_there_is_one_timeline_of_ten_frames_a_second(recording: McapFile) -> None:
+    assert recording.log_times == sorted(recording.log_times)
+
+    times_ns = [EPOCH * 10**9 + number * 10**8 for number in range(NUM_FRAMES)]
+    for topic, messages in recording.messages.items():
+        records = [record for record, _ in messages]
+        assert {record.publish_time - record.log_time for record in records} == {0}
+        if topic not in IRREGULAR_TOPICS:
+            sequence = [(record.sequence, record.log_time) for record in records]
+            assert sequence == list(enumerate(times_ns))
+    images = recording.decoded("/ego_vehicle/Camera_Front/image")
+
+    assert [image.timestamp.ToNanoseconds() for image in images] == times_ns
+
+
+def test_transforms_and_poses_equal_the_dataset(
+    da: DeepAccident, scenario: str, recording: McapFile
+) -> None:
+    for number, message in enumerate(recording.decoded("/tf"), start=1):
+        parents = {}
+        poses = {}
+        for transform in message.transforms:
+            parents[transform.child_frame_id] = transform.parent_frame_id
+            pose = read_matrix(transform.translation, transform.rotation)
+            poses[transform.child_frame_id] = pose
+
+        assert len(poses) == len(AGENTS) * (1 + len(CAMERAS) + 1)
+
+        for agent in AGENTS:
+            posed = recording.decoded(f"/{agent}/pose")[number - 1]
+            assert parents[agent] == posed.frame_id == "world"
+
+            token = sample_token(scenario, agent, number)
+            expected = da.world_from(token, "ego").matrix
+            np.testing.assert_allclose(poses[agent], expected, atol=1e-5)
+
+            pose = read_matrix(posed.pose.position, posed.pose.orientation)
+            np.testing.assert_allclose(pose, expected, atol=1e-5)
+
+            for channel in (*CAMERAS, LIDAR):
+                sensor = f"{agent}/{channel}"
+                assert parents[sensor] == agent
+                expected = da.world_from(token, channel).matrix
+                np.testing.assert_allclose(poses[agent] @ poses[sensor], expected, atol=1e-4)
+
+
+def test_images_are_the_files_bytes(da: DeepAccident, scenario: str, recording: McapFile) -> None:
+    for agent, camera in product(AGENTS, CAMERAS):
+        images = recording.decoded(f"/{agent}/{camera}/image")
+        for number, image in enumerate(images, start=1):
+            token = sample_token(scenario, agent, number)
+            assert image.data == da.get_sample_data_path(token, camera).read_bytes()
+            assert (image.format, image.frame_id) == ("jpeg", f"{agent}/{camera}")
 
 
 def test_calibrations_project_into_the_images(
-    da: DeepAccident, scenario: str, file: McapFile
+    da: DeepAccident, scenario: str, recording: McapFile
 ) -> None:
-    image, message = (
-        file.only(f"/infrastructure/Camera_Back/{kind}")[2] for kind in ("image", "calibration")
-    )
-    assert (message.width, message.height) == Image.open(BytesIO(image.data)).size
-    assert message.frame_id == image.frame_id
-    camera = da.camera(sample(scenario, "infrastructure", 3), "Camera_Back")
-    scale = message.width / camera.width
+    image = recording.decoded("/infrastructure/Camera_Back/image")[2]
+    calibration = recording.decoded("/infrastructure/Camera_Back/calibration")[2]
+    assert (calibration.width, calibration.height) == Image.open(BytesIO(image.data)).size
+    assert calibration.frame_id == image.frame_id
+
+    camera = da.camera(sample_token(scenario, "infrastructure", 3), "Camera_Back")
+    scale = calibration.width / camera.width
     expected = np.diag([scale, scale, 1.0]) @ camera.intrinsic
-    np.testing.assert_allclose(np.reshape(message.K, (3, 3)), expected, atol=1e-9)
-    np.testing.assert_allclose(np.reshape(message.P, (3, 4))[:, :3], expected, atol=1e-9)
-
-
-def test_an_image_that_was_stored_smaller_has_a_calibration_of_its_size(
-    da: DeepAccident, scenario: str, file: McapFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = tmp_path / "small.jpg"
-    Image.new("RGB", (32, 18)).save(small)
-    monkeypatch.setattr(type(da), "sensor_path", lambda *_: small)
-    made = read_mcap(
-        export_mcap(
-            da,
-            scenario,
-            tmp_path / "a.mcap",
-            agents=["ego_vehicle"],
-            channels=["Camera_Front"],
-            frames=[1],
-        )
+    np.testing.assert_allclose(
+        np.reshape(calibration.K, (3, 3)),
+        expected,
+        atol=1e-9,
     )
-    half, whole = (each.only("/ego_vehicle/Camera_Front/calibration")[0] for each in (made, file))
-    assert (half.width, half.height, whole.width, whole.height) == (32, 18, 64, 36)
+    np.testing.assert_allclose(
+        np.reshape(calibration.P, (3, 4))[:, :3],
+        expected,
+        atol=1e-9,
+    )
+
+
+def test_a_smaller_image_has_a_calibration_of_its_size(
+    da: DeepAccident,
+    scenario: str,
+    recording: McapFile,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    picture = tmp_path / "small.jpg"
+    Image.new("RGB", (32, 18)).save(picture)
+    monkeypatch.setattr(type(da), "sensor_path", lambda *_: picture)
+    small = export_small(
+        da,
+        scenario,
+        tmp_path,
+        channels=["Camera_Front"],
+        frames=[1],
+    )
+    topic = "/ego_vehicle/Camera_Front/calibration"
+    half = small.decoded(topic)[0]
+    whole = recording.decoded(topic)[0]
+
+    assert (half.width, half.height) == (32, 18)
+    assert (whole.width, whole.height) == (64, 36)
     np.testing.assert_allclose(np.array(half.K)[:6], np.array(whole.K)[:6] / 2)
 
 
-def test_clouds_have_all_points(da: DeepAccident, scenario: str, file: McapFile) -> None:
+def test_clouds_have_all_points(da: DeepAccident, scenario: str, recording: McapFile) -> None:
     for agent in AGENTS:
-        for index, message in enumerate(file.only(f"/{agent}/{LIDAR}/points"), start=1):
-            stored, cloud = (
-                da.load_point_cloud(sample(scenario, agent, index), "lidar"),
-                cloud_of(message),
-            )
+        for number, message in enumerate(recording.decoded(f"/{agent}/{LIDAR}/points"), start=1):
+            stored = da.load_point_cloud(sample_token(scenario, agent, number), "lidar")
+            cloud = read_cloud(message)
             assert message.frame_id == f"{agent}/{LIDAR}"
             assert len(cloud) == len(stored) > 0
+            # the export rounds to 1/32
             np.testing.assert_allclose(
-                xyz_of(cloud), stored.xyz, rtol=0, atol=1 / 64
-            )  # rounded to 1/32
-            np.testing.assert_allclose(cloud["intensity"], stored.intensity, rtol=0, atol=1 / 64)
+                read_positions(cloud),
+                stored.xyz,
+                rtol=0,
+                atol=1 / 64,
+            )
+            np.testing.assert_allclose(
+                cloud["intensity"],
+                stored.intensity,
+                rtol=0,
+                atol=1 / 64,
+            )
 
 
-def test_road_and_speeds_are_those_of_bev_camera_and_boxes(
-    da: DeepAccident, scenario: str, file: McapFile
+def test_road_and_speed_equal_the_bev_camera_and_the_boxes(
+    da: DeepAccident, scenario: str, recording: McapFile
 ) -> None:
-    (message,) = file.only("/road/points")
-    cloud, first = cloud_of(message), sample(scenario, "ego_vehicle", 1)
+    (message,) = recording.decoded("/road/points")
+    cloud = read_cloud(message)
     colors = np.column_stack([cloud[name] for name in ("red", "green", "blue")])
-    road = (colors == tuple(bytes.fromhex(MAP_COLORS["road"][1:]))).all(axis=1)
-    near = da.world_from(first, "ego").inverse().apply(xyz_of(cloud)[road])
-    row, column = np.rint(599.5 - near[np.abs(near[:, :2]).max(axis=1) < 50, :2].T / 0.1).astype(
-        int
-    )
-    seen = da.load_bev(first).semantic[row, column]
-    assert (len(seen) > 1000, np.mean(seen == TAGS["road"]) > 0.9) == (True, True)
-    own = da.boxes(first, "world").velocity[da.boxes(first).actor_id == OWN_ACTOR_ID]
-    assert file.only("/ego_vehicle/speed")[0].value == pytest.approx(np.linalg.norm(own), abs=0.1)
+    is_road = (colors == tuple(bytes.fromhex(MAP_COLORS["road"][1:]))).all(axis=1)
+    token = sample_token(scenario, "ego_vehicle", 1)
+    ego_from_world = da.world_from(token, "ego").inverse()
+    positions = ego_from_world.apply(read_positions(cloud)[is_road])[:, :2]
+    positions = positions[np.abs(positions).max(axis=1) < 50]
+    rows, columns = np.rint(599.5 - positions.T / 0.1).astype(int)
+    tags = da.load_bev(token).semantic[rows, columns]
+
+    assert len(tags) > 1000
+    assert np.mean(tags == TAGS["road"]) > 0.9
+
+    boxes = da.boxes(token, "world")
+    speed = np.linalg.norm(boxes.velocity[boxes.actor_id == OWN_ACTOR_ID])
+    assert recording.decoded("/ego_vehicle/speed")[0].value == pytest.approx(speed, abs=0.1)
 
 
-def test_layouts_beside_the_file_name_its_topics(path: Path, file: McapFile) -> None:
+def test_layouts_beside_the_file_name_its_topics(path: Path, recording: McapFile) -> None:
     layout = json.loads(path.with_suffix(".foxglove.json").read_text())
-    panels, script = layout["configById"], path.with_suffix(".rerun.py").read_text()
-    named = {
-        *panels["3D!scene"]["topics"],
-        *(one["value"].removesuffix(".value") for one in panels["Plot!values"]["paths"]),
-    }
-    named |= {
-        panels[f"Image!{number}"]["imageMode"][kind]
-        for number in (0, 1)
-        for kind in ("imageTopic", "calibrationTopic")
-    }
-    named |= {*re.findall(r"'(/[^']+)'", script)}
-    assert named <= {*file.messages}
-    assert {"/road/points", "/actors", "/ego_vehicle/speed", "/time_to_impact"} <= named
+    panels = layout["configById"]
+    topics = set(panels["3D!scene"]["topics"])
+    for plot in panels["Plot!values"]["paths"]:
+        topics.add(plot["value"].removesuffix(".value"))
+    for panel in ("Image!0", "Image!1"):
+        mode = panels[panel]["imageMode"]
+        topics |= {mode["imageTopic"], mode["calibrationTopic"]}
+    script = path.with_suffix(".rerun.py").read_text()
+    topics |= set(re.findall(r"'(/[^']+)'", script))
+
+    assert topics <= recording.messages.keys()
+    assert {"/road/points", "/actors", "/ego_vehicle/speed", "/time_to_impact"} <= topics
 
 
 @pytest.mark.parametrize(
     "name", ['a"""; print(1); """', "b'\\", "c{d}%s", "new\nline", "caf\xe9 \udcff"]
 )
-def test_no_name_of_a_file_is_code_in_its_script(name: str, tmp_path: Path) -> None:
+def test_a_file_name_cannot_become_code_in_its_script(name: str, tmp_path: Path) -> None:
     write_layouts(tmp_path / f"{name}.mcap", [])
     module = ast.parse((tmp_path / f"{name}.rerun.py").read_text())
-    statements = [ast.unparse(each) for each in module.body if isinstance(each, ast.Expr)]
+    statements = [ast.unparse(node) for node in module.body if isinstance(node, ast.Expr)]
     assert statements == [repr(ast.get_docstring(module, clean=False))]
-    calls = [each for each in ast.walk(module) if isinstance(each, ast.Call)]
-    [names] = [each.args for each in calls if ast.unparse(each.func).endswith("with_name")]
-    assert [ast.literal_eval(each) for each in names] == [f"{name}.mcap"]
+
+    calls = [node for node in ast.walk(module) if isinstance(node, ast.Call)]
+    [call] = [node for node in calls if ast.unparse(node.func).endswith("with_name")]
+    assert [ast.literal_eval(argument) for argument in call.args] == [f"{name}.mcap"]
 
 
 def test_actors_are_the_union_of_all_annotations(
-    da: DeepAccident, scenario: str, file: McapFile
+    da: DeepAccident, scenario: str, recording: McapFile
 ) -> None:
-    for index, message in enumerate(file.only("/actors"), start=1):
-        boxes = cooperative_boxes(da, sample(scenario, "ego_vehicle", index))
-        assert (
-            len(message.entities)
-            == len({entity.id for entity in message.entities})
-            == len(boxes)
-            > 0
-        )
+    for number, message in enumerate(recording.decoded("/actors"), start=1):
+        boxes = cooperative_boxes(da, sample_token(scenario, "ego_vehicle", number))
+        entity_ids = {entity.id for entity in message.entities}
+        assert len(message.entities) == len(entity_ids) == len(boxes) > 0
+
         for row, entity in enumerate(message.entities):
             (cube,) = entity.cubes
-            pose, size = matrix_of(cube.pose.position, cube.pose.orientation), cube.size
-            np.testing.assert_allclose(pose[:3, 3], boxes.center[row], atol=1e-9)
+            pose = read_matrix(cube.pose.position, cube.pose.orientation)
+            yaw = np.arctan2(pose[1, 0], pose[0, 0])
             np.testing.assert_allclose(
-                np.arctan2(pose[1, 0], pose[0, 0]), boxes.yaw[row], atol=1e-6
+                pose[:3, 3],
+                boxes.center[row],
+                atol=1e-9,
             )
-            np.testing.assert_allclose([size.x, size.y, size.z], boxes.size[row])
+            np.testing.assert_allclose(
+                yaw,
+                boxes.yaw[row],
+                atol=1e-6,
+            )
+
+            size = [
+                cube.size.x,
+                cube.size.y,
+                cube.size.z,
+            ]
+            np.testing.assert_allclose(size, boxes.size[row])
+
             facts = {pair.key: pair.value for pair in entity.metadata}
-            told = (entity.frame_id, facts["category"], facts["num_lidar_pts"])
-            assert told == ("world", boxes.category_names[row], str(boxes.num_lidar_pts[row]))
-            assert boxes.actor_id[row] == -1 or entity.id == facts["actor_id"] == str(
-                boxes.actor_id[row]
-            )
+            assert entity.frame_id == "world"
+            assert facts["category"] == boxes.category_names[row]
+            assert facts["num_lidar_pts"] == str(boxes.num_lidar_pts[row])
+
+            actor = boxes.actor_id[row]
+            assert actor == -1 or entity.id == facts["actor_id"] == str(actor)
 
 
-def test_the_colliding_pair_is_red_and_other_recorders_have_their_hues(
-    da: DeepAccident, scenario: str, file: McapFile
+def test_colliders_are_red_and_other_recording_agents_have_their_colours(
+    da: DeepAccident, scenario: str, recording: McapFile
 ) -> None:
-    pair = da.get("scenario", scenario)["collision"]["ids"]
-    agents = {
-        each["actor_id"]: each["name"] for each in da.agent if each["scenario_token"] == scenario
-    }
-    entities = {entity.id: entity for entity in file.only("/actors")[-1].entities}
-    channels = {
-        name: attrgetter("r", "g", "b")(each.cubes[0].color) for name, each in entities.items()
-    }
-    colors = {
-        name: "#" + bytes(round(255 * each) for each in color).hex()
-        for name, color in channels.items()
-    }
-    assert [name for name, color in colors.items() if color == COLLIDER_COLOR] == sorted(
-        map(str, pair), key=int
-    )
-    behind = {str(actor): AGENT_COLORS[agents[actor]] for actor in agents.keys() - {None, *pair}}
-    assert {
-        name: color for name, color in colors.items() if color in AGENT_COLORS.values()
-    } == behind
+    colors = {}
+    for entity in recording.decoded("/actors")[-1].entities:
+        color = entity.cubes[0].color
+        channels = [round(255 * share) for share in (color.r, color.g, color.b)]
+        colors[entity.id] = "#" + bytes(channels).hex()
+    colliders = da.get("scenario", scenario)["collision"]["ids"]
+    red_ids = [actor for actor, color in colors.items() if color == COLLIDER_COLOR]
+
+    assert red_ids == sorted(map(str, colliders), key=int)
+
+    expected = {}
+    for agent in da.agent:
+        actor = agent["actor_id"]
+        if agent["scenario_token"] == scenario and actor not in {None, *colliders}:
+            expected[str(actor)] = AGENT_COLORS[agent["name"]]
+    hues = AGENT_COLORS.values()
+
+    assert {actor: color for actor, color in colors.items() if color in hues} == expected
 
 
-def test_annotations_are_each_agents_own(da: DeepAccident, scenario: str, file: McapFile) -> None:
+def test_annotations_are_each_agents_own(
+    da: DeepAccident, scenario: str, recording: McapFile
+) -> None:
     for agent in AGENTS:
-        boxes = da.boxes(sample(scenario, agent, 4), "lidar")
-        message = file.only(f"/{agent}/annotations")[3]
+        boxes = da.boxes(sample_token(scenario, agent, 4), "lidar")
+        message = recording.decoded(f"/{agent}/annotations")[3]
         assert len(message.entities) == len(boxes)
+
         for row, entity in enumerate(message.entities):
             facts = {pair.key: pair.value for pair in entity.metadata}
-            told = (entity.frame_id, facts["label_id"], facts["camera_visible"])
-            assert told == (
-                f"{agent}/{LIDAR}",
-                str(boxes.actor_id[row]),
-                str(bool(boxes.camera_visible[row])).lower(),
-            )
+            assert entity.frame_id == f"{agent}/{LIDAR}"
+            assert facts["label_id"] == str(boxes.actor_id[row])
+            assert facts["camera_visible"] == str(bool(boxes.camera_visible[row])).lower()
             points = np.array([[point.x, point.y, point.z] for point in entity.lines[0].points])
-            np.testing.assert_allclose(points[:24].mean(axis=0), boxes.center[row], atol=1e-9)
+            np.testing.assert_allclose(
+                points[:24].mean(axis=0),
+                boxes.center[row],
+                atol=1e-9,
+            )
 
 
 def test_motion_labels_are_points_on_their_cells(
-    da: DeepAccident, scenario: str, file: McapFile
+    da: DeepAccident, scenario: str, recording: McapFile
 ) -> None:
-    labels = motion_labels(da, sample(scenario, "ego_vehicle", 1), "deepaccident").to_present()
-    message = file.only("/ego_vehicle/motion_labels/points")[0]
-    cloud, grid = cloud_of(message), labels.config.grid
+    token = sample_token(scenario, "ego_vehicle", 1)
+    labels = motion_labels(da, token, "deepaccident").to_present()
+    message = recording.decoded("/ego_vehicle/motion_labels/points")[0]
     assert message.frame_id == "ego_vehicle"
-    index, inside = grid.index_of(xyz_of(cloud))
-    assert inside.all()
+
+    cloud = read_cloud(message)
+    cells, is_inside = labels.config.grid.index_of(read_positions(cloud))
+    assert is_inside.all()
+
     drawn = np.zeros_like(labels.instance)
-    drawn[cloud["frame"], index[:, 0], index[:, 1]] = cloud["instance"]
-    expected = np.where(labels.label_valid[:, None, None], labels.instance, 0)
-    np.testing.assert_array_equal(drawn, expected)
-    assert ((expected[0] > 0).any(), len(cloud)) == (True, np.count_nonzero(expected))
-
-
-def test_the_countdown_ends_at_the_impact(da: DeepAccident, scenario: str, file: McapFile) -> None:
-    assert [message.value for message in file.only("/time_to_impact")] == pytest.approx(
-        [0.5, 0.4, 0.3, 0.2, 0.1, 0.0]
+    drawn[cloud["frame"], cells[:, 0], cells[:, 1]] = cloud["instance"]
+    expected = np.where(
+        labels.label_valid[:, None, None],
+        labels.instance,
+        0,
     )
-    facts, first, *_, last = [message.message for message in file.only("/log")]
-    assert (facts.startswith(f"{scenario}: town "), first) == (True, "0.5 s to the impact")
+    np.testing.assert_array_equal(drawn, expected)
+    assert (expected[0] > 0).any()
+    assert len(cloud) == np.count_nonzero(expected)
+
+
+def test_the_countdown_ends_at_the_impact(
+    da: DeepAccident, scenario: str, recording: McapFile
+) -> None:
+    times_s = [message.value for message in recording.decoded("/time_to_impact")]
+    assert times_s == pytest.approx([0.5, 0.4, 0.3, 0.2, 0.1, 0.0])
+
+    facts, first, *_, last = [message.message for message in recording.decoded("/log")]
+    assert facts.startswith(f"{scenario}: town ")
+    assert first == "0.5 s to the impact"
+
     one, other = da.get("scenario", scenario)["collision"]["ids"]
     assert re.fullmatch(rf"impact: .*\b({one}\b.*\b{other}|{other}\b.*\b{one})\b.*", last)
-
-
-def exported(da: DeepAccident, scenario: str, folder: Path, **choices: Any) -> Any:
-    """A small file: one agent, one frame, no sensors unless asked for."""
-    small = {"agents": ["ego_vehicle"], "channels": [], "frames": [2], **choices}
-    return read_mcap(export_mcap(da, scenario, folder / "small.mcap", **small))
 
 
 def test_agents_channels_and_frames_can_be_chosen(
     da: DeepAccident, scenario: str, tmp_path: Path
 ) -> None:
-    chosen = {
-        "agents": "+infrastructure",
-        "channels": [LIDAR, "Camera_Back"],
-        "frames": range(2, 6, 2),
+    recording = export_small(
+        da,
+        scenario,
+        tmp_path,
+        agents="+infrastructure",
+        channels=[LIDAR, "Camera_Back"],
+        frames=range(2, 6, 2),
+    )
+    endings = ("/image", f"{LIDAR}/points")
+
+    assert {topic for topic in recording.messages if topic.endswith(endings)} == {
+        "/ego_vehicle/Camera_Back/image",
+        f"/ego_vehicle/{LIDAR}/points",
+        "/infrastructure/Camera_Back/image",
+        f"/infrastructure/{LIDAR}/points",
     }
-    file = exported(da, scenario, tmp_path, **chosen)
-    sensors = {topic for topic in file.messages if topic.endswith(("/image", f"{LIDAR}/points"))}
-    names = "Camera_Back/image", f"{LIDAR}/points"
-    assert sensors == {
-        f"/{agent}/{name}" for agent in ("ego_vehicle", "infrastructure") for name in names
-    }
-    assert np.diff([record.log_time for record, _ in file.messages["/tf"]]).tolist() == [2 * 10**8]
-    assert len({transform.child_frame_id for transform in file.only("/tf")[0].transforms}) == 2 * 8
+
+    times_ns = [record.log_time for record, _ in recording.messages["/tf"]]
+    assert np.diff(times_ns).tolist() == [2 * 10**8]
+
+    transforms = recording.decoded("/tf")[0].transforms
+    assert len({transform.child_frame_id for transform in transforms}) == 2 * 8
 
 
 @pytest.mark.slow
 def test_scenarios_without_labels_have_poses_and_no_boxes(
-    unlabelled: DeepAccident, tmp_path: Path
+    unlabelled_dataset: DeepAccident, tmp_path: Path
 ) -> None:
-    file = exported(
-        unlabelled,
-        unlabelled.scenario[0]["token"],
-        tmp_path,
-        motion_labels="deepaccident",
-        frames=[1, 2],
-    )
-    counts = (
-        [len(each.entities) for each in file.only("/actors")],
-        [len(each.data) for each in file.only("/actors/points")],
-    )
-    assert (len(file.only("/tf")), *counts) == (2, [0, 0], [0, 0])
-    assert not [topic for topic in file.messages if "annotations" in topic or "motion" in topic]
-
-
-PAGE = (Path(__file__).parents[3] / "docs" / "pictures.md").read_text(encoding="utf-8")
+    scenario = unlabelled_dataset.scenario[0]["token"]
+    choices = {"motion_labels": "deepaccident", "frames": [1, 2]}
+    recording = export_small(unlabelled_dataset, scenario, tmp_path, **choices)
+    assert len(recording.decoded("/tf")) == 2
+    assert [len(message.entities) for message in recording.decoded("/actors")] == [0, 0]
+    assert [len(message.data) for message in recording.decoded("/actors/points")] == [0, 0]
+    assert not [
+        topic for topic in recording.messages if "annotations" in topic or "motion" in topic
+    ]
 
 
 def test_the_code_on_the_page_runs(
@@ -387,16 +444,14 @@ def test_the_code_on_the_page_runs(
 ) -> None:
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
     assert "deepaccident_demo/release" in code
+    code = code.replace("deepaccident_demo/release", str(da.dataroot))
     monkeypatch.chdir(tmp_path)
-    exec(  # noqa: S102
-        compile(code.replace("deepaccident_demo/release", str(da.dataroot)), "pictures.md", "exec"),
-        {},
-    )
-    assert len(read_mcap(tmp_path / "accident.mcap").only("/actors")) == 6
+    exec(compile(code, "pictures.md", "exec"), {})  # noqa: S102
+    assert len(read_mcap(tmp_path / "accident.mcap").decoded("/actors")) == 6
 
 
 @pytest.mark.parametrize(
-    ("choices", "sentence"),
+    ("choices", "message"),
     [
         ({"agent": "ego_vehicle"}, "'agent'.*agents"),
         ({"channels": 1}, "channels: .*Camera_Front.*1"),
@@ -412,44 +467,49 @@ def test_the_code_on_the_page_runs(
         ({"motion_labels": "mine"}, "'mine'"),
     ],
 )
-def test_choices_that_cannot_be_are_refused(
-    da: DeepAccident, scenario: str, tmp_path: Path, choices: dict[str, Any], sentence: str
+def test_impossible_choices_are_refused(
+    da: DeepAccident, scenario: str, tmp_path: Path, choices: dict[str, Any], message: str
 ) -> None:
-    assert_refused(
-        (lambda: export_mcap(da, scenario, tmp_path / "a.mcap", **choices), ChoiceError, sentence)
-    )
+    with pytest.raises(ChoiceError, match=message):
+        export_mcap(da, scenario, tmp_path / "a.mcap", **choices)
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_files_are_left_out_and_told(
+def test_missing_files_are_left_out_with_a_warning(
     da_b: DeepAccident, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    token = da_b.scenario[0]["token"]
+    choices = {"agents": AGENTS, "channels": ["Camera_Front", LIDAR], "frames": [1, 2]}
     with caplog.at_level(logging.WARNING):
-        file = read_mcap(
-            export_mcap(
-                da_b, token, tmp_path / "a.mcap", channels=["Camera_Front", LIDAR], frames=[1, 2]
-            )
+        recording = export_small(
+            da_b,
+            da_b.scenario[0]["token"],
+            tmp_path,
+            **choices,
         )
-    assert not [topic for topic in file.messages if "Camera" in topic or LIDAR in topic]
+    assert not [topic for topic in recording.messages if "Camera" in topic or LIDAR in topic]
     (record,) = caplog.records
-    assert "10 of 10 of Camera_Front, 10 of 10 of lidar01" in record.getMessage()
+    assert "10 of 10 Camera_Front files, 10 of 10 lidar01 files" in record.getMessage()
 
 
-def test_a_damaged_image_or_a_folder_in_its_place_is_an_error_and_the_old_file_stays(
+def test_an_unreadable_image_is_an_error_and_the_old_file_stays(
     da: DeepAccident, scenario: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    damaged, old = tmp_path / "damaged.jpg", tmp_path / "a.mcap"
+    damaged = tmp_path / "damaged.jpg"
     damaged.write_bytes(b"\xff\xd8no picture")
-    old.write_bytes(b"before")
-    for path, said in (
+    old_file = tmp_path / "a.mcap"
+    old_file.write_bytes(b"before")
+
+    def export() -> None:
+        export_mcap(da, scenario, old_file, channels=["Camera_Front"])
+
+    for path, message in (
         (damaged, "damaged.jpg: not a readable image"),
         (tmp_path, "not a regular file (a folder)"),
     ):
         monkeypatch.setattr(type(da), "sensor_path", lambda *_, path=path: path)
-        export = partial(export_mcap, da, scenario, old, channels=["Camera_Front"])
-        assert_refused((export, SensorFileError, (said, "restore the file")))
-    assert {each.name: each.read_bytes()[:6] for each in tmp_path.iterdir()} == {
+        assert_raises((export, SensorFileError, (message, "restore the file")))
+
+    assert {file.name: file.read_bytes()[:6] for file in tmp_path.iterdir()} == {
         "a.mcap": b"before",
         "damaged.jpg": b"\xff\xd8no p",
     }
@@ -458,44 +518,49 @@ def test_a_damaged_image_or_a_folder_in_its_place_is_an_error_and_the_old_file_s
 def test_a_predicted_motion_is_drawn_on_its_cells(
     da: DeepAccident, scenario: str, tmp_path: Path
 ) -> None:
-    sample = f"{scenario}/ego_vehicle/002"
-    labels = motion_labels(da, sample).to_present()
-    instances, heads = labels.instance[None], (MotionHeads.from_labels(labels),)
-    for given in ({"instances": instances}, {"heads": heads}):
-        file = exported(
-            da,
-            scenario,
-            tmp_path,
-            prediction={sample: MotionOutput(grid=labels.config.grid, **given)},
-        )
-        (message,) = file.only("/ego_vehicle/prediction/motion/points")
+    token = sample_token(scenario, "ego_vehicle", 2)
+    labels = motion_labels(da, token).to_present()
+    grid = labels.config.grid
+    for output in (
+        MotionOutput(grid=grid, instances=labels.instance[None]),
+        MotionOutput(grid=grid, heads=(MotionHeads.from_labels(labels),)),
+    ):
+        recording = export_small(da, scenario, tmp_path, prediction={token: output})
+        (message,) = recording.decoded("/ego_vehicle/prediction/motion/points")
         assert message.frame_id == "ego_vehicle"
-        cloud = cloud_of(message)
-        index, _ = labels.config.grid.index_of(xyz_of(cloud[cloud["frame"] == 0]))
-        present = np.zeros(labels.instance[0].shape, dtype=bool)
-        present[tuple(index.T)] = True
-        np.testing.assert_array_equal(present, labels.instance[0] > 0)
+        cloud = read_cloud(message)
+        cells, _ = grid.index_of(read_positions(cloud[cloud["frame"] == 0]))
+        is_occupied = np.zeros(labels.instance[0].shape, dtype=bool)
+        is_occupied[tuple(cells.T)] = True
+        np.testing.assert_array_equal(is_occupied, labels.instance[0] > 0)
 
 
-def test_predicted_accidents_stand_where_they_are_foreseen(
+def test_predicted_accidents_are_drawn_at_their_positions(
     da: DeepAccident, scenario: str, tmp_path: Path
 ) -> None:
-    foreseen = Accident(
+    accident = Accident(
         positions=np.array([[10.0, 2.0], [13.0, -1.0]]), time=1.5, score=0.75, ids=(3, 9)
     )
-    with ResultsWriter(tmp_path / "results.json", "accident") as writer:
-        writer.add(f"{scenario}/ego_vehicle/002", [foreseen])
-    file = exported(
-        da, scenario, tmp_path, prediction=read_results(tmp_path / "results.json"), frames=[1, 2]
+    path = tmp_path / "results.json"
+    with ResultsWriter(path, "accident") as writer:
+        writer.add(sample_token(scenario, "ego_vehicle", 2), [accident])
+    results = read_results(path)
+    recording = export_small(
+        da,
+        scenario,
+        tmp_path,
+        prediction=results,
+        frames=[1, 2],
     )
-    ((record, message),) = file.messages["/ego_vehicle/prediction/accidents"]
+    ((record, message),) = recording.messages["/ego_vehicle/prediction/accidents"]
     (entity,) = message.entities
-    assert (record.log_time, entity.frame_id) == (
-        file.messages["/tf"][1][0].log_time,
-        "ego_vehicle",
-    )
-    places = [[sphere.pose.position.x, sphere.pose.position.y] for sphere in entity.spheres]
-    np.testing.assert_allclose(places, foreseen.positions)
+    second_transform, _ = recording.messages["/tf"][1]
+
+    assert record.log_time == second_transform.log_time
+    assert entity.frame_id == "ego_vehicle"
+
+    positions = [sphere.pose.position for sphere in entity.spheres]
+    np.testing.assert_allclose([[point.x, point.y] for point in positions], accident.positions)
     assert ("actor_ids", "3, 9") in [(pair.key, pair.value) for pair in entity.metadata]
 
 
@@ -505,42 +570,47 @@ def test_detected_boxes_are_drawn_in_their_own_frame(
     boxes = DetectedBoxes.from_arrays(
         [[5, 1, 0]], [[4, 2, 1.5]], [0.5], [0.9], category=["van"], frame="lidar"
     )
-    file = exported(da, scenario, tmp_path, prediction={f"{scenario}/ego_vehicle/002": boxes})
-    ((entity,),) = (message.entities for message in file.only("/ego_vehicle/prediction/boxes"))
+    token = sample_token(scenario, "ego_vehicle", 2)
+    recording = export_small(da, scenario, tmp_path, prediction={token: boxes})
+    (message,) = recording.decoded("/ego_vehicle/prediction/boxes")
+    (entity,) = message.entities
     cube = entity.cubes[0]
-    assert (entity.frame_id, cube.pose.position.x, cube.size.y) == (f"ego_vehicle/{LIDAR}", 5, 2)
-    cloud = xyz_of(cloud_of(file.only("/ego_vehicle/prediction/boxes/points")[0]))
-    assert (
-        np.linalg.norm(cloud[None] - boxes.boxes.corners()[0][:, None], axis=-1).min(axis=1) < 1e-4
-    ).all()
+
+    assert entity.frame_id == f"ego_vehicle/{LIDAR}"
+    assert (cube.pose.position.x, cube.size.y) == (5, 2)
+
+    cloud = read_cloud(recording.decoded("/ego_vehicle/prediction/boxes/points")[0])
+    offsets = read_positions(cloud)[None] - boxes.boxes.corners()[0][:, None]
+    distances_m = np.linalg.norm(offsets, axis=-1)
+    assert (distances_m.min(axis=1) < 1e-4).all()
 
 
-def test_unknown_scenarios_and_predictions_that_are_none_are_refused(
+def test_unknown_scenarios_and_invalid_predictions_are_refused(
     da: DeepAccident, scenario: str, tmp_path: Path
 ) -> None:
-    sample = f"{scenario}/ego_vehicle/002"
+    token = sample_token(scenario, "ego_vehicle", 2)
 
-    def predicted(prediction: Any, **choices: Any) -> Any:
-        return exported(da, scenario, tmp_path, prediction=prediction, **choices)
+    def export(prediction: Any, **choices: Any) -> McapFile:
+        return export_small(da, scenario, tmp_path, prediction=prediction, **choices)
 
-    assert_refused(
+    assert_raises(
         (
             lambda: export_mcap(da, "nowhere/nothing", tmp_path / "a.mcap"),
             TokenError,
             "no token 'nowhere/nothing'",
         ),
         (
-            lambda: predicted([sample]),
+            lambda: export([token]),
             ConfigError,
             ("prediction", "expected Results, or a mapping", "found list"),
         ),
         (
-            lambda: predicted({sample: "an accident"}),
+            lambda: export({token: "an accident"}),
             ConfigError,
             ("Accident or DetectedBoxes", "found str"),
         ),
         (
-            lambda: predicted({sample: []}, frames=[3]),
+            lambda: export({token: []}, frames=[3]),
             NotAvailableError,
             ("prediction", scenario, "agents and frames"),
         ),
@@ -552,48 +622,41 @@ def test_unknown_scenarios_and_predictions_that_are_none_are_refused(
 def test_without_the_extra_the_error_names_it(
     da: DeepAccident, scenario: str, tmp_path: Path, package: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    prefixes = ("deepaccident_devkit.export.mcap.", f"{package}.")
     for name in list(sys.modules):
-        if name.startswith(
-            ("deepaccident_devkit.export.mcap.", f"{package}.")
-        ) and not name.endswith(".config"):
+        if name.startswith(prefixes) and not name.endswith(".config"):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
-    assert_refused(
-        (
-            lambda: export_mcap(da, scenario, tmp_path / "a.mcap"),
-            MissingExtraError,
-            ("pip install '.[mcap]'",),
-        )
+
+    with pytest.raises(MissingExtraError, match=re.escape("pip install '.[mcap]'")):
+        export_mcap(da, scenario, tmp_path / "a.mcap")
+
+
+def test_the_command_exports_the_first_accident_or_a_chosen_scenario(
+    da: DeepAccident, scenario: str, tmp_path: Path
+) -> None:
+    token = da.scenario[1]["token"]
+    results = tmp_path / "results.json"
+    with ResultsWriter(results, "accident") as writer:
+        writer.add(sample_token(token, "ego_vehicle", 2), [])
+    options = (
+        *("--frame-range", "2..3", "--channels", LIDAR, "--points", 10),
+        *("--agents", "ego_vehicle,infrastructure"),
     )
 
+    def export(path: Path, *arguments: object) -> McapFile:
+        invoke_command("export", "mcap", da.dataroot, *arguments, "--out", path, *options)
+        return read_mcap(path)
 
-def test_the_verb_writes_what_is_asked_for(da: DeepAccident, tmp_path: Path) -> None:
-    token = da.scenario[1]["token"]
-    with ResultsWriter(tmp_path / "results.json", "accident") as writer:
-        writer.add(f"{token}/ego_vehicle/002", [])
-    words = [
-        "--frame-range",
-        "2..3",
-        "--channels",
-        LIDAR,
-        "--points",
-        "10",
-        "--agents",
-        "ego_vehicle,infrastructure",
-    ]
-    for name, chosen in (
-        ("first", []),
-        ("a", [token, "--results", str(tmp_path / "results.json")]),
-    ):
-        out = ["--out", str(tmp_path / f"{name}.mcap"), *words]
-        CliRunner().invoke(
-            export, ["mcap", str(da.dataroot), *chosen, *out], catch_exceptions=False
-        )
-    first, file = (read_mcap(tmp_path / f"{name}.mcap") for name in ("first", "a"))
-    accident = next(record["token"] for record in da.scenario if record["collision"] is not None)
-    told = [each.metadata["deepaccident_devkit"]["scenario"] for each in (first, file)]
-    assert (told, len(file.only("/tf"))) == ([accident, token], 2)
-    assert {topic for topic in file.messages if LIDAR in topic} == {
-        f"/{agent}/{LIDAR}/points" for agent in ("ego_vehicle", AGENTS[-1])
+    first = export(tmp_path / "first.mcap")
+
+    assert first.metadata["deepaccident_devkit"]["scenario"] == scenario
+
+    recording = export(tmp_path / "a.mcap", token, "--results", results)
+    assert recording.metadata["deepaccident_devkit"]["scenario"] == token
+    assert len(recording.decoded("/tf")) == 2
+    assert {topic for topic in recording.messages if LIDAR in topic} == {
+        f"/ego_vehicle/{LIDAR}/points",
+        f"/{AGENTS[-1]}/{LIDAR}/points",
     }
-    assert len(file.only("/ego_vehicle/prediction/accidents")) == 1
+    assert len(recording.decoded("/ego_vehicle/prediction/accidents")) == 1

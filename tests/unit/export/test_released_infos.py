@@ -1,21 +1,19 @@
-"""The released infos, read by a reader that knows the released code's conventions and not the
-devkit.
-"""
+"""Read the released infos by the released code's conventions, without the devkit."""
 
 import logging
 import pickle
 import shutil
-from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from refusals import assert_refused
+from support.box_points import count_points_in_box
+from support.command_calls import invoke_command
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli.export import export
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.export.bulk import Exported, export_release
 from deepaccident_devkit.export.released_infos import ReleasedInfos
@@ -24,76 +22,54 @@ from deepaccident_devkit.taxonomy import AGENTS
 pytestmark = pytest.mark.slow
 
 Info = dict[str, Any]
-FOLDER = "./data/DeepAccident_data"
+ROOT_PREFIX = "./data/DeepAccident_data"
 
 
 @pytest.fixture(scope="module")
 def exported(da: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Exported:
-    return export_release(
-        da, tmp_path_factory.mktemp("released") / "out", ReleasedInfos(), workers=2
-    )
+    out = tmp_path_factory.mktemp("released") / "out"
+    return export_release(da, out, ReleasedInfos(), workers=2)
 
 
-def infos(folder: Path, name: str = "val") -> list[Info]:
-    found: list[Info] = pickle.loads((folder / f"carla_infos_{name}.pkl").read_bytes())["infos"]
-    return found
-
-
-def points_in(box: np.ndarray, points: np.ndarray) -> int:
-    """As the released code has boxes: y to the right, a heading of (cos yaw, −sin yaw), full
-    lengths, centres.
-    """
-    x, y, z = (points - box[:3]).T
-    cos, sin = np.cos(box[6]), -np.sin(box[6])
-    length, width, height = box[3:6] / 2 + 1e-6
-    along, across = x * cos + y * sin, y * cos - x * sin
-    return int(
-        ((np.abs(along) <= length) & (np.abs(across) <= width) & (np.abs(z) <= height)).sum()
-    )
-
-
-def disagreement(da: DeepAccident, found: list[Info]) -> float:
-    """The share of seen boxes whose points in the release's own clouds are not as many as the
-    labels say.
-    """
-    wrong = total = 0
-    for info in found:
-        with np.load(
-            da.dataroot / Path(info["lidar_path"]).relative_to("data/DeepAccident_data")
-        ) as archive:
-            points = next(iter(archive.values()))[:, :3]
-        boxes = info["gt_boxes"]
-        seen = info["num_lidar_pts"] > 0
-        counts = np.array([points_in(box, points) for box in boxes[seen]])
-        wrong += int(
-            (
-                np.abs(counts - info["num_lidar_pts"][seen])
-                > 1 + 0.02 * info["num_lidar_pts"][seen]
-            ).sum()
-        )
-        total += int(seen.sum())
-    assert total > 100
-    return wrong / total
+def read_infos(folder: Path, name: str = "val") -> list[Info]:
+    content = pickle.loads((folder / f"carla_infos_{name}.pkl").read_bytes())
+    infos: list[Info] = content["infos"]
+    return infos
 
 
 def test_boxes_hold_the_points_that_their_labels_count(
     da: DeepAccident, exported: Exported
 ) -> None:
-    assert disagreement(da, infos(exported.folder)) == 0
+    """The released code has y to the right and a heading of (cos yaw, −sin yaw)."""
+    num_seen = 0
+    for info in read_infos(exported.folder):
+        path = Path(info["lidar_path"]).relative_to("data/DeepAccident_data")
+        with np.load(da.dataroot / path) as archive:
+            points = next(iter(archive.values()))[:, :3]
+        for box, expected in zip(info["gt_boxes"], info["num_lidar_pts"], strict=True):
+            if expected > 0:
+                right_handed_box = np.array([*box[:6], -box[6]])
+                count = count_points_in_box(right_handed_box, points, margin_m=1e-6)
+                assert abs(count - expected) <= 1 + 0.02 * expected
+                num_seen += 1
+
+    assert num_seen > 100
 
 
 def test_every_agents_keyframes_are_there_in_order(da: DeepAccident, exported: Exported) -> None:
     for split in ("train", "val"):
-        found = infos(exported.folder, split)
-        here = [record for record in da.scenario if record["split"] == split]
-        assert sorted(
-            (f"{each['scenario_type']}/{each['vehicle_name']}", each["timestamp"]) for each in found
-        ) == sorted(
-            (f"{record['scenario_type']}/{agent}", number)
-            for record in here
-            for agent in AGENTS
-            for number in (1, 6)
-        )
+        keyframes = []
+        for info in read_infos(exported.folder, split):
+            recording = f"{info['scenario_type']}/{info['vehicle_name']}"
+            keyframes.append((recording, info["timestamp"]))
+        expected = []
+        for record, agent in product(da.scenario, AGENTS):
+            if record["split"] == split:
+                recording = f"{record['scenario_type']}/{agent}"
+                expected += [(recording, 1), (recording, 6)]
+
+        assert sorted(keyframes) == sorted(expected)
+
     assert exported.tally.samples == 2 * len(AGENTS) * len(da.scenario)
 
 
@@ -112,94 +88,81 @@ def test_scenarios_of_no_split_or_without_labels_are_left_out_and_counted(
 ) -> None:
     shutil.rmtree(next(own_release.glob("train/*_normal")) / "infrastructure" / "label")
     dataset = DeepAccident("v1", own_release, verbose=False)
-    made = export_release(dataset, tmp_path / "out", ReleasedInfos(root_prefix="./DeepAccident"))
-    assert made.tally.left_out == {
+    done = export_release(dataset, tmp_path / "out", ReleasedInfos(root_prefix="./DeepAccident"))
+
+    assert done.tally.left_out == {
         "scenarios that are neither in train nor in val": 2,
         "scenarios without labels": 1,
     }
-    assert {info["scenario_type"] for info in infos(made.folder, "train")} == {
-        "type1_subtype1_accident"
-    }
+
+    train_types = {info["scenario_type"] for info in read_infos(done.folder, "train")}
+    assert train_types == {"type1_subtype1_accident"}
 
 
 def test_paths_lead_to_the_files_in_either_layout(
     da: DeepAccident, exported: Exported, da_b: DeepAccident, tmp_path: Path
 ) -> None:
-    made = export_release(da_b, tmp_path / "out", ReleasedInfos(root_prefix="./DeepAccident/"))
+    done = export_release(da_b, tmp_path / "out", ReleasedInfos(root_prefix="./DeepAccident/"))
     for dataset, folder, prefix in (
-        (da, exported.folder, FOLDER),
-        (da_b, made.folder, "./DeepAccident"),
+        (da, exported.folder, ROOT_PREFIX),
+        (da_b, done.folder, "./DeepAccident"),
     ):
-        info = infos(folder)[0]
+        info = read_infos(folder)[0]
         path = info["lidar_path"]
         assert path.startswith(prefix)
         assert path.split("/")[3] == info["scenario_type"]  # where the released code looks for it
-        calib = dataset.dataroot / f"{Path(path).relative_to(prefix)}".replace(
-            "lidar01", "calib"
-        ).replace(".npz", ".pkl")
-        assert calib.is_file()
+        cloud_path = str(Path(path).relative_to(prefix))
+        calib_path = cloud_path.replace("lidar01", "calib").replace(".npz", ".pkl")
+        assert (dataset.dataroot / calib_path).is_file()
 
 
 @pytest.mark.parametrize("drop", [False, True])
-def test_infos_without_boxes(
+def test_infos_without_boxes_are_listed_or_dropped(
     own_release: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, *, drop: bool
 ) -> None:
-    path = next(own_release.glob("val/*_accident/other_vehicle/label/*/*_004.txt"))
-    path.write_text(path.read_text().splitlines()[0])
-    dataset, listed = (
-        DeepAccident("v1", own_release, verbose=False),
-        tmp_path / "out/carla_infos_without_boxes.txt",
-    )
+    label = next(own_release.glob("val/*_accident/other_vehicle/label/*/*_004.txt"))
+    label.write_text(label.read_text().splitlines()[0])
+    dataset = DeepAccident("v1", own_release, verbose=False)
     form = ReleasedInfos(root_prefix="./DeepAccident", split="val", drop_empty=drop)
     with caplog.at_level(logging.WARNING):
-        made = export_release(dataset, tmp_path / "out", form)
-    boxless = [info["lidar_prefix"] for info in infos(made.folder) if not len(info["gt_boxes"])]
+        done = export_release(dataset, tmp_path / "out", form)
+
+    infos = read_infos(done.folder)
+    boxless = [info["lidar_prefix"] for info in infos if not len(info["gt_boxes"])]
+    boxless_list = tmp_path / "out" / "carla_infos_without_boxes.txt"
     if drop:
-        assert (made.tally.left_out, boxless, listed.exists()) == (
-            {"infos without boxes": 1},
-            [],
-            False,
-        )
+        assert done.tally.left_out == {"infos without boxes": 1}
+        assert boxless == []
+        assert not boxless_list.exists()
     else:
-        assert (
-            listed.read_text().splitlines()
-            == boxless
-            == [f"type1_subtype2_accident_other_vehicle_{path.stem}"]
-        )
-        assert ("1 infos have no boxes" in caplog.text, made.tally.left_out) == (True, {})
+        assert boxless == [f"type1_subtype2_accident_other_vehicle_{label.stem}"]
+        assert boxless_list.read_text().splitlines() == boxless
+        assert "1 infos have no boxes" in caplog.text
+        assert done.tally.left_out == {}
 
 
 def test_the_command_of_mmdet3d_has_the_style(da: DeepAccident, tmp_path: Path) -> None:
-    words = (
-        "--out",
-        str(tmp_path / "out"),
-        "--split",
-        "val",
-        "--style",
-        "released",
-        "--root-prefix",
-        "./a/b",
+    out = tmp_path / "out"
+    result = invoke_command(
+        *("export", "mmdet3d", da.dataroot, "--out", out, "--split", "val"),
+        *("--style", "released", "--root-prefix", "./a/b", "--workers", 1),
     )
-    run = CliRunner().invoke(export, ["mmdet3d", str(da.dataroot), *words, "--workers", "1"])
-    assert (run.exit_code, "20 samples: a few files to write" in run.output) == (0, True)
-    assert infos(tmp_path / "out")[0]["lidar_path"].startswith("./a/b/type1_")
-    assert not (tmp_path / "out" / "v1.0-deepaccident").exists()
+
+    assert "estimate for about 20 samples: a few files" in result.output
+    assert read_infos(out)[0]["lidar_path"].startswith("./a/b/type1_")
+    assert not (out / "v1.0-deepaccident").exists()
 
 
 @pytest.mark.parametrize(
-    ("opened", "prefix", "fitting"),
-    [("da", "data/DeepAccident_data/", FOLDER), ("da_b", FOLDER, "./DeepAccident")],
+    ("fixture", "prefix", "suggestion"),
+    [("da", "data/DeepAccident_data/", ROOT_PREFIX), ("da_b", ROOT_PREFIX, "./DeepAccident")],
 )
 def test_a_prefix_of_other_length_is_refused(
-    request: pytest.FixtureRequest, tmp_path: Path, opened: str, prefix: str, fitting: str
+    request: pytest.FixtureRequest, tmp_path: Path, fixture: str, prefix: str, suggestion: str
 ) -> None:
-    out, form = tmp_path / "out", ReleasedInfos(root_prefix=prefix)
-    export = partial(export_release, request.getfixturevalue(opened), out, form)
-    assert_refused(
-        (
-            export,
-            ChoiceError,
-            ("three parts before the scenario type", f"give {fitting}, or another"),
-        )
-    )
+    out = tmp_path / "out"
+    form = ReleasedInfos(root_prefix=prefix)
+    dataset = request.getfixturevalue(fixture)
+    parts = ("three parts before the scenario type", f"give {suggestion}, or another")
+    assert_raises((lambda: export_release(dataset, out, form), ChoiceError, parts))
     assert not out.exists()

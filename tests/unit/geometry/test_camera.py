@@ -4,16 +4,17 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ChoiceError, GeometryError
 from deepaccident_devkit.geometry import SE3, Boxes, BoxVisibility, PinholeCamera
 
 
-@pytest.mark.parametrize(("degrees", "focal"), [(70, 1142.5184), (110, 560.166)])
-def test_field_of_view_gives_the_releases_focal_lengths(degrees: float, focal: float) -> None:
+@pytest.mark.parametrize(("degrees", "focal_px"), [(70, 1142.5184), (110, 560.166)])
+def test_field_of_view_gives_the_releases_focal_lengths(degrees: float, focal_px: float) -> None:
     camera = PinholeCamera.from_field_of_view(1600, 900, np.radians(degrees))
-    assert_allclose(camera.intrinsic, [[focal, 0, 800], [0, focal, 450], [0, 0, 1]], atol=1e-3)
+    expected = [[focal_px, 0, 800], [0, focal_px, 450], [0, 0, 1]]
+    assert_allclose(camera.intrinsic, expected, atol=1e-3)
 
 
 def test_right_is_larger_u_and_down_is_larger_v() -> None:
@@ -23,7 +24,7 @@ def test_right_is_larger_u_and_down_is_larger_v() -> None:
     assert_array_equal(depth, [5, 5, 5, 10])
 
 
-def test_what_is_not_in_front_has_no_pixel() -> None:
+def test_a_point_that_is_not_in_front_has_no_pixel() -> None:
     camera = PinholeCamera.from_field_of_view(1600, 900, 1.2)
     pixels, depth = camera.project([[0, 0, 0], [1, 1, -3], [0, 0, 1]])
     assert_array_equal(np.isnan(pixels), [[True, True], [True, True], [False, False]])
@@ -39,26 +40,26 @@ def test_the_image_starts_at_zero_and_ends_before_its_size() -> None:
 
 
 def test_a_resized_camera_sees_the_same_parts_of_its_picture() -> None:
-    camera, points = (
-        PinholeCamera.from_field_of_view(1600, 900, 1.2),
-        np.array([[1.0, -2.0, 9.0], [-3.0, 0.5, 20.0]]),
-    )
-    smaller = camera.resized(400, 300)
-    assert (smaller.width, smaller.height) == (400, 300)
-    assert_allclose(smaller.project(points)[0] * [4, 3], camera.project(points)[0])
-    assert_allclose(smaller.project(points)[1], camera.project(points)[1])
+    camera = PinholeCamera.from_field_of_view(1600, 900, 1.2)
+    small_camera = camera.resized(400, 300)
+    points = np.array([[1.0, -2.0, 9.0], [-3.0, 0.5, 20.0]])
+    pixels, depth = camera.project(points)
+    smaller_pixels, smaller_depth = small_camera.project(points)
+
+    assert (small_camera.width, small_camera.height) == (400, 300)
+    assert_allclose(smaller_pixels * [4, 3], pixels)
+    assert_allclose(smaller_depth, depth)
 
 
 def test_in_image_by_depth_and_margin() -> None:
     camera = PinholeCamera.from_field_of_view(100, 50, 1.2)
     pixels = [[50, 25], [50, 25], [1, 25], [-1, 25], [98, 25], [99, 25]]
+    depth = [3, 1, 3, 3, 3, -3]
+
     assert_array_equal(
-        camera.in_image(pixels, [3, 1, 3, 3, 3, -3], min_depth=1),
-        [True, False, True, False, True, False],
+        camera.in_image(pixels, depth, min_depth=1), [True, False, True, False, True, False]
     )
-    assert_array_equal(
-        camera.in_image(pixels, [3, 1, 3, 3, 3, -3]), [True, True, True, False, True, False]
-    )
+    assert_array_equal(camera.in_image(pixels, depth), [True, True, True, False, True, False])
     assert_array_equal(camera.in_image(pixels, margin=1), [True, True, True, False, True, False])
     assert_array_equal(camera.in_image(pixels, margin=-1), [True] * 6)
     top_and_bottom = [[50, 0.5], [50, 1], [50, 48.5], [50, 49]]
@@ -68,8 +69,8 @@ def test_in_image_by_depth_and_margin() -> None:
 
 
 def test_a_box_is_seen_whole_in_part_or_not() -> None:
-    """Ahead; cut by the left edge; beside; behind; around the camera; with corners nearer than 1 m;
-    too large.
+    """The boxes are ahead; cut by the left edge; beside; behind; around the camera; with corners
+    nearer than 1 m; too large.
     """
     camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
     centers = [
@@ -84,6 +85,7 @@ def test_a_box_is_seen_whole_in_part_or_not() -> None:
     sizes = [[2, 2, 2], [2, 2, 2], [2, 2, 2], [2, 2, 2], [2, 2, 2], [1, 1, 1], [40, 40, 2]]
     boxes = Boxes.from_arrays(centers, sizes, np.zeros(7), frame="Camera_Front")
     whole, part, none = BoxVisibility.ALL, BoxVisibility.ANY, BoxVisibility.NONE
+
     assert_array_equal(camera.box_visibility(boxes), [whole, part, none, none, none, part, none])
     assert_array_equal(camera.boxes_in_image(boxes), [True, True, False, False, False, True, False])
     assert_array_equal(camera.boxes_in_image(boxes, whole), [True] + [False] * 6)
@@ -91,41 +93,40 @@ def test_a_box_is_seen_whole_in_part_or_not() -> None:
     assert camera.box_visibility(boxes.select([])).shape == (0,)
 
 
-def test_all_corners_must_be_a_little_in_front() -> None:
+def test_all_corners_must_be_at_least_0_1_m_in_front() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, np.pi / 2)
-    sizes = np.column_stack([np.ones((4, 2)), 3 - np.array([0.2, 0.11, 0.09, -0.05])])
-    boxes = Boxes.from_arrays(
-        np.column_stack([np.zeros((4, 2)), 3 - sizes[:, 2] / 2]),
-        sizes,
-        [0] * 4,
-        frame="Camera_Back",
-    )
+    nearest_depth = np.array([0.2, 0.11, 0.09, -0.05])
+    sizes = np.column_stack([np.ones((4, 2)), 3 - nearest_depth])
+    centers = np.column_stack([np.zeros((4, 2)), 3 - sizes[:, 2] / 2])
+    boxes = Boxes.from_arrays(centers, sizes, [0] * 4, frame="Camera_Back")
     assert_array_equal(camera.boxes_in_image(boxes), [True, True, False, False])
 
 
 def test_boxes_must_be_in_the_cameras_frame() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
     box = Boxes.from_arrays([[10, 0, 0]], [[2, 2, 2]], [0], frame="lidar")
-    others = [
-        replace(box, frame=frame)
-        for frame in ("world", "ego", "lidar", "lidar01", "BEV_instance_camera")
-    ]
-    assert_refused(
+    frames = ("world", "ego", "lidar", "lidar01", "BEV_instance_camera")
+
+    assert_raises(
         *[
-            (partial(call, other), GeometryError, (f"'{other.frame}'", "camera_from_source"))
+            (
+                partial(call, replace(box, frame=frame)),
+                GeometryError,
+                (f"'{frame}'", "camera_from_source"),
+            )
             for call in (camera.boxes_in_image, camera.box_visibility)
-            for other in others
+            for frame in frames
         ],
     )
-    assert camera.boxes_in_image(
-        box.transform(SE3.from_rotation([[0, -1, 0], [0, 0, -1], [1, 0, 0]]), "Camera_Front")
-    ).all()
+    camera_from_lidar = SE3.from_rotation([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    assert camera.boxes_in_image(box.transform(camera_from_lidar, "Camera_Front")).all()
 
 
-def test_cameras_and_pixels_that_cannot_be() -> None:
+def test_impossible_cameras_and_pixels_are_refused() -> None:
     camera = PinholeCamera(np.eye(3), np.int64(8), np.uint16(6))
-    assert (type(camera.width), camera.width, camera.height) == (int, 8, 6)
-    assert_refused(
+    assert type(camera.width) is int
+    assert (camera.width, camera.height) == (8, 6)
+    assert_raises(
         (
             lambda: PinholeCamera(np.eye(4), 10, 10),
             GeometryError,
@@ -136,35 +137,35 @@ def test_cameras_and_pixels_that_cannot_be() -> None:
         (lambda: camera.in_image(np.zeros((6, 2)), [1.0]), GeometryError, ("depth", "(6)")),
         *[
             (
-                partial(PinholeCamera, np.diag([wrong, 1, 1]), 10, 10),
+                partial(PinholeCamera, np.diag([focal_px, 1, 1]), 10, 10),
                 GeometryError,
                 "intrinsic: expected finite numbers",
             )
-            for wrong in (np.nan, np.inf)
+            for focal_px in (np.nan, np.inf)
         ],
         *[
             (
-                partial(PinholeCamera, np.eye(3), wrong, 10),
+                partial(PinholeCamera, np.eye(3), width, 10),
                 GeometryError,
                 "width: expected a whole number of pixels from 1, found",
             )
-            for wrong in (0, -3, 10.5, "10", None)
+            for width in (0, -3, 10.5, "10", None)
         ],
         *[
             (
-                partial(PinholeCamera.from_field_of_view, 10, wrong, 1.2),
+                partial(PinholeCamera.from_field_of_view, 10, height, 1.2),
                 GeometryError,
                 "height: expected a whole number of pixels from 1, found",
             )
-            for wrong in (0, -3, 10.5, "10", None)
+            for height in (0, -3, 10.5, "10", None)
         ],
         *[
             (
-                partial(PinholeCamera.from_field_of_view, 10, 10, wrong),
+                partial(PinholeCamera.from_field_of_view, 10, 10, angle),
                 GeometryError,
                 "horizontal: expected a field of view between 0 and π radians, found",
             )
-            for wrong in (0, np.pi, -1, np.nan)
+            for angle in (0, np.pi, -1, np.nan)
         ],
         (
             lambda: PinholeCamera.from_field_of_view(10, 10, "wide"),
@@ -174,23 +175,24 @@ def test_cameras_and_pixels_that_cannot_be() -> None:
     )
 
 
-def test_levels_that_do_not_exist() -> None:
+def test_visibility_levels_that_do_not_exist_are_refused() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
     box = Boxes.from_arrays([[0, 0, 10]], [[2, 2, 2]], [0], frame="Camera_Front")
+
     assert [(level.name, level.value) for level in BoxVisibility] == [
         ("ALL", 0),
         ("ANY", 1),
         ("NONE", 2),
     ]
     assert camera.boxes_in_image(box, 1)  # type: ignore[arg-type]
-    assert_refused(
+    assert_raises(
         *[
             (
-                partial(camera.boxes_in_image, box, wrong),
+                partial(camera.boxes_in_image, box, level),
                 ChoiceError,
                 r"level: expected one of BoxVisibility.ALL, BoxVisibility.ANY, .*found",
             )
-            for wrong in ("any", 3, None)
+            for level in ("any", 3, None)
         ],
         (
             lambda: camera.box_visibility(None),
@@ -200,7 +202,8 @@ def test_levels_that_do_not_exist() -> None:
     )
 
 
-def test_points_at_infinity_have_no_pixel_and_warn_of_nothing() -> None:
+def test_points_at_infinity_have_no_pixel_and_raise_no_warning() -> None:
     camera = PinholeCamera.from_field_of_view(100, 100, 1.2)
-    pixels, _ = camera.project([[np.inf, 0, 5], [0, 0, np.inf], [-np.inf, 1, -1], [0, np.nan, 1]])
+    points = [[np.inf, 0, 5], [0, 0, np.inf], [-np.inf, 1, -1], [0, np.nan, 1]]
+    pixels, _ = camera.project(points)
     assert not camera.in_image(pixels).any()

@@ -1,11 +1,11 @@
-"""Every default and constant of geometry, against what is written out here."""
+"""Every default and constant of geometry is the one written out here."""
 
 import numpy as np
-from written_out import written_out
+from support.default_values import package_values
 
 from deepaccident_devkit.geometry import SE3, BevGrid, Boxes, LidarPointCloud, PinholeCamera
 
-WRITTEN = {
+EXPECTED_DEFAULTS = {
     "bev_grid.ORIENTATIONS": "('devkit', 'released', 'fiery')",
     "bev_grid.BevGrid": "x=(-50.0, 50.0, 0.5), y=(-50.0, 50.0, 0.5), orientation='devkit'",
     "bev_grid.to_orientation": "ignore=None",
@@ -34,17 +34,13 @@ WRITTEN = {
 
 
 def test_every_default_and_constant_written_out() -> None:
-    assert written_out("deepaccident_devkit.geometry") == WRITTEN
-    nobody, pose = (
-        Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="Camera_Front"),
-        SE3.from_yaw(0.1),
-    )
-    cloud = LidarPointCloud(np.zeros((0, 3)), np.zeros(0)).transform(pose, "ego").crop(BevGrid())
+    assert package_values("deepaccident_devkit.geometry") == EXPECTED_DEFAULTS
+    no_boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="Camera_Front")
+    no_points = LidarPointCloud(np.zeros((0, 3)), np.zeros(0))
+    pose = SE3.from_yaw(0.1)
     camera = PinholeCamera.from_field_of_view(10, 10, 1.0)
-    assert [
-        len(nobody),
-        len(cloud),
-        len(camera.boxes_in_image(nobody)),
-        *nobody[:0].center.flat,
-    ] == [0] * 3
+    assert len(no_boxes) == 0
+    assert len(no_points.transform(pose, "ego").crop(BevGrid())) == 0
+    assert len(camera.boxes_in_image(no_boxes)) == 0
+    assert no_boxes[:0].center.size == 0
     assert len(pose.to_six()) == 6

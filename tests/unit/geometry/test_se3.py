@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pyquaternion import Quaternion
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import GeometryError
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud
@@ -26,29 +26,29 @@ def test_a_quarter_turn_to_the_left_and_a_step() -> None:
 
 def test_constructors_agree() -> None:
     quaternion = Quaternion(axis=(0, 0, 1), degrees=90)
-    want = SE3.from_rotation(QUARTER_LEFT, (1, 2, 3)).matrix
-    assert_allclose(SE3.from_quaternion(quaternion, (1, 2, 3)).matrix, want, atol=1e-15)
-    assert_allclose(SE3.from_quaternion(2.5 * quaternion, (1, 2, 3)).matrix, want, atol=1e-15)
-    assert_allclose(
-        SE3.from_quaternion([0.5**0.5, 0, 0, 0.5**0.5], (1, 2, 3)).matrix, want, atol=1e-15
-    )
-    assert_allclose(SE3.from_yaw(np.pi / 2, (1, 2, 3)).matrix, want, atol=1e-15)
+    expected = SE3.from_rotation(QUARTER_LEFT, (1, 2, 3)).matrix
+
+    assert_allclose(SE3.from_quaternion(quaternion, (1, 2, 3)).matrix, expected, atol=1e-15)
+    assert_allclose(SE3.from_quaternion(2.5 * quaternion, (1, 2, 3)).matrix, expected, atol=1e-15)
+    elements = [0.5**0.5, 0, 0, 0.5**0.5]
+    assert_allclose(SE3.from_quaternion(elements, (1, 2, 3)).matrix, expected, atol=1e-15)
+    assert_allclose(SE3.from_yaw(np.pi / 2, (1, 2, 3)).matrix, expected, atol=1e-15)
     assert_array_equal(SE3.identity().matrix, np.eye(4))
 
 
 def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
     pose = SE3.from_yaw(0.3, (1, 2, 3)).matrix
-    for kept in (12, 16):
-        assert_array_equal(
-            stored_transforms(np.tile(pose.ravel()[:kept], (2, 5, 1))), np.tile(pose, (2, 5, 1, 1))
-        )
+    expected = np.tile(pose, (2, 5, 1, 1))
+    for num_values in (12, 16):
+        stored = np.tile(pose.ravel()[:num_values], (2, 5, 1))
+        assert_array_equal(stored_transforms(stored), expected)
 
 
 @pytest.mark.parametrize(
-    ("fault", "message"),
+    ("value", "message"),
     [
         (np.eye(3), r"SE3.matrix: expected shape \(4, 4\), found \(3, 3\)"),
-        (np.diag([1.0, np.nan, 1, 1]), "holds NaN or infinity"),
+        (np.diag([1.0, np.nan, 1, 1]), "contains NaN or infinity"),
         (np.diag([1.0, -1, 1, 1]), "mirror image"),
         (np.diag([2.0, 2, 2, 1]), "not orthonormal"),
         (
@@ -60,9 +60,9 @@ def test_stored_transforms_have_the_last_row_of_every_transform() -> None:
         ("no matrix", r"SE3.matrix: expected an array of shape \(4, 4\)"),
     ],
 )
-def test_what_is_no_rigid_transform_is_refused(fault: object, message: str) -> None:
-    assert_refused(
-        (lambda: SE3(fault), GeometryError, message),
+def test_a_value_that_is_no_rigid_transform_is_refused(value: object, message: str) -> None:
+    assert_raises(
+        (lambda: SE3(value), GeometryError, message),
     )
 
 
@@ -75,34 +75,36 @@ def boxes() -> Boxes:
 
 def test_boxes_a_box_and_a_cloud_are_carried_along(boxes: Boxes) -> None:
     pose = SE3.from_rotation(QUARTER_LEFT, (10, 0, 1))
-    want = boxes.transform(pose, "ego")
-    for moved, frame in (
+    expected = boxes.transform(pose, "ego")
+    for moved_boxes, frame in (
         (pose @ boxes, "lidar"),
         (pose.apply(boxes), "lidar"),
         (pose.apply(boxes, frame="ego"), "ego"),
     ):
-        assert isinstance(moved, Boxes)
-        assert moved.frame == frame
-        assert_array_equal(moved.corners(), want.corners())
-        assert_array_equal(moved.velocity, want.velocity)
+        assert isinstance(moved_boxes, Boxes)
+        assert moved_boxes.frame == frame
+        assert_array_equal(moved_boxes.corners(), expected.corners())
+        assert_array_equal(moved_boxes.velocity, expected.velocity)
+
     box = Box(boxes[:1], "a/b")
-    for one, frame in ((pose @ box, "lidar"), (pose.apply(box, frame="ego"), "ego")):
-        assert (one.frame, one.token) == (frame, "a/b")
-        assert_array_equal(one.center, want.center[0])
-    cloud = pose.apply(LidarPointCloud(boxes.center, [1, 2]), frame="ego")
-    assert cloud.frame == "ego"
-    assert_array_equal(cloud.xyz, want.center)
-    assert_array_equal((pose @ LidarPointCloud(boxes.center, [1, 2])).xyz, want.center)
+    for moved_box, frame in ((pose @ box, "lidar"), (pose.apply(box, frame="ego"), "ego")):
+        assert (moved_box.frame, moved_box.token) == (frame, box.token)
+        assert_array_equal(moved_box.center, expected.center[0])
+
+    cloud = LidarPointCloud(boxes.center, [1, 2])
+    moved_cloud = pose.apply(cloud, frame="ego")
+    assert moved_cloud.frame == "ego"
+    assert_array_equal(moved_cloud.xyz, expected.center)
+    assert_array_equal((pose @ cloud).xyz, expected.center)
 
 
 def test_misuse_says_what_to_give(boxes: Boxes) -> None:
     pose = SE3.identity()
-    assert (
-        repr(SE3.from_yaw(np.float32(0.5), (1, -2, 3)))
-        == "SE3(translation=[1.000, -2.000, 3.000], yaw=0.5000)"
-    )
+    text = repr(SE3.from_yaw(np.float32(0.5), (1, -2, 3)))
+
+    assert text == "SE3(translation=[1.000, -2.000, 3.000], yaw=0.5000)"
     wrong_points = (None, "abc", object(), ["1", "2", "3"], [[1, 2], [1, 2, 3]], {})
-    assert_refused(
+    assert_raises(
         *[
             (
                 partial(move, points),
@@ -125,7 +127,11 @@ def test_misuse_says_what_to_give(boxes: Boxes) -> None:
             GeometryError,
             ("points: ", "found (3, 8); transpose it (.T)"),
         ),
-        (lambda: pose @ np.eye(4), GeometryError, ("found (4, 4); of a matrix (4, 4) make SE3",)),
+        (
+            lambda: pose @ np.eye(4),
+            GeometryError,
+            ("found (4, 4); make an SE3 from a matrix (4, 4)",),
+        ),
         (
             lambda: pose.rotate(np.zeros((3, 2))),
             GeometryError,
@@ -134,7 +140,7 @@ def test_misuse_says_what_to_give(boxes: Boxes) -> None:
         (
             lambda: pose.apply([1, 2, 3], frame="ego"),
             GeometryError,
-            ("frame: ", "carry no name", "'ego'"),
+            ("frame: ", "have no frame", "'ego'"),
         ),
         (
             lambda: pose.apply(boxes, frame=5),
@@ -142,61 +148,62 @@ def test_misuse_says_what_to_give(boxes: Boxes) -> None:
             ("frame: expected the name of a frame", "5"),
         ),
         *[
-            (partial(SE3.from_yaw, wrong), GeometryError, ("yaw: ", "angle in radians, found"))
-            for wrong in ("left", None, [0.1], np.nan)
+            (partial(SE3.from_yaw, yaw), GeometryError, ("yaw: ", "angle in radians, found"))
+            for yaw in ("left", None, [0.1], np.nan)
         ],
         *[
-            (partial(SE3.from_quaternion, wrong), GeometryError, ("quaternion: ",))
-            for wrong in (None, 7, "abcd", [None] * 4, (0, 0, 0, 0), (np.nan, 0, 0, 1), (1, 0, 0))
+            (partial(SE3.from_quaternion, elements), GeometryError, ("quaternion: ",))
+            for elements in (
+                *(None, 7, "abcd", [None] * 4),
+                *((0, 0, 0, 0), (np.nan, 0, 0, 1), (1, 0, 0)),
+            )
         ],
     )
 
 
-def test_points_at_infinity_warn_of_nothing() -> None:
+def test_points_at_infinity_raise_no_warning() -> None:
     pose = SE3.from_yaw(0.3)
-    assert not np.isfinite(pose.apply([[np.inf, 0, 0], [np.nan, 1, 2]])).all(axis=1).any()
+    points = pose.apply([[np.inf, 0, 0], [np.nan, 1, 2]])
+    assert not np.isfinite(points).all(axis=1).any()
     assert not np.isfinite(pose.rotate([np.inf, 0, 0])).all()
 
 
-def off_rotation(source: np.random.Generator, *, how: str) -> np.ndarray:
-    """A pose up to 600 m out whose rotation is as far from orthonormal as files have it."""
-    matrix = SE3.from_six([*source.uniform(-600, 600, 3), *source.uniform(-3, 3, 3)]).matrix
-    if how == "single":
-        return matrix.astype(np.float32)
-    if how == "rounded":
-        return matrix.round(4)
-    return matrix + np.pad(source.uniform(-2e-4, 2e-4, (3, 3)), (0, 1))
+def make_inexact_pose(rng: np.random.Generator, error: str) -> SE3:
+    """Return a pose up to 600 m out with a rotation as far from orthonormal as in files."""
+    matrix = SE3.from_six([*rng.uniform(-600, 600, 3), *rng.uniform(-3, 3, 3)]).matrix
+    if error == "single":
+        return SE3(matrix.astype(np.float32))
+    if error == "rounded":
+        return SE3(matrix.round(4))
+    return SE3(matrix + np.pad(rng.uniform(-2e-4, 2e-4, (3, 3)), (0, 1)))
 
 
-@pytest.mark.parametrize("how", ["single", "rounded", "coarse"])
-def test_ways_there_and_back_end_where_they_began_though_poses_are_rounded(how: str) -> None:
-    source = np.random.default_rng(0)
+@pytest.mark.parametrize("error", ["single", "rounded", "coarse"])
+def test_transforms_there_and_back_cancel_although_poses_are_rounded(error: str) -> None:
+    rng = np.random.default_rng(0)
     for _ in range(100):
-        a, b, c = (SE3(off_rotation(source, how=how)) for _ in range(3))
-        a_from_b, b_from_a = a.inverse() @ b, b.inverse() @ a
+        a, b, c = (make_inexact_pose(rng, error) for _ in range(3))
+        a_from_b = a.inverse() @ b
+        b_from_a = b.inverse() @ a
         assert_allclose((a_from_b @ b_from_a).matrix, np.eye(4), atol=1e-9)
         assert_allclose((a @ a.inverse()).matrix, np.eye(4), atol=1e-9)
-        points = source.uniform(-600, 600, (9, 3))
+
+        points = rng.uniform(-600, 600, (9, 3))
+        a_from_a_by_c = a_from_b @ (b.inverse() @ c) @ (c.inverse() @ a)
         assert_allclose(b_from_a.apply(a_from_b.apply(points)), points, atol=1e-9)
-        assert_allclose(
-            ((a.inverse() @ b) @ (b.inverse() @ c) @ (c.inverse() @ a)).apply(points),
-            points,
-            atol=1e-9,
-        )
-        boxes = Boxes.from_arrays(points, np.full((9, 3), 8.0), source.uniform(-3, 3, 9), frame="a")
-        assert_allclose(
-            boxes.transform(b_from_a, "b").transform(a_from_b, "a").corners(),
-            boxes.corners(),
-            atol=1e-5,
-        )
+        assert_allclose(a_from_a_by_c.apply(points), points, atol=1e-9)
+
+        boxes = Boxes.from_arrays(points, np.full((9, 3), 8.0), rng.uniform(-3, 3, 9), frame="a")
+        returned_boxes = boxes.transform(b_from_a, "b").transform(a_from_b, "a")
+        assert_allclose(returned_boxes.corners(), boxes.corners(), atol=1e-5)
 
 
 def test_a_rounded_pose_keeps_its_numbers_and_has_the_nearest_rotations_quaternion() -> None:
     turn = SE3.from_six([0, 0, 0, 0.4, -0.3, 2.0]).rotation
     stretch = np.eye(3) + 1e-4 * np.array([[1, 2, -1], [2, 0, 3], [-1, 3, -2]])
-    pose = SE3.from_rotation(
-        turn @ stretch
-    )  # a polar decomposition: the nearest rotation is `turn`
+    # a polar decomposition: the nearest rotation is `turn`
+    pose = SE3.from_rotation(turn @ stretch)
+
     assert_array_equal(pose.rotation, turn @ stretch)
     assert_allclose(pose.quaternion.rotation_matrix, turn, atol=1e-7)
     assert_allclose(pose.inverse().quaternion.rotation_matrix, turn.T, atol=1e-7)

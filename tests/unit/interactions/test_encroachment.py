@@ -29,13 +29,12 @@ def test_one_crosses_two_seconds_after_the_other() -> None:
 
 def test_the_window_ends_what_counts() -> None:
     assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.6) == math.inf
-    assert post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.8) == pytest.approx(
-        1.4
-    )
+    pet_s = post_encroachment_time(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.8)
+    assert pet_s == pytest.approx(1.4)
     assert math.isnan(conflict_area_pet(EAST, NORTH, TEN_EAST, TEN_NORTH, window=3.6))
 
 
-def test_who_stands_is_always_there() -> None:
+def test_a_standing_box_occupies_its_place_at_all_times() -> None:
     standing = np.array([0.0, 0.0, 4.0, 2.0, 0.3])
     assert post_encroachment_time(EAST, standing, TEN_EAST, STILL) == 0
     assert post_encroachment_time(standing, standing, STILL, STILL) == 0
@@ -47,43 +46,52 @@ def test_who_stands_is_always_there() -> None:
 
 
 def test_one_behind_the_other_follows_at_its_headway() -> None:
-    assert post_encroachment_time(
-        EAST, np.array([-40.0, 0.0, 4.0, 2.0, 0.0]), TEN_EAST, TEN_EAST
-    ) == pytest.approx(1.6)
+    follower = np.array([-40.0, 0.0, 4.0, 2.0, 0.0])
+    pet_s = post_encroachment_time(EAST, follower, TEN_EAST, TEN_EAST)
+    assert pet_s == pytest.approx(1.6)
 
 
-places = st.floats(-25, 25)
-boxes = st.tuples(places, places, st.floats(1, 12), st.floats(1, 3), st.floats(-7, 7)).map(np.array)
+coordinates = st.floats(-25, 25)
+boxes = st.tuples(
+    coordinates, coordinates, st.floats(1, 12), st.floats(1, 3), st.floats(-7, 7)
+).map(np.array)
 velocities = st.tuples(st.floats(-9, 9), st.floats(-9, 9)).map(np.array)
-WINDOW = 6.0
+WINDOW_S = 6.0
 
 
-def moved(box: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.ndarray:
-    return np.column_stack([box[:2] + times[:, None] * velocity, np.tile(box[2:], (len(times), 1))])
-
-
-@given(boxes, boxes, velocities, velocities)
-def test_as_a_grid_of_times_has_it(first, second, one, other) -> None:
-    found = post_encroachment_time(first, second, one, other, WINDOW)
-    times = np.linspace(0, WINDOW, 121)
-    gaps = gaps_of_pairs(moved(first, one, times)[:, None], moved(second, other, times)[None])
-    delays, touching = np.abs(times[None, :] - times[:, None]), gaps <= 0
-    if touching.any():
-        assert abs(found) <= delays[touching].min() + 1e-9
-    slack = (
-        gaps <= 0.05 * (np.hypot(*one) + np.hypot(*other)) + 1e-9
-    )  # what may touch between the grid's times
-    assert abs(found) >= (delays[slack].min() - 0.1 if slack.any() else np.inf) - 1e-9
+def move_box(box: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.ndarray:
+    centers = box[:2] + times[:, None] * velocity
+    return np.column_stack([centers, np.tile(box[2:], (len(times), 1))])
 
 
 @given(boxes, boxes, velocities, velocities)
-def test_it_is_0_where_they_touch_and_turns_with_the_pair(first, second, one, other) -> None:
-    found = post_encroachment_time(first, second, one, other, WINDOW)
-    assert post_encroachment_time(second, first, other, one, WINDOW) == pytest.approx(
-        -found if np.isfinite(found) else found, abs=1e-6
-    )
-    if time_to_collision(first, second, one, other) < WINDOW - 1e-6:
-        assert found == pytest.approx(0, abs=1e-6)
-    area = conflict_area_pet(first, second, one, other, WINDOW)
-    if found == math.inf:
-        assert math.isnan(area) or area > 0
+def test_as_a_grid_of_times_has_it(first, second, first_velocity, second_velocity) -> None:
+    pet_s = post_encroachment_time(first, second, first_velocity, second_velocity, WINDOW_S)
+    times = np.linspace(0, WINDOW_S, 121)
+    first_boxes = move_box(first, first_velocity, times)
+    second_boxes = move_box(second, second_velocity, times)
+    gaps = gaps_of_pairs(first_boxes[:, None], second_boxes[None])
+    delays = np.abs(times[None, :] - times[:, None])
+
+    if (gaps <= 0).any():
+        assert abs(pet_s) <= delays[gaps <= 0].min() + 1e-9
+    step_length = 0.05 * (np.hypot(*first_velocity) + np.hypot(*second_velocity))
+    may_touch = gaps <= step_length + 1e-9  # between two times of the grid
+    shortest_delay = delays[may_touch].min() - 0.1 if may_touch.any() else np.inf
+    assert abs(pet_s) >= shortest_delay - 1e-9
+
+
+@given(boxes, boxes, velocities, velocities)
+def test_it_is_0_where_they_touch_and_turns_with_the_pair(
+    first, second, first_velocity, second_velocity
+) -> None:
+    pet_s = post_encroachment_time(first, second, first_velocity, second_velocity, WINDOW_S)
+    swapped_pet_s = post_encroachment_time(second, first, second_velocity, first_velocity, WINDOW_S)
+    expected = -pet_s if np.isfinite(pet_s) else pet_s
+    assert swapped_pet_s == pytest.approx(expected, abs=1e-6)
+
+    if time_to_collision(first, second, first_velocity, second_velocity) < WINDOW_S - 1e-6:
+        assert pet_s == pytest.approx(0, abs=1e-6)
+    area_pet_s = conflict_area_pet(first, second, first_velocity, second_velocity, WINDOW_S)
+    if pet_s == math.inf:
+        assert math.isnan(area_pet_s) or area_pet_s > 0

@@ -27,77 +27,88 @@ from deepaccident_devkit.interactions import (
 CAR = np.array([0.0, 0.0, 4.0, 2.0, 0.0])
 AHEAD = np.array([24.0, 0.0, 4.0, 2.0, 0.0])
 CROSSING = np.array([13.0, -13.0, 4.0, 2.0, math.pi / 2])
-BESIDE = np.array([24.0, 2.5, 4.0, 2.0, 0.0])
-STILL, FIVE, TEN = np.zeros(2), np.array([5.0, 0.0]), np.array([10.0, 0.0])
-NORTH = np.array([0.0, 10.0])
+OTHER_LANE = np.array([24.0, 2.5, 4.0, 2.0, 0.0])
+STILL, FIVE_EAST, TEN_EAST = np.zeros(2), np.array([5.0, 0.0]), np.array([10.0, 0.0])
+TEN_NORTH = np.array([0.0, 10.0])
 UNKNOWN = np.full(2, np.nan)
 
 
 def test_behind_another_the_gap_counts_at_the_closing_speed() -> None:
-    assert time_to_collision_1d(CAR, AHEAD, TEN, FIVE) == pytest.approx(4)
-    assert drac_1d(CAR, AHEAD, TEN, FIVE) == pytest.approx(25 / 40)
-    assert drac(CAR, AHEAD, TEN, FIVE) == pytest.approx(5 / 8)
-    assert (
-        closing_speed(CAR, AHEAD, TEN, FIVE) == closing_speed_of_boxes(CAR, AHEAD, TEN, FIVE) == 5
-    )
-    assert relative_speed(TEN, NORTH) == pytest.approx(math.sqrt(200))
+    assert time_to_collision_1d(CAR, AHEAD, TEN_EAST, FIVE_EAST) == pytest.approx(4)
+    assert drac_1d(CAR, AHEAD, TEN_EAST, FIVE_EAST) == pytest.approx(25 / 40)
+    assert drac(CAR, AHEAD, TEN_EAST, FIVE_EAST) == pytest.approx(5 / 8)
+    assert closing_speed(CAR, AHEAD, TEN_EAST, FIVE_EAST) == 5
+    assert closing_speed_of_boxes(CAR, AHEAD, TEN_EAST, FIVE_EAST) == 5
+    assert relative_speed(TEN_EAST, TEN_NORTH) == pytest.approx(math.sqrt(200))
 
 
 def test_the_one_ahead_measures_the_same_behind_it() -> None:
-    assert time_to_collision_1d(AHEAD, CAR, FIVE, TEN) == pytest.approx(4)
-    assert time_to_collision_1d(AHEAD, CAR, TEN, FIVE) == math.inf
+    assert time_to_collision_1d(AHEAD, CAR, FIVE_EAST, TEN_EAST) == pytest.approx(4)
+    assert time_to_collision_1d(AHEAD, CAR, TEN_EAST, FIVE_EAST) == math.inf
 
 
 def test_one_dimension_sees_no_crossing_and_nobody_beside() -> None:
-    assert time_to_collision(CAR, CROSSING, TEN, NORTH) == pytest.approx(1)
-    assert time_to_collision_1d(CAR, CROSSING, TEN, NORTH) == math.inf
-    assert time_to_collision_1d(CAR, BESIDE, TEN, STILL) == math.inf
+    assert time_to_collision(CAR, CROSSING, TEN_EAST, TEN_NORTH) == pytest.approx(1)
+    assert time_to_collision_1d(CAR, CROSSING, TEN_EAST, TEN_NORTH) == math.inf
+    assert time_to_collision_1d(CAR, OTHER_LANE, TEN_EAST, STILL) == math.inf
+    assert drac_1d(CAR, OTHER_LANE, TEN_EAST, STILL) == 0
+    assert drac_1d(CAR, AHEAD, FIVE_EAST, TEN_EAST) == 0
+    assert drac(CAR, OTHER_LANE, TEN_EAST, STILL) == 0
     assert (
-        drac_1d(CAR, BESIDE, TEN, STILL)
-        == drac_1d(CAR, AHEAD, FIVE, TEN)
-        == drac(CAR, BESIDE, TEN, STILL)
-        == 0
+        modified_ttc_1d(CAR, OTHER_LANE, TEN_EAST, STILL, np.float64(1), np.float64(0)) == math.inf
     )
-    assert modified_ttc_1d(CAR, BESIDE, TEN, STILL, np.float64(1), np.float64(0)) == math.inf
+
+
+@pytest.mark.parametrize("angle", [0.7, 2.4, -1.2])
+def test_one_dimension_follows_the_heading_not_the_axes_of_the_world(angle: float) -> None:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    rotation = np.array([[cosine, -sine], [sine, cosine]])
+
+    def rotated(box: np.ndarray) -> np.ndarray:
+        return np.concatenate([rotation @ box[:2], box[2:4], [box[4] + angle]])
+
+    speeds = (rotation @ TEN_EAST, rotation @ FIVE_EAST)
+    same_lane = AHEAD + np.array([0.0, 1.5, 0.0, 0.0, 0.0])
+    assert time_to_collision_1d(rotated(CAR), rotated(same_lane), *speeds) == pytest.approx(4)
+    assert time_to_collision_1d(rotated(CAR), rotated(OTHER_LANE), *speeds) == math.inf
 
 
 def test_at_contact_there_is_no_time_and_no_brake_is_enough() -> None:
     touching = np.array([3.0, 0.5, 4.0, 2.0, 0.2])
-    assert (
-        time_to_collision_1d(CAR, touching, TEN, STILL),
-        time_to_collision_1d(CAR, touching, STILL, TEN),
-    ) == (0, 0)
-    assert drac_1d(CAR, touching, TEN, STILL) == drac(CAR, touching, STILL, STILL) == math.inf
-    assert modified_ttc_1d(CAR, touching, TEN, STILL, np.float64(0), np.float64(0)) == 0
-    assert math.isnan(closing_speed_of_boxes(CAR, touching, TEN, STILL))
-    assert math.isnan(closing_speed(CAR, CAR, TEN, STILL))
+    assert time_to_collision_1d(CAR, touching, TEN_EAST, STILL) == 0
+    assert time_to_collision_1d(CAR, touching, STILL, TEN_EAST) == 0
+    assert drac_1d(CAR, touching, TEN_EAST, STILL) == math.inf
+    assert drac(CAR, touching, STILL, STILL) == math.inf
+    assert modified_ttc_1d(CAR, touching, TEN_EAST, STILL, np.float64(0), np.float64(0)) == 0
+    assert math.isnan(closing_speed_of_boxes(CAR, touching, TEN_EAST, STILL))
+    assert math.isnan(closing_speed(CAR, CAR, TEN_EAST, STILL))
 
 
 def test_accelerations_along_one_line() -> None:
-    brakes = modified_ttc_1d(CAR, AHEAD, TEN, TEN, np.float64(0), np.float64(-2.5))
-    assert brakes == pytest.approx(4)  # 20 m = 2.5 t² / 2
-    assert modified_ttc_1d(CAR, AHEAD, TEN, FIVE, np.float64(-10), np.float64(0)) == math.inf
-    assert modified_ttc_1d(
-        CAR, AHEAD, TEN, FIVE, np.float64(1e-14), np.float64(0)
-    ) == pytest.approx(4)
-    # who brakes behind reverses in this definition, and the one ahead backs into it
-    assert modified_ttc_1d(AHEAD, CAR, TEN, FIVE, np.float64(-10), np.float64(0)) == pytest.approx(
-        (5 + math.sqrt(25 + 400)) / 10
-    )
+    def compute_mttc_s(first, second, first_velocity, second_velocity, *rates: float) -> float:
+        accelerations = map(np.float64, rates)
+        return modified_ttc_1d(first, second, first_velocity, second_velocity, *accelerations)
+
+    # 20 m = 2.5 t² / 2
+    assert compute_mttc_s(CAR, AHEAD, TEN_EAST, TEN_EAST, 0, -2.5) == pytest.approx(4)
+    assert compute_mttc_s(CAR, AHEAD, TEN_EAST, FIVE_EAST, -10, 0) == math.inf
+    assert compute_mttc_s(CAR, AHEAD, TEN_EAST, FIVE_EAST, 1e-14, 0) == pytest.approx(4)
+    # in this definition a car that brakes reverses at last, and so it backs into the one behind
+    expected_s = (5 + math.sqrt(25 + 400)) / 10
+    mttc_s = compute_mttc_s(AHEAD, CAR, TEN_EAST, FIVE_EAST, -10, 0)
+    assert mttc_s == pytest.approx(expected_s)
 
 
 def test_what_a_collision_would_do() -> None:
-    assert delta_v(TEN, -TEN, np.float64(1500), np.float64(9000)) == pytest.approx(
-        [20 * 9000 / 10500, 20 * 1500 / 10500]
-    )
+    changes = delta_v(TEN_EAST, -TEN_EAST, np.float64(1500), np.float64(9000))
+    assert changes == pytest.approx([20 * 9000 / 10500, 20 * 1500 / 10500])
     assert impact_heading(CAR, CROSSING) == pytest.approx(math.pi / 2)
-    assert impact_direction(CAR, TEN, NORTH) == pytest.approx(-math.pi / 4)
-    assert impact_direction(CROSSING, TEN, STILL) == pytest.approx(-math.pi / 2)
-    assert math.isnan(impact_direction(CAR, TEN, TEN))
+    assert impact_direction(CAR, TEN_EAST, TEN_NORTH) == pytest.approx(-math.pi / 4)
+    assert impact_direction(CROSSING, TEN_EAST, STILL) == pytest.approx(-math.pi / 2)
+    assert math.isnan(impact_direction(CAR, TEN_EAST, TEN_EAST))
     backwards = np.array([0.0, 0.0, 4.0, 2.0, math.pi])
-    assert (
-        impact_heading(CAR, backwards) == impact_heading(backwards, CAR) == pytest.approx(math.pi)
-    )
+    assert impact_heading(CAR, backwards) == impact_heading(backwards, CAR)
+    assert impact_heading(CAR, backwards) == pytest.approx(math.pi)
 
 
 def test_time_below_a_threshold() -> None:
@@ -116,7 +127,7 @@ def test_an_unknown_velocity_makes_no_number() -> None:
         closing_speed,
         closing_speed_of_boxes,
     ):
-        for velocities in ((UNKNOWN, TEN), (TEN, UNKNOWN)):
+        for velocities in ((UNKNOWN, TEN_EAST), (TEN_EAST, UNKNOWN)):
             assert math.isnan(measure(CAR, AHEAD, *velocities)), measure.__name__
 
 
@@ -129,14 +140,15 @@ velocities = st.tuples(st.floats(-15, 15), st.floats(-15, 15)).map(np.array)
 
 @given(boxes, boxes, velocities, velocities)
 def test_pairs_are_symmetric(first, second, first_velocity, second_velocity) -> None:
-    there = (first, second, first_velocity, second_velocity)
-    back = (second, first, second_velocity, first_velocity)
     for measure in (time_to_collision, closing_speed, drac):
-        assert measure(*there) == pytest.approx(measure(*back), rel=1e-6, abs=1e-9, nan_ok=True)
+        value = measure(first, second, first_velocity, second_velocity)
+        swapped_value = measure(second, first, second_velocity, first_velocity)
+        assert value == pytest.approx(swapped_value, rel=1e-6, abs=1e-9, nan_ok=True)
     assert gaps_of_pairs(first, second) == pytest.approx(gaps_of_pairs(second, first), abs=1e-9)
-    assert impact_heading(first, second) == pytest.approx(
-        -impact_heading(second, first), abs=1e-9
-    ) or abs(impact_heading(first, second)) == pytest.approx(math.pi)
+
+    heading = impact_heading(first, second)
+    is_opposite = heading == pytest.approx(-impact_heading(second, first), abs=1e-9)
+    assert is_opposite or abs(heading) == pytest.approx(math.pi)
 
 
 @given(boxes, boxes, velocities, velocities)
@@ -148,10 +160,9 @@ def test_the_gap_shrinks_at_the_boxes_closing_speed(
     if np.isnan(speed):
         assert gap == 0
         return
-    step = 1e-7
-    moved = [
-        np.concatenate([box[:2] + step * velocity, box[2:]])
-        for box, velocity in ((first, first_velocity), (second, second_velocity))
-    ]
+    step_s = 1e-7
+    moved_first = np.concatenate([first[:2] + step_s * first_velocity, first[2:]])
+    moved_second = np.concatenate([second[:2] + step_s * second_velocity, second[2:]])
     if gap > 1e-3:
-        assert (gap - gaps_of_pairs(*moved)) / step == pytest.approx(speed, abs=1e-2)
+        moved_gap = gaps_of_pairs(moved_first, moved_second)
+        assert (gap - moved_gap) / step_s == pytest.approx(speed, abs=1e-2)

@@ -1,4 +1,4 @@
-"""A release whose BEV cameras can be taken away, and the generator's own roads beneath it."""
+"""A release with BEV cameras that a test may remove, and the generator's roads beneath it."""
 
 import os
 import shutil
@@ -18,8 +18,8 @@ from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import CAMERAS, LIDAR
 
 
-def copied(release_root: Path, root: Path) -> Path:
-    """A copy of the release with labels, calib, meta and BEV cameras."""
+def copy_release(release_root: Path, root: Path) -> Path:
+    """Copy the labels, calib, meta and BEV cameras of the release."""
     shutil.copytree(
         release_root,
         root,
@@ -31,30 +31,29 @@ def copied(release_root: Path, root: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def bev_release(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """The session's release with its BEV cameras and an index of its own, beside which maps are
-    kept.
-    """
-    root = copied(release_root, tmp_path_factory.mktemp("maps") / "release")
+    """The session's release with its BEV cameras and its own index, beside which maps are kept."""
+    root = copy_release(release_root, tmp_path_factory.mktemp("maps") / "release")
     return DeepAccident("v1", root, verbose=False)
 
 
 @pytest.fixture
 def own_bev_release(release_root: Path, tmp_path: Path) -> DeepAccident:
-    """The same, whose files a test may remove (written to, they would change the session's)."""
-    return DeepAccident("v1", copied(release_root, tmp_path / "release"), verbose=False)
+    """The same, with files that a test may remove; to write them would change the session's."""
+    return DeepAccident("v1", copy_release(release_root, tmp_path / "release"), verbose=False)
 
 
 @pytest.fixture(scope="session")
 def town(bev_release: DeepAccident) -> str:
     """The town of the first accident and its twin, which no other scenario shares."""
     first = bev_release.scenario[0]
-    same = bev_release.field2token("scenario", "town", first["town"])
-    assert [bev_release.get("scenario", token)["name"] for token in same] == [first["name"]] * 2
+    tokens = bev_release.field2token("scenario", "town", first["town"])
+    names = [bev_release.get("scenario", token)["name"] for token in tokens]
+    assert names == [first["name"]] * 2
     return str(first["town"])
 
 
 @pytest.fixture(scope="session")
-def mapped(bev_release: DeepAccident, town: str) -> TownMap:
+def mapped_town(bev_release: DeepAccident, town: str) -> TownMap:
     """The map of that town."""
     return town_map(bev_release, town, workers=1)
 
@@ -72,12 +71,11 @@ def world(bev_release: DeepAccident) -> World:
 
 @pytest.fixture(scope="session")
 def true_codes(world: World) -> Callable[[FloatArray], FloatArray]:
-    """The codes of the generator's ground at points (N, 2) in world."""
-    turned = world.world_from_ground.matrix[:2, :2]
+    """A function that returns the codes of the generator's ground at points (N, 2) in world."""
+    rotation = world.world_from_ground.matrix[:2, :2]
 
-    def at(xy: FloatArray) -> FloatArray:
-        return world.ground.at(
-            (xy - world.world_from_ground.translation[:2]) @ np.linalg.inv(turned).T
-        )
+    def codes_at(xy: FloatArray) -> FloatArray:
+        offsets = xy - world.world_from_ground.translation[:2]
+        return world.ground.at(offsets @ np.linalg.inv(rotation).T)
 
-    return at
+    return codes_at

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, FieldError, GeometryError
 from deepaccident_devkit.geometry import BevGrid
@@ -17,9 +17,9 @@ from deepaccident_devkit.motion.batch_names import HEAD_NAMES, MAPS, config_from
 NAMES = ("fiery", "beverse", "deepaccident")
 
 
-def made(**changes) -> MotionLabels:
-    """Two cars, one of which turns, on a grid that is not square; the last frame is beyond the
-    recording.
+def make_labels(**changes) -> MotionLabels:
+    """Draw two cars, one of them turning, on a grid that is not square; the last frame is beyond
+    the recording.
     """
     config = MotionLabelConfig(grid=BevGrid((-20, 30, 0.5), (-20, 20, 0.5)), **changes)
     frames = [
@@ -34,30 +34,33 @@ def made(**changes) -> MotionLabels:
         )
         for t in range(config.future_frames)
     ]
-    return motion_labels_from_boxes(
-        [*frames, None], np.random.default_rng(0).normal(0, 0.02, (config.frames, 6)), config
-    )
+    egomotion = np.random.default_rng(0).normal(0, 0.02, (config.frames, 6))
+    return motion_labels_from_boxes([*frames, None], egomotion, config)
 
 
 @pytest.mark.parametrize("orientation", ["devkit", "released", "fiery"])
 @pytest.mark.parametrize("names", NAMES)
 def test_a_batch_read_back_is_the_same_labels(names, orientation) -> None:
-    labels = made(orientation=orientation)
-    back = MotionLabels.from_batch(labels.as_batch(names), labels.config, names)
-    for name in (*MAPS, "future_egomotion"):
-        assert_array_equal(getattr(back, name), getattr(labels, name))
-        assert getattr(back, name).dtype == getattr(labels, name).dtype
-    assert_array_equal(back.valid, labels.valid if names != "fiery" else np.ones(7))
-    assert not back.at_present
-    assert MotionLabels.from_batch(
-        labels.as_batch(names), labels.config, names, at_present=True
-    ).at_present
+    labels = make_labels(orientation=orientation)
+    batch = labels.as_batch(names)
+
+    loaded = MotionLabels.from_batch(batch, labels.config, names)
+
+    for field in (*MAPS, "future_egomotion"):
+        assert_array_equal(getattr(loaded, field), getattr(labels, field))
+        assert getattr(loaded, field).dtype == getattr(labels, field).dtype
+    assert_array_equal(loaded.valid, labels.valid if names != "fiery" else np.ones(7))
+    assert not loaded.at_present
+    present = MotionLabels.from_batch(batch, labels.config, names, at_present=True)
+    assert present.at_present
 
 
 def test_fierys_batch() -> None:
     """Rows ahead, past frames in front (empty), segmentation with a channel."""
-    labels = made(orientation="fiery")
+    labels = make_labels(orientation="fiery")
+
     batch = labels.as_batch("fiery")
+
     assert list(batch) == [*MAPS, "future_egomotion"]
     assert {name: batch[name].shape for name in MAPS} == {
         "segmentation": (7, 1, 100, 80),
@@ -66,7 +69,8 @@ def test_fierys_batch() -> None:
         "offset": (7, 2, 100, 80),
         "flow": (7, 2, 100, 80),
     }
-    assert (batch["segmentation"].dtype, batch["instance"].dtype) == (np.int64, np.int64)
+    assert batch["segmentation"].dtype == np.int64
+    assert batch["instance"].dtype == np.int64
     assert not batch["instance"][:2].any()
     assert (batch["flow"][:2] == 255).all()
     assert_array_equal(batch["offset"][2:], labels.offset)
@@ -74,8 +78,11 @@ def test_fierys_batch() -> None:
 
 
 def test_beverses_and_deepaccidents_batches() -> None:
-    labels = made(orientation="devkit")
-    beverse, deepaccident = labels.as_batch("beverse"), labels.as_batch("deepaccident")
+    labels = make_labels(orientation="devkit")
+
+    beverse = labels.as_batch("beverse")
+    deepaccident = labels.as_batch("deepaccident")
+
     for batch in (beverse, deepaccident):
         assert list(batch) == [
             "motion_segmentation",
@@ -91,23 +98,22 @@ def test_beverses_and_deepaccidents_batches() -> None:
         assert batch["motion_segmentation"].shape == (5, 80, 100)
     assert_array_equal(beverse["instance_flow"], labels.flow)
     assert_array_equal(deepaccident["motion_instance"], labels.instance[:, ::-1])
-    assert_array_equal(deepaccident["instance_offset"], made(orientation="released").offset)
-    assert_array_equal(
-        deepaccident["future_egomotions"],
-        flip_six_vector(labels.future_egomotion).astype(np.float32),
-    )
+    released = make_labels(orientation="released")
+    assert_array_equal(deepaccident["instance_offset"], released.offset)
+    flipped_egomotion = flip_six_vector(labels.future_egomotion).astype(np.float32)
+    assert_array_equal(deepaccident["future_egomotions"], flipped_egomotion)
 
 
 def test_labels_answer_to_the_names_of_the_heads() -> None:
-    labels = made()
+    labels = make_labels()
     for ours, head in HEAD_NAMES.items():
         assert getattr(labels, head) is getattr(labels, ours)
 
 
 def test_batches_that_do_not_fit_are_refused() -> None:
-    labels = made()
+    labels = make_labels()
     batch = labels.as_batch("beverse")
-    assert_refused(
+    assert_raises(
         (
             lambda: labels.as_batch("stp3"),
             ChoiceError,
@@ -159,7 +165,7 @@ def test_settings_of_the_other_codes() -> None:
         (0, 30, 0.15), (-30, 15, 0.15)
     )
     assert config_from_names({}, "beverse") == MotionLabelConfig.preset("beverse")
-    assert_refused(
+    assert_raises(
         (
             lambda: config_from_names({"grid_conf": {"ybound": 3}}, "deepaccident"),
             ConfigError,

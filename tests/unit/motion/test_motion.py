@@ -1,8 +1,8 @@
-"""Every default and constant of motion, against what is written out here."""
+"""Compare every default and constant of motion with the values written out here."""
 
 import numpy as np
-from refusals import assert_refused
-from written_out import written_out
+from support.default_values import package_values
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import LabelFilesError
 from deepaccident_devkit.geometry import BevGrid
@@ -78,12 +78,17 @@ WRITTEN = {
 
 
 def test_every_default_and_constant_written_out() -> None:
-    assert written_out("deepaccident_devkit.motion") == WRITTEN
+    assert package_values("deepaccident_devkit.motion") == WRITTEN
+
     labels = motion_labels_from_boxes([None] * 5, np.zeros((7, 6)))
-    assert not predict_instances(MotionHeads.from_labels(labels.to_present())).instance.any()
+    heads = MotionHeads.from_labels(labels.to_present())
+    assert not predict_instances(heads).instance.any()
     assert not labels.as_batch("beverse")["motion_instance"].any()
+
     image = BevImage(np.zeros(BEV_SHAPE, dtype=np.uint8), np.zeros(BEV_SHAPE, dtype=np.uint16))
-    assert not segmentation_of(image, BevGrid((-1, 1, 1), (-1, 1, 1))).masks.any()
-    assert_refused(
+    targets = segmentation_of(image, BevGrid((-1, 1, 1), (-1, 1, 1)))
+    assert not targets.masks.any()
+
+    assert_raises(
         (lambda: LabelFiles("nowhere"), LabelFilesError, ("nowhere",)),
     )

@@ -1,5 +1,5 @@
-"""`da.motion_labels`: what the tables of a release give, from its first frame to its last, or in
-part.
+"""Check `da.motion_labels`: labels from the tables of a release, from its first frame to its last,
+or of a part of it.
 """
 
 from dataclasses import replace
@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import plain_fiery
 import pytest
-import tiny
 from numpy.testing import assert_array_equal
 from pyquaternion import Quaternion
-from refusals import assert_refused
+from support import plain_fiery, tiny_release
+from support.expected_errors import assert_raises
+from support.tiny_release_index import open_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, TokenError
@@ -30,18 +30,21 @@ from deepaccident_devkit.taxonomy import AGENTS, LIDAR
 from deepaccident_devkit.v2x.cooperation import visible_actors
 
 MAPS = ("segmentation", "instance", "centerness", "offset", "flow")
-EGO, POLE = f"{tiny.TOKEN}/ego_vehicle", f"{tiny.TOKEN}/infrastructure"
-VAN, LATER, WALKER = 1300, 1301, 1302
+EGO = f"{tiny_release.SCENARIO_TOKEN}/ego_vehicle"
+POLE = f"{tiny_release.SCENARIO_TOKEN}/infrastructure"
+VAN = 1300
+LATE_CAR = 1301
+WALKER = 1302
 
 
-def lines(agent: str, frame: int) -> list[str]:
-    """tiny's own row and van; a car that nobody sees before frame 11, a pedestrian and two
+def make_lines(agent: str, frame: int) -> list[str]:
+    """Return tiny's own row and van, a car that nobody sees before frame 11, a pedestrian and two
     untracked cars.
     """
     seen = frame >= 11
     return [
-        *tiny.label_lines(agent, frame)[:-1],
-        f"car 14.0 7.0 -1.0 4.5 1.9 1.5 0.0 0.0 0.0 {LATER} {9 * seen} {seen}",
+        *tiny_release.label_lines(agent, frame)[:-1],
+        f"car 14.0 7.0 -1.0 4.5 1.9 1.5 0.0 0.0 0.0 {LATE_CAR} {9 * seen} {seen}",
         f"pedestrian 6.0 -5.0 -0.9 0.6 0.6 1.86 0.0 0.0 0.0 {WALKER} 9 True",
         "car -20.0 10.0 -1.0 4.5 1.9 1.5 0.0 0.0 0.0 -1 99 True",
         "car -20.0 -10.0 -1.0 4.5 1.9 1.5 0.0 0.0 0.0 -1 99 True",
@@ -50,21 +53,17 @@ def lines(agent: str, frame: int) -> list[str]:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    return opened(
-        tiny.write_tiny_release(
-            tmp_path_factory.mktemp("tiny") / "release", frames=31, lines_of=lines
-        )
-    )
+    root = tmp_path_factory.mktemp("tiny") / "release"
+    tiny_release.write_tiny_release(root, frames=31, lines_of=make_lines)
+    return open_release(root)
 
 
-def opened(root: Path) -> DeepAccident:
-    return DeepAccident(dataroot=root, verbose=False, workers=1)
-
-
-def drawn(labels: MotionLabels, actor: int) -> list[int]:
-    """In how many cells an actor is drawn, frame by frame."""
-    number = labels.id_map.get(actor, 0)
-    return [int((frame == number).sum()) if number else 0 for frame in labels.instance]
+def count_cells(labels: MotionLabels, actor: int) -> list[int]:
+    """Count the cells that an actor is drawn in, frame by frame."""
+    if actor not in labels.id_map:
+        return [0] * len(labels.instance)
+    is_actor = labels.instance == labels.id_map[actor]
+    return is_actor.sum(axis=(1, 2)).tolist()
 
 
 @pytest.mark.slow
@@ -86,58 +85,70 @@ def drawn(labels: MotionLabels, actor: int) -> list[int]:
 def test_it_draws_what_boxes_poses_and_visible_actors_say(
     da_motion: DeepAccident, config: MotionLabelConfig
 ) -> None:
-    """The same through the public calls, a moment at a time; of one sample, and of many whatever
-    lies beside them.
+    """Labels are the same through the public calls, a moment at a time; of one sample, and of many
+    whatever lies beside them.
     """
-    places = [(scenario["token"], agent) for scenario in da_motion.scenario for agent in AGENTS]
+    recordings = [(scenario["token"], agent) for scenario in da_motion.scenario for agent in AGENTS]
     records = [
-        da_motion.get_sample(*place, number) for number in (1, 13, 26, 35) for place in places
+        da_motion.get_sample(*recording, number)
+        for number in (1, 13, 26, 35)
+        for recording in recordings
     ]
     for record, labels in zip(records, da_motion.motion_labels_of(records, config), strict=True):
-        assert_same(labels, by_public_calls(da_motion, record, config))
-    assert_same(da_motion.motion_labels(records[-1], config), labels)
+        assert_same_labels(labels, draw_by_public_calls(da_motion, record, config))
+    assert_same_labels(da_motion.motion_labels(records[-1], config), labels)
 
 
-def by_public_calls(release: DeepAccident, record: dict, config: MotionLabelConfig) -> MotionLabels:
-    recording, number = record["token"].rsplit("/", 1)
+def draw_by_public_calls(
+    release: DeepAccident, record: dict, config: MotionLabelConfig
+) -> MotionLabels:
+    recording, present = record["token"].rsplit("/", 1)
     length = release.get("scenario", record["scenario_token"])["num_frames"]
-    numbers = [
-        int(number) + offset for offset in (*config.offsets, config.offsets[-1] + config.step)
-    ]
-    tokens = [f"{recording}/{one:03d}" if 1 <= one <= length else None for one in numbers]
-    poses = [np.eye(4) if one is None else release.world_from(one, "ego").matrix for one in tokens]
+    tokens = []
+    poses = []
+    for offset in (*config.offsets, config.offsets[-1] + config.step):
+        number = int(present) + offset
+        if 1 <= number <= length:
+            token = f"{recording}/{number:03d}"
+            tokens.append(token)
+            poses.append(release.world_from(token, "ego").matrix)
+        else:
+            tokens.append(None)
+            poses.append(np.eye(4))
+
     frames = []
     for token in tokens[config.receptive_field - 1 : -1]:
         if token is None:
             frames.append(None)
             continue
-        boxes, rows = release.boxes(token, "lidar"), release.annotation_rows(token)
-        actors = boxes.actor_id
-        seen = (
-            visible_actors(release, token, agents=config.agents)
-            if config.filter_invisible
-            else actors
-        )
-        columns = {
-            name: getattr(boxes, name) for name in ("center", "size", "actor_id", "category")
-        }
+        boxes = release.boxes(token, "lidar")
+        rows = release.annotation_rows(token)
+        visible = np.ones(len(boxes.actor_id), dtype=bool)
+        if config.filter_invisible:
+            seen = visible_actors(release, token, agents=config.agents)
+            visible = np.isin(boxes.actor_id, seen)
         frames.append(
             FrameBoxes(
-                **columns,
+                center=boxes.center,
+                size=boxes.size,
+                actor_id=boxes.actor_id,
+                category=boxes.category,
                 yaw=release.columns("annotation")["yaw"][rows],
-                visible=np.isin(actors, seen),
+                visible=visible,
                 ego_from_lidar=release.ego_from(token, LIDAR).matrix,
             )
         )
-    there = [token is not None for token in tokens]
-    motion, is_vehicle = egomotion(poses, there, config.rules), record["agent"] != "infrastructure"
-    return motion_labels_from_boxes(frames, motion, config, valid=there[:-1], is_vehicle=is_vehicle)
+
+    valid = [token is not None for token in tokens]
+    motion = egomotion(poses, valid, config.rules)
+    is_vehicle = record["agent"] != "infrastructure"
+    return motion_labels_from_boxes(frames, motion, config, valid=valid[:-1], is_vehicle=is_vehicle)
 
 
-def assert_same(one: MotionLabels, other: MotionLabels) -> None:
+def assert_same_labels(labels: MotionLabels, expected: MotionLabels) -> None:
     for name in (*MAPS, "future_egomotion", "valid"):
-        assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
-    assert dict(one.id_map) == dict(other.id_map)
+        assert_array_equal(getattr(labels, name), getattr(expected, name), err_msg=name)
+    assert dict(labels.id_map) == dict(expected.id_map)
 
 
 def test_labels_of_the_first_frame(small: DeepAccident) -> None:
@@ -150,14 +161,12 @@ def test_labels_of_the_first_frame(small: DeepAccident) -> None:
 
 @pytest.mark.parametrize("number", [12, 26, 27, 31])
 def test_labels_of_the_last_frames(small: DeepAccident, number: int) -> None:
-    there = [number + 5 * step <= 31 for step in range(-2, 5)]
-    after = [number + 5 * step <= 31 for step in range(-1, 6)]
+    valid = [number + 5 * step <= 31 for step in range(-2, 5)]
+    next_is_valid = [number + 5 * step <= 31 for step in range(-1, 6)]
     for protocol, mark in (("released", 0), ("clean", 255)):
         labels = small.motion_labels(f"{EGO}/{number:03d}", MotionLabelConfig(protocol=protocol))
-        assert (labels.valid.tolist(), labels.future_egomotion.any(axis=1).tolist()) == (
-            there,
-            after,
-        )
+        assert labels.valid.tolist() == valid
+        assert labels.future_egomotion.any(axis=1).tolist() == next_is_valid
         missing = ~labels.label_valid
         for name in ("segmentation", "instance", "centerness"):
             assert (getattr(labels, name)[missing] == mark).all()
@@ -178,16 +187,16 @@ def test_a_step_and_a_past_that_leave_the_recording(small: DeepAccident) -> None
 
 
 def test_own_row_only_as_the_egos_own_box(small: DeepAccident) -> None:
-    """−101 and never −100, whether unseen actors are left out or not."""
+    """Its id is −101 and never −100, whether unseen actors are left out or not."""
+    middle = np.s_[:, 96:104, 94:106]
     for filtered in (True, False):
         for protocol in ("released", "clean"):
             config = MotionLabelConfig(filter_invisible=filtered, protocol=protocol)
             with_ego = small.motion_labels(f"{EGO}/006", config)
             without = small.motion_labels(f"{EGO}/006", replace(config, draw_ego=False))
             assert -100 not in with_ego.id_map
-            assert min(drawn(with_ego, OWN_BOX_ID)) > 20
+            assert min(count_cells(with_ego, OWN_BOX_ID)) > 20
             assert {*with_ego.id_map} - {*without.id_map} == {OWN_BOX_ID}
-            middle = np.s_[:, 96:104, 94:106]
             assert with_ego.segmentation[middle].any(axis=(1, 2)).all()
             assert not without.segmentation[middle].any()
 
@@ -200,30 +209,29 @@ def test_the_pole_has_no_own_box(small: DeepAccident) -> None:
 
 
 def test_untracked_actors_are_seen_by_nobody(small: DeepAccident) -> None:
-    for protocol in ("released", "clean"):
-        assert (
-            not small.motion_labels(f"{EGO}/006", MotionLabelConfig(protocol=protocol))
-            .segmentation[:, 70:130, 50:70]
-            .any()
-        )
-        everybody = small.motion_labels(
-            f"{EGO}/006", MotionLabelConfig(protocol=protocol, filter_invisible=False)
-        )
-        left = [len(np.unique(frame[70:130, 50:70])) - 1 for frame in everybody.instance]
-        assert left == [1 if protocol == "released" else 2] * 5
+    around_untracked = np.s_[:, 70:130, 50:70]
+    for protocol, instances_per_frame in (("released", 1), ("clean", 2)):
+        config = MotionLabelConfig(protocol=protocol)
+        seen = small.motion_labels(f"{EGO}/006", config)
+        assert not seen.segmentation[around_untracked].any()
+
+        unfiltered = small.motion_labels(f"{EGO}/006", replace(config, filter_invisible=False))
+        for frame in unfiltered.instance[around_untracked]:
+            assert len(np.unique(frame)) - 1 == instances_per_frame
 
 
-def test_whose_sight_counts(tmp_path: Path) -> None:
-    """The van is seen by the pole alone."""
+def test_an_actor_is_drawn_if_a_chosen_agent_sees_it(tmp_path: Path) -> None:
+    """The van is seen only by the pole."""
 
-    def seen_by_pole(agent: str, frame: int) -> list[str]:
-        return [
-            line.replace(" 12 True", " 0 False") if agent != "infrastructure" else line
-            for line in tiny.label_lines(agent, frame)
-        ]
+    def make_lines_seen_by_pole(agent: str, frame: int) -> list[str]:
+        lines = tiny_release.label_lines(agent, frame)
+        if agent != "infrastructure":
+            lines = [line.replace(" 12 True", " 0 False") for line in lines]
+        return lines
 
-    release = opened(tiny.write_tiny_release(tmp_path, lines_of=seen_by_pole))
-    for agents, there in {
+    root = tiny_release.write_tiny_release(tmp_path, lines_of=make_lines_seen_by_pole)
+    release = open_release(root)
+    for agents, is_drawn in {
         None: True,
         "all": True,
         "+infrastructure": True,
@@ -232,20 +240,22 @@ def test_whose_sight_counts(tmp_path: Path) -> None:
         "vehicles": False,
         ("ego_vehicle", "other_vehicle"): False,
     }.items():
-        assert (
-            VAN in release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents)).id_map
-        ) == there, agents
+        labels = release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=agents))
+        assert (VAN in labels.id_map) == is_drawn, agents
 
 
 def test_ids_go_on_from_the_sample_before(small: DeepAccident) -> None:
-    """As a worker of the released code has them; what nobody met before comes behind."""
-    assert {*small.motion_labels(f"{EGO}/001").id_map} == {OWN_BOX_ID, VAN, WALKER}
-    before = {VAN: 1, 4711: 2}
-    second = small.motion_labels(f"{EGO}/016", id_map=before)
-    assert (dict(second.id_map), before) == (
-        {VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATER: 4, WALKER: 5},
-        {VAN: 1, 4711: 2},
-    )
+    """A worker of the released code keeps its ids; actors that it has not met yet come after
+    them.
+    """
+    first = small.motion_labels(f"{EGO}/001")
+    assert {*first.id_map} == {OWN_BOX_ID, VAN, WALKER}
+
+    previous_ids = {VAN: 1, 4711: 2}
+    second = small.motion_labels(f"{EGO}/016", id_map=previous_ids)
+    assert dict(second.id_map) == {VAN: 1, 4711: 2, OWN_BOX_ID: 3, LATE_CAR: 4, WALKER: 5}
+    assert previous_ids == {VAN: 1, 4711: 2}
+
     fresh = small.motion_labels(f"{EGO}/016")
     for actor, number in fresh.id_map.items():
         assert_array_equal(fresh.instance == number, second.instance == second.id_map[actor])
@@ -254,35 +264,41 @@ def test_ids_go_on_from_the_sample_before(small: DeepAccident) -> None:
 
 
 def test_vectors_turn_with_their_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The ego turns by 40 degrees within 2 s: at the present, a cell and its offset still lead to
-    one place.
+    """The ego turns by 40 degrees within 2 s; at the present, all cells of the van and their
+    offsets must still lead to one point.
 
-    The released ones lead elsewhere, the farther the longer the van.
+    The released ones do not, and miss it the more the longer the van is.
     """
-    monkeypatch.setattr(tiny, "ego_to_world", lambda _agent, frame: tiny.pose(2.0 * frame))
-    release, errors = opened(tiny.write_tiny_release(tmp_path, frames=31)), {}
+    monkeypatch.setattr(
+        tiny_release, "ego_to_world", lambda _agent, frame: tiny_release.pose(2.0 * frame)
+    )
+    release = open_release(tiny_release.write_tiny_release(tmp_path, frames=31))
+
+    spreads = {}
     for protocol in ("released", "clean"):
-        labels = release.motion_labels(
-            f"{EGO}/003", MotionLabelConfig(protocol=protocol)
-        ).to_present()
-        assert min(drawn(labels, VAN)) > 20
-        errors[protocol] = [spread(labels, t, VAN) for t in range(5)]
-    assert errors["released"][0] == 0 < min(errors["released"][2:]), errors
-    assert errors["released"][4] > 2, errors
-    assert max(errors["clean"]) <= 1, errors
+        labels = release.motion_labels(f"{EGO}/003", MotionLabelConfig(protocol=protocol))
+        present = labels.to_present()
+        assert min(count_cells(present, VAN)) > 20
+        spreads[protocol] = [measure_spread(present, t, VAN) for t in range(5)]
+
+    assert spreads["released"][0] == 0 < min(spreads["released"][2:]), spreads
+    assert spreads["released"][4] > 2, spreads
+    assert max(spreads["clean"]) <= 1, spreads
 
 
-def spread(labels: MotionLabels, t: int, actor: int) -> float:
-    """How far apart, in cells, the places are that an actor's cells and their offsets lead to: half
-    of the longer.
+def measure_spread(labels: MotionLabels, t: int, actor: int) -> float:
+    """Measure, in cells, how far the centres that an actor's cells and offsets lead to spread from
+    their middle.
     """
     cells = np.argwhere(labels.instance[t] == labels.id_map[actor])
-    return float(np.ptp(cells + labels.offset[t][:, cells[:, 0], cells[:, 1]].T, axis=0).max()) / 2
+    rows, columns = cells.T
+    centers = cells + labels.offset[t][:, rows, columns].T
+    return float(np.ptp(centers, axis=0).max()) / 2
 
 
 def test_a_sample_without_a_label(tmp_path: Path) -> None:
-    release = opened(tiny.write_tiny_release(tmp_path, labelled=False))
-    assert_refused(
+    release = open_release(tiny_release.write_tiny_release(tmp_path, labelled=False))
+    assert_raises(
         (
             lambda: release.motion_labels(f"{EGO}/002"),
             NotAvailableError,
@@ -292,122 +308,112 @@ def test_a_sample_without_a_label(tmp_path: Path) -> None:
 
 
 def test_agents_of_a_partial_release(tmp_path: Path) -> None:
-    two = opened(
-        tiny.write_tiny_release(tmp_path, agents=("ego_vehicle", "infrastructure"), lines_of=lines)
+    agents = ("ego_vehicle", "infrastructure")
+    release = open_release(
+        tiny_release.write_tiny_release(tmp_path, agents=agents, lines_of=make_lines)
     )
-    assert VAN in two.motion_labels(f"{EGO}/002").id_map
-    assert (
-        VAN in two.motion_labels(f"{EGO}/002", MotionLabelConfig(agents="+infrastructure")).id_map
-    )
-    assert_refused(
-        *[
+    for config in (
+        None,
+        MotionLabelConfig(agents="+infrastructure"),
+        MotionLabelConfig(agents="+other", filter_invisible=False),
+    ):
+        assert VAN in release.motion_labels(f"{EGO}/002", config).id_map
+
+    for missing_agents in ("+other", "all", ("ego_vehicle", "other_vehicle")):
+        config = MotionLabelConfig(agents=missing_agents)
+        assert_raises(
             (
-                partial(two.motion_labels, f"{EGO}/002", MotionLabelConfig(agents=agents)),
+                partial(release.motion_labels, f"{EGO}/002", config),
                 NotAvailableError,
                 r"agents: other_vehicle\w* is not in this release|behind is not",
-            )
-            for agents in ("+other", "all", ("ego_vehicle", "other_vehicle"))
-        ],
-    )
-    assert (
-        VAN
-        in two.motion_labels(
-            f"{EGO}/002", MotionLabelConfig(agents="+other", filter_invisible=False)
-        ).id_map
-    )
+            ),
+        )
 
 
 def test_what_is_no_sample_and_agents_that_do_not_exist(small: DeepAccident) -> None:
-    assert_refused(
-        *[
+    for sample in ("", "nothing", f"{EGO}/0", f"{EGO}/2", f"{EGO}/099", None, 3, {"token": 3}):
+        assert_raises(
             (
                 partial(small.motion_labels, sample),
                 TokenError,
                 r"no token|expected a token or a record",
-            )
-            for sample in (
-                "",
-                "nothing",
-                f"{EGO}/0",
-                f"{EGO}/2",
-                f"{EGO}/099",
-                None,
-                3,
-                {"token": 3},
-            )
-        ],
+            ),
+        )
+    for agents in ("everybody", ("pole",), ()):
+        assert_raises(
+            (partial(MotionLabelConfig, agents=agents), ChoiceError, r"agents?: expected"),
+        )
+    assert_raises(
         (lambda: small.motion_labels_of(f"{EGO}/001"), ChoiceError, "put it into a list"),
-        *[
-            (lambda wrong=wrong: MotionLabelConfig(agents=wrong), ChoiceError, r"agents?: expected")
-            for wrong in ("everybody", ("pole",), ())
-        ],
     )
 
 
 def test_an_agent_without_labels_sees_nothing(tmp_path: Path) -> None:
-    tiny.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
-    release = opened(tiny.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
-    assert {*release.motion_labels(f"{EGO}/002").id_map} == {OWN_BOX_ID, VAN}
-    assert {
-        *release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",))).id_map
-    } == {OWN_BOX_ID}
+    tiny_release.write_tiny_release(tmp_path, agents=("infrastructure",), labelled=False)
+    release = open_release(tiny_release.write_tiny_release(tmp_path, agents=("ego_vehicle",)))
+
+    all_agents = release.motion_labels(f"{EGO}/002")
+    assert {*all_agents.id_map} == {OWN_BOX_ID, VAN}
+
+    pole_only = release.motion_labels(f"{EGO}/002", MotionLabelConfig(agents=("infrastructure",)))
+    assert {*pole_only.id_map} == {OWN_BOX_ID}
 
 
 def test_a_label_without_boxes(tmp_path: Path) -> None:
-    release = opened(tiny.write_tiny_release(tmp_path, lines_of=lambda _agent, _frame: ["0.0 0.0"]))
+    release = open_release(
+        tiny_release.write_tiny_release(tmp_path, lines_of=lambda _agent, _frame: ["0.0 0.0"])
+    )
     released = release.motion_labels(f"{EGO}/002")
     assert {*released.id_map} == {OWN_BOX_ID}  # the default box
-    for token, config in (
-        (f"{EGO}/002", MotionLabelConfig(protocol="clean")),
-        (f"{POLE}/002", None),
-    ):
-        labels = release.motion_labels(token, config)
+
+    clean = release.motion_labels(f"{EGO}/002", MotionLabelConfig(protocol="clean"))
+    pole = release.motion_labels(f"{POLE}/002")
+    for labels in (clean, pole):
         assert not labels.id_map
         assert not labels.instance[0].any()
         assert (labels.offset == 255).all()
 
 
-def leaning(agent: str, frame: int):
-    """Up to 16° of lean; agents turn while they drive."""
-    pose = tiny.pose(0, x=12.0 * tiny.AGENTS.index(agent) + 0.3 * frame, y=-4.0, z=0.5)
-    turn = Quaternion(axis=(0, 0, 1), degrees=35 + 3 * frame) * Quaternion(
-        axis=(0, 1, 0), degrees=13
-    )
-    pose[:3, :3] = (turn * Quaternion(axis=(1, 0, 0), degrees=9 - frame / 3)).rotation_matrix
+def make_leaning_pose(agent: str, frame: int) -> np.ndarray:
+    """Return the pose of an agent that leans by up to 16° and turns while it drives."""
+    x = 12.0 * tiny_release.AGENTS.index(agent) + 0.3 * frame
+    yaw = Quaternion(axis=(0, 0, 1), degrees=35 + 3 * frame)
+    pitch = Quaternion(axis=(0, 1, 0), degrees=13)
+    roll = Quaternion(axis=(1, 0, 0), degrees=9 - frame / 3)
+
+    pose = tiny_release.pose(0, x=x, y=-4.0, z=0.5)
+    pose[:3, :3] = (yaw * pitch * roll).rotation_matrix
     return pose
 
 
-def lines_around(agent: str, frame: int) -> list[str]:
-    """Cars around the agent; it sees some of them always, some at times, some never, and others see
-    those.
+def make_lines_around(agent: str, frame: int) -> list[str]:
+    """Place cars around the agent; it sees some always, some at times and some never, and the other
+    agents may see them.
     """
-    own, later = agent != "infrastructure", frame > 12
-    return [
-        *tiny.label_lines(agent, frame)[:-1],
-        *(
-            f"{kind} {x} {y} -1.1 {4.4 + width:.3f} {width} 1.7 {angle} 0.0 0.0 "
-            f"{actor} {points} {seen}"
-            for kind, x, y, width, angle, actor, points, seen in (
-                ("car", 14.03 + frame / 7, 7.1, 1.9, 0.4, 1301, 90, later),
-                ("truck", 31.01, -19.3, 2.6, -1.2, 1302, 90, not own),
-                ("cyclist", -8.2, 3.3, 0.6, 2.2, 1303, 0, True),
-                ("pedestrian", 6.0, -5.0, 0.6, 0.1, 1304, 90, True),
-                ("car", -20.0, 10.0, 1.9, 0.7, -1, 90, True),
-                ("car", -20.0, -10.0, 1.9, 1.7, -1, 90, later),
-                ("van", 40.2, 36.9, 2.1, -2.8, 1305, 0, True),
-            )
-        ),
-    ]
+    is_vehicle = agent != "infrastructure"
+    is_late = frame > 12
+    lines = tiny_release.label_lines(agent, frame)[:-1]
+    for kind, x, y, width, yaw, actor, points, seen in (
+        ("car", 14.03 + frame / 7, 7.1, 1.9, 0.4, 1301, 90, is_late),
+        ("truck", 31.01, -19.3, 2.6, -1.2, 1302, 90, not is_vehicle),
+        ("cyclist", -8.2, 3.3, 0.6, 2.2, 1303, 0, True),
+        ("pedestrian", 6.0, -5.0, 0.6, 0.1, 1304, 90, True),
+        ("car", -20.0, 10.0, 1.9, 0.7, -1, 90, True),
+        ("car", -20.0, -10.0, 1.9, 1.7, -1, 90, is_late),
+        ("van", 40.2, 36.9, 2.1, -2.8, 1305, 0, True),
+    ):
+        size = f"{4.4 + width:.3f} {width} 1.7"
+        lines.append(f"{kind} {x} {y} -1.1 {size} {yaw} 0.0 0.0 {actor} {points} {seen}")
+    return lines
 
 
 @pytest.fixture(scope="module")
 def slope(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    root = tmp_path_factory.mktemp("slope") / "release"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiny, "ego_to_world", leaning)
-        root = tiny.write_tiny_release(
-            tmp_path_factory.mktemp("slope") / "release", frames=28, lines_of=lines_around
-        )
-    return DeepAccident(dataroot=root, verbose=False, workers=1)
+        patch.setattr(tiny_release, "ego_to_world", make_leaning_pose)
+        tiny_release.write_tiny_release(root, frames=28, lines_of=make_lines_around)
+    return open_release(root)
 
 
 @pytest.mark.parametrize("filter_invisible", [True, False])
@@ -415,23 +421,22 @@ def slope(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
 def test_it_draws_as_fierys_class(slope: DeepAccident, agent: str, filter_invisible: bool) -> None:
     config = MotionLabelConfig.preset("fiery", filter_invisible=filter_invisible)
     for number in (1, 5, 13, 24):
-        token = f"{tiny.TOKEN}/{agent}/{number:03d}"
+        token = f"{tiny_release.SCENARIO_TOKEN}/{agent}/{number:03d}"
         labels = slope.motion_labels(token, config)
         expected = plain_fiery.instances(slope, token, filter_invisible=filter_invisible)
-        inner = (labels.label_valid, plain_fiery.INNER, plain_fiery.INNER)
+        inner = (labels.label_valid, plain_fiery.INNER_MARGIN, plain_fiery.INNER_MARGIN)
         assert_array_equal(labels.instance[inner], expected[inner])
 
 
-def test_its_choices_are_fields(slope: DeepAccident) -> None:
+def test_the_choices_of_fierys_class_are_fields(slope: DeepAccident) -> None:
     fiery = PRESETS["fiery"]
-    assert (fiery.agents, fiery.rules.sight, fiery.rules.pose) == ("single", "camera", "yaw")
-    others = {
-        (rules.sight, rules.pose) for name, rules in LABEL_PROTOCOLS.items() if name != "fiery"
-    }
-    assert (others, MotionLabelConfig.from_dict(fiery.as_dict())) == (
-        {("released", "whole")},
-        fiery,
-    )
-    assert {"sight", "pose"}.isdisjoint(MotionLabelConfig().as_dict()["protocol"]), (
-        "digests of older files stay"
-    )
+    assert fiery.agents == "single"
+    assert fiery.rules.sight == "camera"
+    assert fiery.rules.pose == "yaw"
+    for name, rules in LABEL_PROTOCOLS.items():
+        if name != "fiery":
+            assert (rules.sight, rules.pose) == ("released", "whole")
+    assert MotionLabelConfig.from_dict(fiery.as_dict()) == fiery
+
+    protocol_fields = MotionLabelConfig().as_dict()["protocol"]
+    assert {"sight", "pose"}.isdisjoint(protocol_fields), "digests of older files stay"

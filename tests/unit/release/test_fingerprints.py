@@ -1,4 +1,4 @@
-"""Hashes of a scenario's label, meta and calib files."""
+"""Check the hashes of a scenario's label, meta and calib files."""
 
 import os
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import IndexStoreError, ReleaseError
@@ -20,8 +20,8 @@ from deepaccident_devkit.release.fingerprints import (
 )
 
 
-def first(root: Path, kind: str, ending: str) -> Path:
-    return min(root.glob(f"train/*_accident/ego_vehicle/{kind}/*/*.{ending}"))
+def find_first_label(root: Path) -> Path:
+    return min(root.glob("train/*_accident/ego_vehicle/label/*/*.txt"))
 
 
 @pytest.fixture
@@ -29,8 +29,9 @@ def scenario(da_b: DeepAccident) -> str:
     return min(da_b.split_scenarios("train"))
 
 
-def folder_of(root: Path, scenario: str) -> ScenarioFolder:
-    return next(folder for folder in find_release(root).scenarios if folder.token == scenario)
+def find_folder(root: Path, scenario: str) -> ScenarioFolder:
+    folders = {folder.token: folder for folder in find_release(root).scenarios}
+    return folders[scenario]
 
 
 @pytest.mark.parametrize(
@@ -44,31 +45,36 @@ def folder_of(root: Path, scenario: str) -> ScenarioFolder:
 def test_one_file_changes_one_hash_and_the_index_is_refused(
     own_release: Path, scenario: str, kind: str, pattern: str
 ) -> None:
-    """Hashes are of the files that the index was made from: of others there are none."""
-    opened = DeepAccident(dataroot=own_release, verbose=False)
-    before = scenario_hashes(opened, [scenario])[scenario]
-    assert (
-        opened.indexed_hashes(scenario) == before == folder_hashes(folder_of(own_release, scenario))
-    )
+    """Hashes describe the files that the index was made from; other files have none."""
+    release = DeepAccident(dataroot=own_release, verbose=False)
+    folder = find_folder(own_release, scenario)
+    before = folder_hashes(folder)
+    assert release.indexed_hashes(scenario) == before
+    assert scenario_hashes(release, [scenario])[scenario] == before
+
     path = min(own_release.glob(f"train/*_accident/{pattern}"))
     path.write_bytes(path.read_bytes()[:-1] + b" ")
-    changed = folder_hashes(folder_of(own_release, scenario)).as_dict()
-    assert [name for name, value in before.as_dict().items() if changed[name] != value] == [kind]
-    named = (
+
+    after = folder_hashes(find_folder(own_release, scenario)).as_dict()
+    changed_kinds = [name for name, value in before.as_dict().items() if after[name] != value]
+    assert changed_kinds == [kind]
+    words = (
         str(own_release),
         "the index is out of date",
         scenario,
         "deepaccident check index DATAROOT",
     )
-    assert_refused((lambda: scenario_hashes(opened, [scenario]), IndexStoreError, named))
-    others = opened.split_scenarios("val")
-    assert list(scenario_hashes(opened, others)) == sorted(others)
+    assert_raises((lambda: scenario_hashes(release, [scenario]), IndexStoreError, words))
+    validation = release.split_scenarios("val")
+    assert list(scenario_hashes(release, validation)) == sorted(validation)
 
 
-def points_changed(path: Path, change: Callable[[list[int]], list[int]]) -> None:
+def change_points(path: Path, change: Callable[[list[int]], list[int]]) -> None:
+    """Change the LiDAR points of all boxes in a label file."""
     lines = [line.split(" ") for line in path.read_text().split("\n")]
-    rows = [words for words in lines if len(words) == 13]
-    for words, count in zip(rows, change([int(words[11]) for words in rows]), strict=True):
+    boxes = [words for words in lines if len(words) == 13]
+    counts = change([int(words[11]) for words in boxes])
+    for words, count in zip(boxes, counts, strict=True):
         words[11] = str(count)
     path.write_text("\n".join(map(" ".join, lines)))
 
@@ -85,56 +91,65 @@ def points_changed(path: Path, change: Callable[[list[int]], list[int]]) -> None
 def test_only_few_points_more_or_less_are_alike(
     own_release: Path, scenario: str, change: Callable[[list[int]], list[int]], is_like: bool
 ) -> None:
-    folder = folder_of(own_release, scenario)
+    folder = find_folder(own_release, scenario)
     before = folder_hashes(folder)
-    points_changed(first(own_release, "label", "txt"), change)
+
+    change_points(find_first_label(own_release), change)
+
     after = folder_hashes(folder)
     assert before != after
-    assert (before.is_like(after), after.is_like(before)) == (is_like, is_like)
+    assert before.is_like(after) == is_like
+    assert after.is_like(before) == is_like
     assert before.boxes == after.boxes
 
 
 def test_other_boxes_or_unknown_ones_are_not_alike(own_release: Path, scenario: str) -> None:
-    folder = folder_of(own_release, scenario)
+    folder = find_folder(own_release, scenario)
     before = folder_hashes(folder)
     unknown = ScenarioHashes(**before.as_dict())
     assert before.is_like(unknown)
     assert unknown.is_like(before)
-    path = first(own_release, "label", "txt")
+
+    path = find_first_label(own_release)
     words = path.read_text().split(" ")
-    path.write_text(" ".join([*words[:5], "9" + words[5], *words[6:]]))
+    words[5] = "9" + words[5]
+    path.write_text(" ".join(words))
+
     after = folder_hashes(folder)
     assert after.points == before.points
-    assert not any(
-        mine.is_like(after) for mine in (before, unknown, replace(before, label=after.label))
-    )
+    assert not before.is_like(after)
+    assert not unknown.is_like(after)
+    assert not replace(before, label=after.label).is_like(after)
     assert not before.is_like(None)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
 def test_a_file_that_cannot_be_read_is_named(own_release: Path, scenario: str) -> None:
-    opened = DeepAccident(dataroot=own_release, verbose=False)
-    path = first(own_release, "label", "txt")
+    release = DeepAccident(dataroot=own_release, verbose=False)
+    path = find_first_label(own_release)
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(
         ReleaseError, match=rf"^{path}: not a regular file \(a named pipe\); restore the file"
     ):
-        scenario_hashes(opened, [scenario])
+        scenario_hashes(release, [scenario])
 
 
 def test_no_meta_and_no_such_scenario(own_release: Path, scenario: str) -> None:
-    for meta in own_release.glob("train/*/meta/*.txt"):
-        meta.unlink()
-    opened = DeepAccident(dataroot=own_release, verbose=False)
-    found = scenario_hashes(opened, [scenario, "type1_subtype1_accident/gone"])
-    assert list(found) == [scenario]
-    assert found[scenario].meta is None
+    for path in own_release.glob("train/*/meta/*.txt"):
+        path.unlink()
+    release = DeepAccident(dataroot=own_release, verbose=False)
+
+    hashes = scenario_hashes(release, [scenario, "type1_subtype1_accident/gone"])
+
+    assert list(hashes) == [scenario]
+    assert hashes[scenario].meta is None
 
 
 def test_fingerprint_of_all_in_any_order() -> None:
-    one = ScenarioHashes(label="a", meta=None, calib="c")
-    other = ScenarioHashes(label="b", meta="m", calib="c")
-    assert fingerprint({"x": one, "y": other}) == fingerprint({"y": other, "x": one})
-    assert fingerprint({"x": one, "y": other}) != fingerprint({"x": other, "y": one})
+    first = ScenarioHashes(label="a", meta=None, calib="c")
+    second = ScenarioHashes(label="b", meta="m", calib="c")
+    expected = fingerprint({"x": first, "y": second})
+    assert fingerprint({"y": second, "x": first}) == expected
+    assert fingerprint({"x": second, "y": first}) != expected
     assert digest_of({"a": 1, "b": [2.5]}) == digest_of({"b": [2.5], "a": 1})

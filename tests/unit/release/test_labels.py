@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import assert_refused
-from strategies import mutations
+from support.expected_errors import assert_raises
+from support.strategies import mutations
 
 from deepaccident_devkit.errors import LabelError, MissingFileError
 from deepaccident_devkit.release import Labels, read_label, read_labels, write_label
@@ -21,13 +21,13 @@ HEADER = "0.0034441 -5.6166797"
 PARKED = "car -38.698 -19.789 -0.882 4.181 1.994 1.381 -0.000518 0.0 0.0 20001 0 True"
 OWN = "car -0.0026 -1.4e-05 -1.2216 4.674 1.812 1.442 0.0 0.00344 -5.6167 -100 1394 False"
 WALKER = "pedestrian 21.8 -1.46 -0.84 0.375 0.375 1.86 2.19 0.0 0.0 -1 0 True"
-BEHIND = (
+CAR_BEHIND = (
     "car -13.459459497478285 -0.0037344838527602064 -1.2119891287962656 "
     "4.791779518127441 2.163450002670288 "
     "1.4876600503921509 0.00033209590742323136 -4.587319957896956 "
     "-0.016017722274652455 5481 197 True"
 )
-REAL = "\n".join([HEADER, PARKED, OWN, WALKER, BEHIND, ""])
+REAL = "\n".join([HEADER, PARKED, OWN, WALKER, CAR_BEHIND, ""])
 REMEDY = "; restore the file from its archive, or leave the scenario out with on_error='skip'"
 
 
@@ -41,54 +41,52 @@ def write(tmp_path: Path):
     return write_file
 
 
-def numbers_of(labels: Labels) -> np.ndarray:
-    return np.column_stack([labels.center, labels.size, labels.yaw, labels.velocity])
+def stack_numbers(labels: Labels) -> np.ndarray:
+    columns = [labels.center, labels.size, labels.yaw, labels.velocity]
+    return np.column_stack(columns)
 
 
-def expected(text: str) -> np.ndarray:
-    rows = [line.split()[1:10] for line in text.splitlines()[1:]]
-    return np.array([[float(word) for word in row] for row in rows])
+def parse_numbers(text: str) -> np.ndarray:
+    """Read the nine floating-point numbers of each box with Python's own parser."""
+    rows = []
+    for line in text.splitlines()[1:]:
+        words = line.split()[1:10]
+        rows.append([float(word) for word in words])
+    return np.array(rows)
 
 
 def test_the_real_lines_to_the_bit(write) -> None:
     labels = read_label(write(REAL), raw=True)
     assert labels.raw
-    assert_array_equal(numbers_of(labels), expected(REAL))
-    names = (
-        "num_boxes",
-        "agent_velocity",
-        "category",
-        "actor_id",
-        "num_lidar_pts",
-        "camera_visible",
-    )
-    assert {name: getattr(labels, name).tolist() for name in names} == {
-        "num_boxes": [4],
-        "agent_velocity": [[0.0034441, -5.6166797]],
-        "category": [0, 0, 5, 0],
-        "actor_id": [20001, -100, -1, 5481],
-        "num_lidar_pts": [0, 1394, 0, 197],
-        "camera_visible": [True, False, True, True],
-    }
+    assert_array_equal(stack_numbers(labels), parse_numbers(REAL))
+    assert labels.num_boxes.tolist() == [4]
+    assert labels.agent_velocity.tolist() == [[0.0034441, -5.6166797]]
+    assert labels.category.tolist() == [0, 0, 5, 0]
+    assert labels.actor_id.tolist() == [20001, -100, -1, 5481]
+    assert labels.num_lidar_pts.tolist() == [0, 1394, 0, 197]
+    assert labels.camera_visible.tolist() == [True, False, True, True]
 
 
 def test_right_handed_means_y_yaw_and_vy_change_their_signs(write) -> None:
+    signs = [1, -1, 1, 1, 1, 1, -1, 1, -1]
     labels = read_label(write(REAL))
     assert not labels.raw
     assert_array_equal(labels.agent_velocity, [[0.0034441, 5.6166797]])
-    assert_array_equal(numbers_of(labels), expected(REAL) * [1, -1, 1, 1, 1, 1, -1, 1, -1])
+    assert_array_equal(stack_numbers(labels), parse_numbers(REAL) * signs)
 
 
 @pytest.mark.parametrize("raw", [False, True])
 def test_boxes_are_right_handed_whatever_raw_was(write, raw: bool) -> None:
     boxes = read_label(write(REAL), raw=raw).boxes()
-    assert (boxes.frame, boxes.category_names) == ("lidar", ["car", "car", "pedestrian", "car"])
+    assert boxes.frame == "lidar"
+    assert boxes.category_names == ["car", "car", "pedestrian", "car"]
     assert_array_equal(
         boxes.center[3], [-13.459459497478285, 0.0037344838527602064, -1.2119891287962656]
     )
     assert_array_equal(boxes.velocity[3], [-4.587319957896956, 0.016017722274652455, 0])
     assert_allclose(boxes.yaw, [0.000518, 0, -2.19, -0.00033209590742323136], atol=1e-15)
-    assert_array_equal([boxes.row, boxes.actor_id], [[0, 1, 2, 3], [20001, -100, -1, 5481]])
+    assert_array_equal(boxes.row, [0, 1, 2, 3])
+    assert_array_equal(boxes.actor_id, [20001, -100, -1, 5481])
 
 
 @pytest.mark.parametrize(
@@ -125,23 +123,27 @@ def test_boxes_are_right_handed_whatever_raw_was(write, raw: bool) -> None:
     ],
 )
 def test_tolerated_forms_read_as_the_clean_file(write, text: str) -> None:
-    clean, odd = read_label(write(REAL, "clean.txt")), write(text)
-    # alone, and where it spoils the fast way for its neighbours
-    for labels in (
-        read_label(odd),
-        read_labels([write(HEADER, "empty.txt"), odd, write(HEADER, "other.txt")]),
-    ):
-        assert_array_equal(numbers_of(labels), numbers_of(clean))
+    clean = read_label(write(REAL, "clean.txt"))
+    path = write(text)
+
+    single = read_label(path)
+    # among others, where it spoils the fast way for its neighbours
+    several = read_labels([write(HEADER, "empty.txt"), path, write(HEADER, "other.txt")])
+
+    for labels in (single, several):
+        assert_array_equal(stack_numbers(labels), stack_numbers(clean))
         assert_array_equal(labels.actor_id, clean.actor_id)
         assert_array_equal(labels.camera_visible, clean.camera_visible)
         assert labels.num_boxes.sum() == 4
-    assert_array_equal(read_label(odd).agent_velocity, clean.agent_velocity)
+    assert_array_equal(single.agent_velocity, clean.agent_velocity)
 
 
 @pytest.mark.parametrize("text", [HEADER, HEADER + "\n", HEADER + "\r\n\r\n", HEADER + "\ncar\n"])
-def test_a_label_of_line_one_alone_is_valid(write, text: str) -> None:
+def test_a_label_of_only_line_one_is_valid(write, text: str) -> None:
     labels = read_label(write(text))
-    assert (len(labels), len(labels.boxes()), labels.num_boxes.tolist()) == (0, 0, [0])
+    assert len(labels) == 0
+    assert len(labels.boxes()) == 0
+    assert labels.num_boxes.tolist() == [0]
     assert_array_equal(labels.agent_velocity, [[0.0034441, 5.6166797]])
 
 
@@ -149,34 +151,33 @@ def test_several_files_keep_their_order_and_their_counts(write) -> None:
     paths = [
         write(REAL, "1"),
         write("1 2", "2"),
-        write("\n".join(["3 4", WALKER]), "3"),
+        write(f"3 4\n{WALKER}", "3"),
         write("5 6\n\n", "4"),
     ]
+
     labels = read_labels(paths)
+
     assert_array_equal(labels.num_boxes, [4, 0, 1, 0])
     assert_array_equal(labels.agent_velocity, [[0.0034441, 5.6166797], [1, -2], [3, -4], [5, -6]])
     assert_array_equal(labels.boxes().row, [0, 1, 2, 3, 0])
-    nothing = read_labels([])
-    found = (
-        len(nothing),
-        len(nothing.num_boxes),
-        nothing.agent_velocity.shape,
-        len(nothing.boxes()),
-    )
-    assert found == (0, 0, (0, 2), 0)
+
+    empty = read_labels([])
+    assert len(empty) == 0
+    assert len(empty.num_boxes) == 0
+    assert empty.agent_velocity.shape == (0, 2)
+    assert len(empty.boxes()) == 0
 
 
-def test_of_many_files_the_first_faulty_one_is_named(write) -> None:
-    good, first, second = (
-        write(REAL, "good.txt"),
-        write("1 x", "first.txt"),
-        write("1 y", "second.txt"),
-    )
+def test_the_first_faulty_one_of_many_files_is_named(write) -> None:
+    good = write(REAL, "good.txt")
+    first = write("1 x", "first.txt")
+    second = write("1 y", "second.txt")
+    missing = good.with_name("gone.txt")
     paths = [good] * 300 + [first] + [good] * 2500 + [second] + [good] * 10
-    assert_refused(
-        (lambda: read_labels(paths), LabelError, rf"^{first}:1: 'x' is no number"),
+    assert_raises(
+        (lambda: read_labels(paths), LabelError, rf"^{first}:1: 'x' is not a number"),
         (
-            lambda: read_labels([*paths[:300], good.with_name("gone.txt"), *paths]),
+            lambda: read_labels([*paths[:300], missing, *paths]),
             MissingFileError,
             r"gone\.txt",
         ),
@@ -215,15 +216,17 @@ WORDS = st.one_of(
 
 @settings(max_examples=20)
 @given(st.lists(st.lists(WORDS, min_size=9, max_size=9), min_size=1, max_size=8))
-def test_numbers_are_what_float_says_to_the_bit(
+def test_numbers_are_pythons_floats_to_the_bit(
     tmp_path_factory: pytest.TempPathFactory, rows: list
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "numbers.txt"
-    path.write_text(
-        "\n".join(["0 0", *(" ".join(["van", *row, "7", "0", "True"]) for row in rows)])
-    )
-    want = np.array([[float(word) for word in row] for row in rows])
-    assert_array_equal(numbers_of(read_label(path, raw=True)).view(np.int64), want.view(np.int64))
+    lines = [" ".join(["van", *row, "7", "0", "True"]) for row in rows]
+    text = "\n".join(["0 0", *lines])
+    path.write_text(text)
+
+    numbers = stack_numbers(read_label(path, raw=True))
+
+    assert_array_equal(numbers.view(np.int64), parse_numbers(text).view(np.int64))
 
 
 @pytest.mark.parametrize("raw", [False, True])
@@ -231,9 +234,14 @@ def test_numbers_are_what_float_says_to_the_bit(
     "word", ["nan", "NaN", "NAN", "-nan", "inf", "-inf", "Infinity", "1e999", "-1e300", "1e39"]
 )
 def test_a_velocity_that_is_no_number_is_unknown(write, word: str, raw: bool) -> None:
-    for written, expected in ((f"{word} 2.5", [np.nan, 2.5]), (f"2.5 {word}", [2.5, np.nan])):
-        labels = read_label(write(f"{HEADER}\n{PARKED.replace('0.0 0.0', written)}"), raw=raw)
-        assert_array_equal(labels.velocity * [1, 1 if raw else -1], [expected])
+    sign_of_y = 1 if raw else -1
+    for velocity, expected in (
+        (f"{word} 2.5", [np.nan, 2.5 * sign_of_y]),
+        (f"2.5 {word}", [2.5, np.nan]),
+    ):
+        line = PARKED.replace("0.0 0.0", velocity)
+        labels = read_label(write(f"{HEADER}\n{line}"), raw=raw)
+        assert_array_equal(labels.velocity, [expected])
 
 
 @pytest.mark.parametrize(
@@ -313,20 +321,22 @@ def test_a_velocity_that_is_no_number_is_unknown(write, word: str, raw: bool) ->
         ),
         (PARKED, r":1: expected '<speed_x> <speed_y>', found 13 fields: 'car"),
         ("1 2 3\n", r":1: expected '<speed_x> <speed_y>', found 3 fields: '1 2 3'"),
-        ("fast 2\n", r":1: 'fast' is no number"),
+        ("fast 2\n", r":1: 'fast' is not a number"),
         ("", r":1: expected '<speed_x> <speed_y>', found an empty file"),
         ("\n \n", r":1: expected '<speed_x> <speed_y>', found an empty file"),
-        (f"{HEADER}\n{OWN}\npedestr" + "\0" * 50, ":3: holds zero bytes"),
-        (f"{HEADER}\n{OWN}\n\0\0\n", ":3: holds zero bytes"),
-        (f"\0{HEADER}\n{OWN}", ":1: holds zero bytes"),
+        (f"{HEADER}\n{OWN}\npedestr" + "\0" * 50, ":3: contains zero bytes"),
+        (f"{HEADER}\n{OWN}\n\0\0\n", ":3: contains zero bytes"),
+        (f"\0{HEADER}\n{OWN}", ":1: contains zero bytes"),
     ],
 )
 def test_faults_name_file_line_and_remedy(write, text: str, message: str) -> None:
-    good, bad = write(REAL, "good.txt"), write(text, "bad.txt")
-    # alone, and among good files of one call
-    for paths in ([bad], [good, bad, good]):
-        with pytest.raises(LabelError, match=rf"^{bad}{message}.*{REMEDY}$"):
-            read_labels(paths)
+    good = write(REAL, "good.txt")
+    bad = write(text, "bad.txt")
+    pattern = rf"^{bad}{message}.*{REMEDY}$"
+    assert_raises(
+        (lambda: read_labels([bad]), LabelError, pattern),
+        (lambda: read_labels([good, bad, good]), LabelError, pattern),
+    )
 
 
 @pytest.mark.parametrize(
@@ -339,24 +349,29 @@ def test_faults_name_file_line_and_remedy(write, text: str, message: str) -> Non
     ],
 )
 def test_binary_garbage_is_a_label_error(write, content: bytes) -> None:
-    assert_refused(
+    assert_raises(
         (lambda: read_label(write(content)), LabelError, r"label\.txt:\d+: .*restore the file")
     )
 
 
 @pytest.mark.parametrize("marks", [1, 2])
-@pytest.mark.parametrize("place", [0, len(HEADER) + 1])
-def test_a_byte_order_mark_means_the_same_alone_and_among_others(
-    write, outcome, place: int, marks: int
+@pytest.mark.parametrize("position", [0, len(HEADER) + 1])
+def test_a_byte_order_mark_means_the_same_in_one_file_and_among_others(
+    write, outcome, position: int, marks: int
 ) -> None:
-    """Arrow drops one at the start of what it is given, which is only the first file's."""
-    text = f"{HEADER}\n{PARKED}\n".encode()
-    marked = write(text[:place] + b"\xef\xbb\xbf" * marks + text[place:], "marked.txt")
-    alone, last = (
-        outcome(LabelError, read_labels, paths) for paths in ([marked], [write(REAL), marked])
-    )
-    assert alone[1] == last[1]
-    assert (alone[0] and alone[0].actor_id[-1]) == (last[0] and last[0].actor_id[-1])
+    """Arrow drops a mark at the start of its input, which is only the first file's."""
+    content = f"{HEADER}\n{PARKED}\n".encode()
+    mark = b"\xef\xbb\xbf" * marks
+    path = write(content[:position] + mark + content[position:], "marked.txt")
+
+    single, single_message = outcome(LabelError, read_labels, [path])
+    several, several_message = outcome(LabelError, read_labels, [write(REAL), path])
+
+    assert single_message == several_message
+    if single is None:
+        assert several is None
+    else:
+        assert single.actor_id[-1] == several.actor_id[-1]
 
 
 @pytest.mark.parametrize("raw", [False, True])
@@ -385,7 +400,7 @@ def test_damage_raises_our_error_or_nothing(
     ("text", "message"),
     [
         ("1 " * 100_000, r":1: expected '<speed_x> <speed_y>', found more than 13 fields: '1 1 "),
-        (f"{'9' * 5000}x 1", r":1: '9+ … 9+x' is no number"),
+        (f"{'9' * 5000}x 1", r":1: '9+ … 9+x' is not a number"),
         (f"{HEADER}\n" + "1 " * 100_000, r":2: expected 13 fields, found more than 13: '1 1 "),
         (
             f"{HEADER}\n{PARKED.replace('car', 'c' * 5000)}",
@@ -417,11 +432,13 @@ def test_a_file_of_too_many_lines_is_refused(
 ) -> None:
     path = write(HEADER + ends * 300_000)
     with pytest.raises(
-        LabelError, match=r"has 300,00\d lines, more than 262,144; if it is sound"
+        LabelError, match=r"has 300,00\d lines, more than 262,144; if the file is correct"
     ) as raised:
         read_label(path)
-    word = str(raised.value).split("set ")[1].split(";")[0]
-    monkeypatch.setenv(LIMITS_VARIABLE, word.removeprefix(f"{LIMITS_VARIABLE}="))
+
+    _, _, remedy = str(raised.value).partition("set ")
+    setting, _, _ = remedy.partition(";")
+    monkeypatch.setenv(LIMITS_VARIABLE, setting.removeprefix(f"{LIMITS_VARIABLE}="))
     assert len(read_label(path)) == 0
 
 
@@ -431,7 +448,7 @@ def test_the_first_fault_among_many_boxes_is_named(write, line: int, ends: str) 
     lines = [HEADER, *[PARKED] * 4999, "van 1", "bus 2"]
     lines[line - 1] = "bus 1"
     path = write(ends.join(lines))
-    assert_refused(
+    assert_raises(
         (
             lambda: read_label(path),
             LabelError,
@@ -455,29 +472,36 @@ for path in sys.argv[1:]:
 
 def test_lines_of_too_many_words_are_read_in_arrows_own_memory(write) -> None:
     """Arrow's reader of CSV, up to 19, writes beyond it (apache/arrow 45497)."""
-    texts = (
-        "1 " * 100_000,
-        f"{HEADER}\n" + "1 " * 100_000,
-        f"{HEADER}\n" + f"{PARKED}\n" * 3000 + "1 " * 9000,
-    )
-    paths = [str(write(text, f"{number}.txt")) for number, text in enumerate(texts)]
+    many_words = "1 " * 100_000
+    paths = [
+        write(many_words, "0.txt"),
+        write(f"{HEADER}\n" + many_words, "1.txt"),
+        write(f"{HEADER}\n" + f"{PARKED}\n" * 3000 + "1 " * 9000, "2.txt"),
+    ]
+    command = [sys.executable, "-c", READ, *map(str, paths)]
     environment = {**os.environ, "ARROW_DEBUG_MEMORY_POOL": "abort"}
-    words = [sys.executable, "-c", READ, *paths]
-    ran = subprocess.run(words, env=environment, check=False, capture_output=True, text=True)
-    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "refused\n" * 3, "")
+
+    process = subprocess.run(command, env=environment, check=False, capture_output=True, text=True)
+
+    assert process.returncode == 0
+    assert process.stdout == "refused\n" * 3
+    assert process.stderr == ""
 
 
 @pytest.mark.parametrize(("end", "cut"), [("", True), (" ", True), ("\n", False)])
-def test_words_alone_on_a_line_are_told(write, end: str, cut: bool) -> None:
+def test_lone_words_on_a_line_are_reported(write, end: str, cut: bool) -> None:
     assert read_lone_words(write(REAL)) == []
+
     path = write(f"one\n{HEADER}\n\n{PARKED}\n two \n{OWN}\ncar{end}")
     assert len(read_label(path)) == 2
-    assert read_lone_words(path) == [(1, "one", False), (5, "two", False), (7, "car", cut)]
+    lone_words = read_lone_words(path)
+    assert lone_words == [(1, "one", False), (5, "two", False), (7, "car", cut)]
 
 
 def test_write_refuses_the_labels_of_several_files(write, tmp_path: Path) -> None:
-    out, labels = tmp_path / "out.txt", read_labels([write(REAL), write(REAL)])
-    assert_refused(
+    out = tmp_path / "out.txt"
+    labels = read_labels([write(REAL), write(REAL)])
+    assert_raises(
         (
             lambda: write_label(out, labels),
             LabelError,

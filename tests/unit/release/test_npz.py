@@ -1,15 +1,14 @@
 import io
 import pickle
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from refusals import assert_refused
-from strategies import mutations
+from support.expected_errors import assert_raises
+from support.strategies import mutations
 
 from deepaccident_devkit.errors import MissingFileError, SensorFileError
 from deepaccident_devkit.release.npz import read_npz, write_npz
@@ -30,7 +29,7 @@ def write_members(path: Path, members: dict[str, bytes]) -> Path:
     return path
 
 
-def npy(array: np.ndarray) -> bytes:
+def make_npy(array: np.ndarray) -> bytes:
     file = io.BytesIO()
     np.save(file, array)
     return file.getvalue()
@@ -62,63 +61,51 @@ def test_written_arrays_come_back_and_bytes_are_the_same_twice(
 
 
 def test_two_arrays_none_named_data_and_a_bare_array(path: Path) -> None:
-    def read(write: Callable[[], object]) -> object:
-        write()
-        return read_npz(path, "lidar")
+    not_named_data = (f"{path}: expected an array named 'data'", REMEDY)
 
-    expected = (f"{path}: expected an array named 'data'", REMEDY)
-    assert_refused(
-        (
-            lambda: read(lambda: np.savez(path, points=DATA, intensity=DATA)),
-            SensorFileError,
-            (*expected, "points, intensity"),
-        ),
-        (
-            lambda: read(lambda: write_members(path, {})),
-            SensorFileError,
-            (*expected, "found no array"),
-        ),
-        (
-            lambda: read(lambda: path.write_bytes(npy(DATA))),
-            SensorFileError,
-            (f"{path}: expected an npz archive, found a bare array", REMEDY),
-        ),
-    )
+    np.savez(path, points=DATA, intensity=DATA)
+    words = (*not_named_data, "points, intensity")
+    assert_raises((lambda: read_npz(path, "lidar"), SensorFileError, words))
+
+    write_members(path, {})
+    words = (*not_named_data, "found no array")
+    assert_raises((lambda: read_npz(path, "lidar"), SensorFileError, words))
+
+    path.write_bytes(make_npy(DATA))
+    words = (f"{path}: expected an npz archive, found a bare array", REMEDY)
+    assert_raises((lambda: read_npz(path, "lidar"), SensorFileError, words))
 
 
 def test_objects_empty_truncated_garbage_and_missing(path: Path) -> None:
     """Objects are never unpickled."""
-    assert_refused(
-        (
-            lambda: read_npz(path, "lidar"),
-            MissingFileError,
-            ("points.npz: no such file", "unpack the archive"),
-        )
-    )
+    words = ("points.npz: no such file", "unpack the archive")
+    assert_raises((lambda: read_npz(path, "lidar"), MissingFileError, words))
+
     np.savez(path, data=np.array([{"a": 1}]))
     objects = path.read_bytes()
     np.savez(path, data=DATA)
     whole = path.read_bytes()
-    cut = (whole[:end] for end in range(1, len(whole), 7))
-    for content in (objects, pickle.dumps([1]), b"", b"garbage", bytes(1000), *cut):
+    truncated = (whole[:end] for end in range(1, len(whole), 7))
+    for content in (objects, pickle.dumps([1]), b"", b"garbage", bytes(1000), *truncated):
         path.write_bytes(content)
-        said = r"the file is empty" if not content else ".*"
-        message = rf"(?s)^{path}: not a readable npz archive \({said}\){REMEDY}$"
-        assert_refused((lambda: read_npz(path, "lidar"), SensorFileError, message))
+        reason = ".*" if content else r"the file is empty"
+        message = rf"(?s)^{path}: not a readable npz archive \({reason}\){REMEDY}$"
+        assert_raises((lambda: read_npz(path, "lidar"), SensorFileError, message))
 
 
-def with_field(content: bytes, local: int, central: int, value: int) -> bytes:
-    """A field of both headers of the archive's only member, set to a value."""
-    damaged, entry = bytearray(content), content.rfind(b"PK\x01\x02")
-    damaged[local], damaged[entry + central] = value, value
+def set_field(content: bytes, local_offset: int, central_offset: int, value: int) -> bytes:
+    """Set a field in both headers of the archive's only member."""
+    damaged = bytearray(content)
+    central_header = content.rfind(b"PK\x01\x02")
+    damaged[local_offset] = value
+    damaged[central_header + central_offset] = value
     return bytes(damaged)
 
 
-def huge_header() -> bytes:
+def make_huge_header() -> bytes:
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f4", "fortran_order": False, "shape": (10**13, 4)}
-    )
+    description = {"descr": "<f4", "fortran_order": False, "shape": (10**13, 4)}
+    np.lib.format.write_array_header_1_0(header, description)
     return header.getvalue()
 
 
@@ -128,10 +115,10 @@ def huge_header() -> bytes:
         ({"data": b"hello"}, None),
         ({"readme.txt": b"hello"}, None),
         ({"data.npy": b""}, None),
-        ({"data.npy": huge_header()}, None),
-        ({"data.npy": npy(DATA)}, (6, 8, 1)),
-        ({"data.npy": npy(DATA)}, (8, 10, 99)),
-        ({"data.npy": npy(DATA)}, (4, 6, 255)),
+        ({"data.npy": make_huge_header()}, None),
+        ({"data.npy": make_npy(DATA)}, (6, 8, 1)),
+        ({"data.npy": make_npy(DATA)}, (8, 10, 99)),
+        ({"data.npy": make_npy(DATA)}, (4, 6, 255)),
     ],
     ids=[
         "text-as-data",
@@ -149,8 +136,8 @@ def test_archives_that_are_not_numpys(
     write_members(path, members)
     if fields:
         assert read_npz(path, "lidar").shape == DATA.shape
-        path.write_bytes(with_field(path.read_bytes(), *fields))
-    assert_refused((lambda: read_npz(path, "lidar"), SensorFileError, rf"^{path}: .*{REMEDY}$"))
+        path.write_bytes(set_field(path.read_bytes(), *fields))
+    assert_raises((lambda: read_npz(path, "lidar"), SensorFileError, rf"^{path}: .*{REMEDY}$"))
 
 
 @settings(max_examples=150)

@@ -1,5 +1,5 @@
-"""Pickles for old readers: which names they ask for, and that their bytes follow from the values
-alone.
+"""Check pickles for old readers: which names they ask for, and that their bytes follow only from
+the values.
 """
 
 import hashlib
@@ -23,41 +23,47 @@ NUMBERS = {
 }
 WORDS = {"names": np.array(["car", "truck"]), "word": "Straße", "list": [1, None, True, 2**40]}
 DIGEST = "c48e7659814dd927284843d627bbc18c8fa234c5e89cdc07bcd8c86c649fed3a"
-"""Of WORDS and NUMBERS, joined; numpy 1.26 and 2 give the same bytes."""
+"""SHA-256 of WORDS and NUMBERS, joined; numpy 1.26 and 2 give the same bytes."""
 
 
-def joined(*pieces: list[Any], **beside: Any) -> bytes:
+def join_pieces(*pieces: list[Any], **entries: Any) -> bytes:
+    """Write a pickle of a dict: the pieces' joined items as `infos`, and more entries."""
     file = io.BytesIO()
-    write_joined(file, "infos", map(pickled_items, pieces), beside)
+    write_joined(file, "infos", map(pickled_items, pieces), entries)
     return file.getvalue()
 
 
 @pytest.mark.parametrize(
-    "content", [pickled({"infos": [WORDS, NUMBERS]}), joined([WORDS, NUMBERS])]
+    "content", [pickled({"infos": [WORDS, NUMBERS]}), join_pieces([WORDS, NUMBERS])]
 )
 def test_a_pickle_asks_for_the_names_of_numpy_1_in_an_old_protocol(content: bytes) -> None:
-    found = list(pickletools.genops(content))
-    names = {argument for opcode, argument, _ in found if opcode.name == "GLOBAL"}
+    names = set()
+    for opcode, argument, _ in pickletools.genops(content):
+        assert opcode.proto <= 3
+        if opcode.name == "GLOBAL":
+            names.add(argument)
+
     assert names == {"numpy.core.multiarray _reconstruct", "numpy ndarray", "numpy dtype"}
-    assert max(opcode.proto for opcode, _, _ in found) <= 3
     pickletools.dis(content, out=io.StringIO())  # raises for a stack or a memo in disorder
     assert_equal(pickle.loads(content), {"infos": [WORDS, NUMBERS]})
 
 
 def test_pieces_follow_each_other() -> None:
-    content = joined([NUMBERS, NUMBERS], [], [{"n": 1}], metadata={"version": "v1"})
-    assert_equal(
-        load_arrays(content), {"infos": [NUMBERS, NUMBERS, {"n": 1}], "metadata": {"version": "v1"}}
-    )
-    assert load_arrays(joined()) == {"infos": []}
+    content = join_pieces([NUMBERS, NUMBERS], [], [{"n": 1}], metadata={"version": "v1"})
+    expected = {"infos": [NUMBERS, NUMBERS, {"n": 1}], "metadata": {"version": "v1"}}
+    assert_equal(load_arrays(content), expected)
+    assert load_arrays(join_pieces()) == {"infos": []}
 
 
 def test_the_same_values_are_the_same_bytes() -> None:
-    again = {
+    copies = {
         name: np.array(value) if isinstance(value, np.ndarray) else value
         for name, value in NUMBERS.items()
     }
+    assert join_pieces([copies]) == join_pieces([NUMBERS])
+
     shared = np.eye(2)
-    assert joined([again]) == joined([NUMBERS])
-    assert joined([[shared, shared]]) == joined([[np.eye(2), np.eye(2)]])
-    assert hashlib.sha256(joined([WORDS, NUMBERS])).hexdigest() == DIGEST
+    assert join_pieces([[shared, shared]]) == join_pieces([[np.eye(2), np.eye(2)]])
+
+    content = join_pieces([WORDS, NUMBERS])
+    assert hashlib.sha256(content).hexdigest() == DIGEST

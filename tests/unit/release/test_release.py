@@ -1,35 +1,35 @@
-"""What all readers of a release's files have in common."""
+"""Check what all readers of a release's files have in common."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import release
 from deepaccident_devkit.errors import MissingFileError, ReleaseError
 
 READERS = {name: getattr(release, name) for name in release.__all__ if name.startswith("read_")}
 SINGLE = {
-    name: reader
-    if name not in ("read_calibs", "read_labels")
-    else lambda path, reader=reader: reader([path])
-    for name, reader in READERS.items()
+    **READERS,
+    "read_calibs": lambda path: release.read_calibs([path]),
+    "read_labels": lambda path: release.read_labels([path]),
 }
 
 
 @pytest.mark.parametrize("read", SINGLE.values(), ids=SINGLE)
 def test_a_missing_file_is_ours_and_pythons_own_error(tmp_path: Path, read: Callable) -> None:
-    gone = tmp_path / "gone"
-    assert_refused(
-        *(
-            (lambda: read(gone), kind, f"^{gone}: no such file")
-            for kind in (MissingFileError, FileNotFoundError)
-        )
+    path = tmp_path / "gone"
+    message = f"^{path}: no such file"
+    assert_raises(
+        (lambda: read(path), MissingFileError, message),
+        (lambda: read(path), FileNotFoundError, message),
     )
 
 
 @pytest.mark.parametrize("read", SINGLE.values(), ids=SINGLE)
-def test_a_folder_in_the_files_place_is_our_error(tmp_path: Path, read: Callable) -> None:
-    """As any file that is there and cannot be read."""
-    assert_refused((lambda: read(tmp_path), ReleaseError, f"^{tmp_path}"))
+def test_a_folder_in_place_of_the_file_is_our_error(tmp_path: Path, read: Callable) -> None:
+    """The error is the same as for any file that exists but cannot be read."""
+    assert_raises(
+        (lambda: read(tmp_path), ReleaseError, f"^{tmp_path}"),
+    )

@@ -1,6 +1,7 @@
-"""Samples, moments and actors that several tests of pictures look at."""
+"""Samples, frames and actors that several tests of pictures draw."""
 
 import pytest
+from support.replay_page import accident_scenario
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.motion import MotionLabels
@@ -9,43 +10,42 @@ from deepaccident_devkit.statistics import DatasetStatistics, dataset_statistics
 
 
 @pytest.fixture(scope="session")
-def approach(da: DeepAccident) -> str:
+def approach_sample(da: DeepAccident) -> str:
     """The ego's third sample in a scenario that ends in a collision."""
-    scenario = next(one for one in da.scenario if one["collision"] is not None)
-    return f"{scenario['token']}/ego_vehicle/003"
+    return f"{accident_scenario(da)}/ego_vehicle/003"
 
 
 @pytest.fixture(scope="session")
-def behind(da: DeepAccident) -> str:
-    """The sample of the agent right behind a collider, at the impact."""
-    scenario = next(one for one in da.scenario if one["collision"] is not None)
-    return f"{scenario['token']}/ego_vehicle_behind/006"
+def follower_sample(da: DeepAccident) -> str:
+    """The sample, at the impact, of the agent right behind a collider."""
+    return f"{accident_scenario(da)}/ego_vehicle_behind/006"
 
 
 @pytest.fixture(scope="session")
 def frame(da: DeepAccident) -> str:
-    """A moment of a scenario that ends in a collision."""
-    scenario = next(one for one in da.scenario if one["collision"] is not None)
-    return f"{scenario['token']}/004"
+    """The token of a frame in a scenario that ends in a collision."""
+    return f"{accident_scenario(da)}/004"
 
 
 @pytest.fixture(scope="session")
-def other(da: DeepAccident) -> str:
-    """The other vehicle, which the ego collides with."""
-    scenario = next(one for one in da.scenario if one["collision"] is not None)
-    actor = da.get("agent", f"{scenario['token']}/other_vehicle")["actor_id"]
-    return f"{scenario['token']}/actor/{actor}"
+def other_vehicle(da: DeepAccident) -> str:
+    """The instance token of the other vehicle, which the ego collides with."""
+    scenario = accident_scenario(da)
+    actor_id = da.get("agent", f"{scenario}/other_vehicle")["actor_id"]
+    return f"{scenario}/actor/{actor_id}"
 
 
 @pytest.fixture(scope="session")
 def sample(da_motion: DeepAccident) -> str:
-    """A sample of the ego, 1 s before the impact."""
-    accident = next(scenario for scenario in da_motion.scenario if scenario["collision"])
-    return da_motion.get_sample(accident, "ego_vehicle", accident["num_frames"] - 10)["token"]
+    """The token of an ego sample 1 s before the impact."""
+    scenario = accident_scenario(da_motion)
+    num_frames = da_motion.get("scenario", scenario)["num_frames"]
+    return da_motion.get_sample(scenario, "ego_vehicle", num_frames - 10)["token"]
 
 
 @pytest.fixture(scope="session")
 def labels(da_motion: DeepAccident, sample: str) -> MotionLabels:
+    """The motion labels of `sample`, from the present on."""
     return da_motion.motion_labels(sample).to_present()
 
 

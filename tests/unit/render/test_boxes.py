@@ -1,14 +1,20 @@
-"""Boxes are drawn where geometry says, from above and in images."""
+"""Boxes are drawn where geometry puts them, from above and in images."""
 
 from typing import Any
 
 import numpy as np
 import pytest
-from drawing import has_color, new_axes, of_kind, on_canvas, rendered
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.quiver import Quiver
-from refusals import assert_refused
+from support.expected_errors import assert_raises
+from support.rendered_pixels import (
+    canvas_positions,
+    collections_of_kind,
+    has_color,
+    new_axes,
+    render_canvas,
+)
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import GeometryError
@@ -42,9 +48,9 @@ OPTICAL_FROM_EGO = SE3(np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [
 """A camera at the origin that looks along x."""
 
 
-def boxes(frame: str = "ego", **columns: Any) -> Boxes:
-    """A turned car in front, a truck to the left, and one that the agent drives itself."""
-    given = {
+def make_boxes(frame: str = "ego", **columns: Any) -> Boxes:
+    """Make a turned car in front, a truck to the left, and the car that the agent drives itself."""
+    columns = {
         "center": [[12.0, -2, 0], [20, 9, 1], [0, 0, 0]],
         "size": [[4.5, 1.9, 1.5], [9, 2.5, 3.5], [4, 2, 1.5]],
         "yaw": [0.4, -2.0, 0],
@@ -53,185 +59,214 @@ def boxes(frame: str = "ego", **columns: Any) -> Boxes:
         "velocity": [[3.0, 1, 0], [0, 0, 0], [np.nan, np.nan, np.nan]],
         **columns,
     }
-    return Boxes.from_arrays(
-        given.pop("center"), given.pop("size"), given.pop("yaw"), frame=frame, **given
-    )
+    center, size, yaw = (columns.pop(name) for name in ("center", "size", "yaw"))
+    return Boxes.from_arrays(center, size, yaw, frame=frame, **columns)
 
 
 def image_axes() -> Any:
+    """Make axes that show the pixels of `CAMERA`."""
     ax = new_axes((8, 6))
     ax.set(xlim=(0, CAMERA.width), ylim=(CAMERA.height, 0), aspect="equal")
     return ax
 
 
-def in_front(boxes: Boxes) -> Boxes:
+def to_camera_frame(boxes: Boxes) -> Boxes:
     return boxes.transform(OPTICAL_FROM_EGO, "Camera_Front")
 
 
+def are_red(ax: Any, points: Any) -> list[bool]:
+    """Return for each point in data coordinates whether a line on the axes is red there."""
+    canvas = render_canvas(ax)
+    return [has_color(canvas, position, RED) for position in canvas_positions(ax, points)]
+
+
 def test_from_above_the_outline_passes_within_two_pixels_of_the_corners() -> None:
-    drawn, ax = boxes(), new_axes()
+    boxes = make_boxes()
+    ax = new_axes()
     ax.set(xlim=(-10, 30), ylim=(-15, 25), aspect="equal")
-    draw_boxes_from_above(drawn, ax, [RED] * 3)
-    picture, corners = rendered(ax), drawn.bottom_corners()[..., :2]
+
+    draw_boxes_from_above(boxes, ax, [RED] * 3)
+
+    corners = boxes.bottom_corners()[..., :2]
     middles = (corners + np.roll(corners, 1, axis=1)) / 2
-    on, off = np.concatenate([corners, middles]).reshape(-1, 2), drawn.center[:, :2] - (0.0, 6.0)
-    found = [
-        [has_color(picture, place, RED) for place in on_canvas(ax, places)] for places in (on, off)
-    ]
-    assert found == [[True] * len(on), [False] * len(off)]
+    on_outline = np.concatenate([corners, middles]).reshape(-1, 2)
+    off_outline = boxes.center[:, :2] - (0.0, 6.0)
+    assert are_red(ax, on_outline) == [True] * len(on_outline)
+    assert are_red(ax, off_outline) == [False] * len(off_outline)
 
 
 def test_in_an_image_the_edges_pass_within_two_pixels_of_the_projected_corners() -> None:
-    seen, ax = in_front(boxes().select([0, 1])), image_axes()
-    draw_boxes_in_image(seen, CAMERA, ax, [RED, RED])
-    picture = rendered(ax)
-    pixels, _ = CAMERA.project(seen.corners().reshape(-1, 3))
+    boxes = to_camera_frame(make_boxes().select([0, 1]))
+    ax = image_axes()
+
+    draw_boxes_in_image(boxes, CAMERA, ax, [RED, RED])
+
+    pixels, _ = CAMERA.project(boxes.corners().reshape(-1, 3))
     assert CAMERA.in_image(pixels).all()
-    found = [has_color(picture, place, RED) for place in on_canvas(ax, [*pixels, [200, 290]])]
-    assert found == [*[True] * len(pixels), False]
+    beside_boxes = [200, 290]
+    assert are_red(ax, [*pixels, beside_boxes]) == [*[True] * len(pixels), False]
 
 
 def test_a_line_leads_to_the_front_and_each_box_has_its_colour() -> None:
-    drawn, ax = boxes(), new_axes()
-    draw_boxes_from_above(
-        drawn, ax, ["#ff0000", "#00ff00", "#0000ff"], linestyle="dashed", fill=0.5
-    )
+    boxes = make_boxes()
+    ax = new_axes()
+    colors = ["#ff0000", "#00ff00", "#0000ff"]
+
+    draw_boxes_from_above(boxes, ax, colors, linestyle="dashed", fill=0.5)
+
     outlines, headings = ax.collections
     np.testing.assert_allclose(outlines.get_edgecolor(), [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])
-    ahead = np.column_stack([np.cos(drawn.yaw), np.sin(drawn.yaw)]) * drawn.size[:, :1] / 2
-    centers = drawn.center[:, :2]
-    np.testing.assert_allclose(
-        headings.get_segments(), np.stack([centers, centers + ahead], axis=1)
-    )
+    directions = np.column_stack([np.cos(boxes.yaw), np.sin(boxes.yaw)])
+    centers = boxes.center[:, :2]
+    fronts = centers + directions * boxes.size[:, :1] / 2
+    np.testing.assert_allclose(headings.get_segments(), np.stack([centers, fronts], axis=1))
 
 
 def test_one_box_is_drawn_in_its_category_s_colour_or_the_one_given() -> None:
-    box, ax = Box(boxes().select([1])), new_axes()
+    box = Box(make_boxes().select([1]))
+    ax = new_axes()
     assert draw_box(box, ax) is ax
-    assert_refused(
+    assert_raises(
         (lambda: draw_box(ax, box), GeometryError, ("box", "found Axes", "draw_box(box, ax)"))
     )  # type: ignore[arg-type]
     draw_box(box, ax, RED)
+
     first, second = ax.collections[0], ax.collections[2]
     np.testing.assert_allclose(first.get_paths()[0].vertices[:4], box.bottom_corners()[:2].T)
-    assert [to_hex(each.get_edgecolor()[0]) for each in (first, second)] == [
-        CATEGORY_COLORS["truck"],
-        RED,
-    ]
+    assert to_hex(first.get_edgecolor()[0]) == CATEGORY_COLORS["truck"]
+    assert to_hex(second.get_edgecolor()[0]) == RED
 
 
 def test_edges_are_cut_off_before_the_camera() -> None:
-    through, behind, before = (
-        [[0.0, 0, 1.1], [0, 1, -0.9]],
-        [[0.0, 0, -1], [0, 0, -2]],
-        [[1.0, 1, 2], [1, 1, 4]],
-    )
-    segments = np.array([through, behind, before, through[::-1]])
+    crossing = [[0.0, 0, 1.1], [0, 1, -0.9]]
+    behind = [[0.0, 0, -1], [0, 0, -2]]
+    ahead = [[1.0, 1, 2], [1, 1, 4]]
+    segments = np.array([crossing, behind, ahead, crossing[::-1]])
+
     pixels, drawn = segments_in_image(segments, CAMERA)
+
     assert drawn.tolist() == [True, False, True, True]
     cut = CAMERA.project(np.array([[0, 0.5, NEAR_PLANE_M]]))[0][0]
     np.testing.assert_allclose(
-        pixels, [[[200, 150], cut], [[300, 250], [250, 200]], [cut, [200, 150]]]
+        pixels,
+        [
+            [[200, 150], cut],
+            [[300, 250], [250, 200]],
+            [cut, [200, 150]],
+        ],
     )
     assert segments[0, 1, 2] == -0.9
 
 
-ABOVE = (draw_boxes_from_above, draw_velocities_from_above, draw_ids_from_above)
+FROM_ABOVE = (draw_boxes_from_above, draw_velocities_from_above, draw_ids_from_above)
 
 
 @pytest.mark.parametrize(
-    "draw", [*ABOVE, draw_boxes_in_image, draw_velocities_in_image, draw_ids_in_image]
+    "draw", [*FROM_ABOVE, draw_boxes_in_image, draw_velocities_in_image, draw_ids_in_image]
 )
 def test_no_box_at_all_draws_nothing(draw: Any) -> None:
-    ax, none = image_axes(), boxes().select([])
-    draw(*((none, ax) if draw in ABOVE else (in_front(none), CAMERA, ax)), [])
-    rendered(ax)
-    assert sum(len(one.get_paths()) for one in ax.collections) + len(ax.texts) == 0
+    ax = image_axes()
+    no_boxes = make_boxes().select([])
+
+    if draw in FROM_ABOVE:
+        draw(no_boxes, ax, [])
+    else:
+        draw(to_camera_frame(no_boxes), CAMERA, ax, [])
+
+    render_canvas(ax)
+    assert sum(len(shape.get_paths()) for shape in ax.collections) + len(ax.texts) == 0
 
 
 def test_tracked_boxes_have_their_ids_beside_them() -> None:
     ax = new_axes()
-    draw_ids_from_above(boxes(), ax, [RED] * 3)
-    assert [(one.get_text(), one.xy) for one in ax.texts] == [("7", (12, -2)), ("own", (0, 0))]
+    draw_ids_from_above(make_boxes(), ax, [RED] * 3)
+    labels = [(text.get_text(), text.xy) for text in ax.texts]
+    assert labels == [("7", (12, -2)), ("own", (0, 0))]
 
 
-def test_in_an_image_ids_stand_above_what_is_before_the_camera() -> None:
+def test_in_an_image_ids_stand_above_the_boxes_before_the_camera() -> None:
     ax = image_axes()
-    draw_ids_in_image(
-        in_front(boxes(center=[[12.0, -2, 0], [20, 9, 1], [-5, 0, 0]])), CAMERA, ax, [RED] * 3
-    )
+    boxes = make_boxes(center=[[12.0, -2, 0], [20, 9, 1], [-5, 0, 0]])
+    draw_ids_in_image(to_camera_frame(boxes), CAMERA, ax, [RED] * 3)
+
     (text,) = ax.texts
-    top = CAMERA.project(OPTICAL_FROM_EGO.apply(np.array([[12.0, -2, 0.75]])))[0][0]
-    assert (text.get_text(), text.xy) == ("7", pytest.approx(tuple(top)))
+    top = OPTICAL_FROM_EGO.apply(np.array([[12.0, -2, 0.75]]))
+    pixels, _ = CAMERA.project(top)
+    assert (text.get_text(), text.xy) == ("7", pytest.approx(tuple(pixels[0])))
 
 
 def test_velocities_are_arrows_of_a_second_where_they_are_known_and_not_zero() -> None:
     ax = new_axes()
-    draw_velocities_from_above(boxes(), ax, [RED, "blue", "blue"])
-    (arrows,) = of_kind(ax, Quiver)
+    draw_velocities_from_above(make_boxes(), ax, [RED, "blue", "blue"])
+    (arrows,) = collections_of_kind(ax, Quiver)
     np.testing.assert_allclose(np.column_stack([arrows.XY, arrows.U, arrows.V]), [[12, -2, 3, 1]])
     assert to_hex(arrows.get_facecolor()[0]) == RED
 
 
 def test_small_actors_have_a_mark_of_their_class() -> None:
-    ax, hidden = new_axes(), new_axes()
-    small = boxes(category=["pedestrian", "car", "cyclist"])
-    draw_boxes_from_above(small, ax, [RED, RED, CATEGORY_COLORS["cyclist"]])
-    draw_boxes_from_above(small, hidden, [RED] * 3, fill=0)
+    ax = new_axes()
+    unfilled_ax = new_axes()
+    boxes = make_boxes(category=["pedestrian", "car", "cyclist"])
+
+    draw_boxes_from_above(boxes, ax, [RED, RED, CATEGORY_COLORS["cyclist"]])
+    draw_boxes_from_above(boxes, unfilled_ax, [RED] * 3, fill=0)
+
     marks = ax.collections[-1]
     corners = [path.vertices[:-1] for path in marks.get_paths()]
-    assert ([*map(len, corners)], [*map(to_hex, marks.get_facecolor())]) == (
-        [16, 4],
-        [RED, CATEGORY_COLORS["cyclist"]],
-    )
-    np.testing.assert_allclose(
-        [each.mean(axis=0) for each in corners], small.center[[0, 2], :2], atol=1e-9
-    )
-    assert len(hidden.collections[-1].get_facecolor()) == 0
+    assert [*map(len, corners)] == [16, 4]
+    assert [*map(to_hex, marks.get_facecolor())] == [RED, CATEGORY_COLORS["cyclist"]]
+    mark_centers = [mark_corners.mean(axis=0) for mark_corners in corners]
+    np.testing.assert_allclose(mark_centers, boxes.center[[0, 2], :2], atol=1e-9)
+    assert len(unfilled_ax.collections[-1].get_facecolor()) == 0
 
 
 def test_velocities_in_an_image_lead_to_where_the_centre_would_be() -> None:
     ax = image_axes()
-    draw_velocities_in_image(in_front(boxes()), CAMERA, ax, [RED] * 3)
-    places = OPTICAL_FROM_EGO.apply(np.array([[12.0, -2, 0], [15, -1, 0]]))
-    np.testing.assert_allclose(ax.collections[0].get_segments(), [CAMERA.project(places)[0]])
+    draw_velocities_in_image(to_camera_frame(make_boxes()), CAMERA, ax, [RED] * 3)
+
+    now_and_later = OPTICAL_FROM_EGO.apply(np.array([[12.0, -2, 0], [15, -1, 0]]))
+    pixels, _ = CAMERA.project(now_and_later)
+    np.testing.assert_allclose(ax.collections[0].get_segments(), [pixels])
 
 
 def test_a_box_beside_the_camera_is_cut_off_at_the_camera() -> None:
     # 2 m to the right, from 4 m behind the camera to 4 m before it; its front looks at the camera
-    both = in_front(
-        Boxes.from_arrays(
-            [[0.0, -3, 0], [-9, -3, 0]], [[2.0, 8, 1]] * 2, [np.pi / 2] * 2, frame="ego"
-        )
-    )
-    np.testing.assert_allclose(bounds_in_image(both, CAMERA)[0], [200 + 200 * 2 / 4, 0, 400, 300])
+    centers = [[0.0, -3, 0], [-9, -3, 0]]
+    sizes = [[2.0, 8, 1]] * 2
+    yaws = [np.pi / 2] * 2
+    boxes = to_camera_frame(Boxes.from_arrays(centers, sizes, yaws, frame="ego"))
+    np.testing.assert_allclose(bounds_in_image(boxes, CAMERA)[0], [200 + 200 * 2 / 4, 0, 400, 300])
+
     ax = new_axes()
-    assert draw_boxes_in_image(both, CAMERA, ax, [RED, RED]).tolist() == [True, False]
-    (front,) = next(each for each in ax.collections if isinstance(each, PolyCollection)).get_paths()
-    across = front.vertices[:, 0]
-    assert (across.min(), across.max()) == pytest.approx((300, 200 + 200 * 2 / NEAR_PLANE_M))
+    assert draw_boxes_in_image(boxes, CAMERA, ax, [RED, RED]).tolist() == [True, False]
+
+    polygons = next(shape for shape in ax.collections if isinstance(shape, PolyCollection))
+    (front,) = polygons.get_paths()
+    columns = front.vertices[:, 0]
+    assert (columns.min(), columns.max()) == pytest.approx((300, 200 + 200 * 2 / NEAR_PLANE_M))
 
 
 def test_the_pair_is_red_other_recorders_have_hues_and_the_rest_shades(
-    da: DeepAccident, approach: str
+    da: DeepAccident, approach_sample: str
 ) -> None:
-    boxes, scenario = da.boxes(approach, "ego"), approach.rsplit("/", 2)[0]
+    boxes = da.boxes(approach_sample, "ego")
+    scenario = approach_sample.rsplit("/", 2)[0]
     agents = {name: da.get("agent", f"{scenario}/{name}")["actor_id"] for name in AGENTS[:4]}
-    recorders = {
-        **{actor: name for name, actor in agents.items() if name != "ego_vehicle"},
-        OWN_ACTOR_ID: "ego_vehicle",
-    }
-    assert recorder_ids(da, approach) == recorders
-    hues = {
-        agents[name]: AGENT_COLORS[name] for name in ("ego_vehicle_behind", "other_vehicle_behind")
-    }
-    hues |= dict.fromkeys((OWN_ACTOR_ID, agents["other_vehicle"]), COLLIDER_COLOR)
+    recorders = {actor_id: name for name, actor_id in agents.items() if name != "ego_vehicle"}
+    recorders[OWN_ACTOR_ID] = "ego_vehicle"
+    assert recorder_ids(da, approach_sample) == recorders
+
+    pair_colors = dict.fromkeys((OWN_ACTOR_ID, agents["other_vehicle"]), COLLIDER_COLOR)
+    followers = ("ego_vehicle_behind", "other_vehicle_behind")
+    hues = {agents[name]: AGENT_COLORS[name] for name in followers} | pair_colors
     actors = [*zip(boxes.actor_id.tolist(), boxes.category_names, strict=True)]
-    assert role_colors(da, approach, boxes) == [
-        hues.get(actor, CATEGORY_COLORS[name]) for actor, name in actors
+    assert role_colors(da, approach_sample, boxes) == [
+        hues.get(actor_id, CATEGORY_COLORS[category]) for actor_id, category in actors
     ]
-    assert len(hues.keys() & {actor for actor, _ in actors}) > 2
+    assert len(hues.keys() & {actor_id for actor_id, _ in actors}) > 2
+
     with style(color_by="class"):
-        by_class = role_colors(da, approach, boxes)
-    red = {actor: color for actor, color in hues.items() if color == COLLIDER_COLOR}
-    assert by_class == [red.get(actor, CLASS_COLORS[name]) for actor, name in actors]
+        colors_by_class = role_colors(da, approach_sample, boxes)
+    assert colors_by_class == [
+        pair_colors.get(actor_id, CLASS_COLORS[category]) for actor_id, category in actors
+    ]

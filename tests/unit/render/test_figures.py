@@ -1,12 +1,12 @@
-"""Layers: what a caller may ask of a picture."""
+"""Layers: which ones a caller may ask a picture for."""
 
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.figures import LAYERS, layers_of
 
 
-def test_none_is_the_default_and_nothing_is_nothing() -> None:
+def test_none_means_the_default_layers_and_an_empty_list_means_no_layer() -> None:
     assert layers_of(None, ("boxes", "ids")) == {"boxes", "ids"}
     assert layers_of((), ("boxes",)) == frozenset()
 
@@ -16,8 +16,8 @@ def test_one_layer_needs_no_list_and_any_iterable_is_fine() -> None:
     assert layers_of(iter(("boxes", "ids")), ()) == {"boxes", "ids"}
 
 
-def test_a_layer_that_the_picture_has_not_is_refused_with_those_it_has() -> None:
-    assert_refused(
+def test_an_unknown_layer_is_refused_and_the_known_ones_are_named() -> None:
+    assert_raises(
         (
             lambda: layers_of(["points"], (), ("image", "boxes")),
             ChoiceError,

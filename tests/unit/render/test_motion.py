@@ -1,17 +1,23 @@
-"""Pictures of motion labels and predictions: what is drawn where, in which colour, and what is
-not.
-"""
+"""Pictures of motion labels and predictions: what is drawn where and in which colour."""
 
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from drawing import legend_words, new_axes, of_kind, picture, texts, tokens_of
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.quiver import Quiver
-from refusals import assert_refused
+from support.expected_errors import assert_raises
+from support.rendered_pixels import (
+    collections_of_kind,
+    first_image,
+    new_axes,
+    read_legend,
+    read_texts,
+    read_tokens,
+)
+from support.replay_page import accident_scenario
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -43,8 +49,8 @@ from deepaccident_devkit.render.styles import (
 )
 
 
-def figure_of(labels: MotionLabels, **how: Any) -> Any:
-    return draw_motion_labels(labels, fig=detached_figure((8, 8)), **how)
+def draw_labels(labels: MotionLabels, **options: Any) -> Any:
+    return draw_motion_labels(labels, fig=detached_figure((8, 8)), **options)
 
 
 CONFIG = MotionLabelConfig(
@@ -54,154 +60,177 @@ CONFIG = MotionLabelConfig(
     protocol="clean",
 )
 RECTANGLE = np.array([[-2.2, -1.2], [-2.2, 1.2], [2.2, 1.2], [2.2, -1.2]])
-STEP = (3.0, 1.5)
-"""Metres from frame to frame."""
+STEP_M = (3.0, 1.5)  # from frame to frame
 
 
-def two_cars(config: MotionLabelConfig = CONFIG, *, frames: int = 3) -> MotionLabels:
-    """The ego, which stands, and car 7, which starts at (10.25, 5.25) and drives on; some frames
-    are recorded.
+def make_labels(config: MotionLabelConfig = CONFIG, *, num_recorded: int = 3) -> MotionLabels:
+    """Make labels of three frames, with the ego, which stands still, and car 7, which starts at
+    (10.25, 5.25) m and moves by `STEP_M`; only the first frames are recorded.
     """
-    moments = [
-        FramePolygons(
-            corners=np.array(
-                [RECTANGLE + 0.25, RECTANGLE + (10.25, 5.25) + frame * np.array(STEP)]
-            ),
+    ego_corners = RECTANGLE + 0.25
+    frames: list[FramePolygons | None] = [None] * 3
+    for frame in range(num_recorded):
+        car_corners = RECTANGLE + (10.25, 5.25) + frame * np.array(STEP_M)
+        frames[frame] = FramePolygons(
+            corners=np.array([ego_corners, car_corners]),
             key=np.array([OWN_BOX_ID, 7]),
         )
-        for frame in range(frames)
-    ]
-    return labels_from_polygons([*moments, *[None] * (3 - frames)], np.zeros((3, 6)), config)
+    return labels_from_polygons(frames, np.zeros((3, 6)), config)
 
 
-def panel(labels: MotionLabels, name: Any, frame: int = 0, **how: Any) -> Any:
+def draw_map(labels: MotionLabels, name: Any, frame: int = 0, **options: Any) -> Any:
     ax = detached_figure((4, 4)).add_subplot()
-    assert draw_motion_map(labels, name, frame, ax=ax, **how) is ax
+    assert draw_motion_map(labels, name, frame, ax=ax, **options) is ax
     return ax
 
 
 def color_at(ax: Any, x: float, y: float) -> Any:
-    """The colour of the cell that a point in metres lies in."""
+    """Return the colour of the cell that a point, in metres, lies in."""
     left, right, low, high = ax.images[0].get_extent()
-    colors = picture(ax)
     assert ax.images[0].origin == "lower"
-    row, column = (
-        (y - low) / (high - low) * colors.shape[0],
-        (x - left) / (right - left) * colors.shape[1],
-    )
+    colors = first_image(ax)
+    num_rows, num_columns = colors.shape[:2]
+    row = (y - low) / (high - low) * num_rows
+    column = (x - left) / (right - left) * num_columns
     return colors[int(row), int(column)]
 
 
+def read_arrows(ax: Any) -> list[list[float]]:
+    """Return start and extent (x, y, dx, dy) of the arrows, to a micrometre, in order."""
+    rows: list[list[float]] = []
+    for arrows in collections_of_kind(ax, Quiver):
+        rows += np.column_stack([arrows.XY, arrows.U, arrows.V]).round(6).tolist()
+    return sorted(rows)
+
+
 def test_instances_are_where_they_are_and_have_their_colours() -> None:
-    labels = two_cars()
-    ax, later = panel(labels, "instance"), panel(labels, "instance", 2)
-    car = color_at(ax, 10.2, 5.2)
-    np.testing.assert_allclose(
-        [color_at(ax, 0.2, 0.2), color_at(ax, 5, -10)], [to_rgb(OWN_COLOR), (1, 1, 1)]
+    labels = make_labels()
+    ax = draw_map(labels, "instance")
+    car_color = color_at(ax, 10.2, 5.2)
+    np.testing.assert_allclose(color_at(ax, 0.2, 0.2), to_rgb(OWN_COLOR))
+    np.testing.assert_allclose(color_at(ax, 5, -10), (1, 1, 1))
+    assert not np.allclose(car_color, 1)
+
+    later_ax = draw_map(labels, "instance", 2)
+    np.testing.assert_allclose(color_at(later_ax, 16.2, 8.2), car_color)  # the same in all frames
+
+    car_marked, both_marked = (
+        draw_map(labels, "instance", marked=marked) for marked in ({7}, {7, -100})
     )
-    assert not np.allclose(car, 1)
-    np.testing.assert_allclose(color_at(later, 16.2, 8.2), car)  # the same in all frames
-    one, both = (panel(labels, "instance", marked=marked) for marked in ({7}, {7, -100}))
-    np.testing.assert_allclose(
-        [color_at(one, 10.2, 5.2), color_at(both, 0.2, 0.2)], [to_rgb(COLLIDER_COLOR)] * 2
-    )
-    assert len(both.collections) == 1  # the own box's edge
+    np.testing.assert_allclose(color_at(car_marked, 10.2, 5.2), to_rgb(COLLIDER_COLOR))
+    np.testing.assert_allclose(color_at(both_marked, 0.2, 0.2), to_rgb(COLLIDER_COLOR))
+    assert len(both_marked.collections) == 1  # the own box's edge
 
 
 def test_recording_vehicles_have_their_hues_and_others_shades_in_the_picture_and_its_key() -> None:
-    figure = figure_of(two_cars().to_present(), agents={-100: "ego_vehicle"}, style="trail")
+    figure = draw_labels(make_labels().to_present(), agents={-100: "ego_vehicle"}, style="trail")
     (ax,) = figure.axes
     np.testing.assert_allclose(color_at(ax, 0.2, 0.2), to_rgb(AGENT_COLORS["ego_vehicle"]))
     assert to_hex(color_at(ax, 10.2, 5.2)) in INSTANCE_COLORS
-    assert legend_words(figure) == ["ego", "own box"]
+    assert read_legend(figure) == [
+        "ego",
+        "own vehicle",
+        "others now",
+        "in 1 s",
+        "every 0.5 s",
+    ]
 
 
 def test_arrows_lead_from_instances_to_where_they_are_next() -> None:
-    flow, last, offset = (
-        panel(two_cars(), "flow"),
-        panel(two_cars(), "flow", 2),
-        panel(two_cars(), "offset"),
-    )
-    (found,) = of_kind(flow, Quiver)
+    labels = make_labels()
+    flow = draw_map(labels, "flow")
+    (arrows,) = collections_of_kind(flow, Quiver)
     np.testing.assert_allclose(
-        np.column_stack([found.XY, found.U, found.V]), [(0.25, 0.25, 0, 0), (10.25, 5.25, *STEP)]
+        np.column_stack([arrows.XY, arrows.U, arrows.V]),
+        [(0.25, 0.25, 0, 0), (10.25, 5.25, *STEP_M)],
     )
-    assert (
-        of_kind(last, Quiver) + of_kind(offset, Quiver) == []
-    )  # nothing is known of what comes after the last
-    assert len(np.unique(picture(flow).reshape(-1, 3), axis=0)) == 3  # nothing, no way, a way
+    num_colors = len(np.unique(first_image(flow).reshape(-1, 3), axis=0))
+    assert num_colors == 3  # empty cells, an instance that stands still, one that moves
+
+    last_flow = draw_map(labels, "flow", 2)  # nothing is known about the time after it
+    assert collections_of_kind(last_flow, Quiver) == []
+    assert collections_of_kind(draw_map(labels, "offset"), Quiver) == []
 
 
 @pytest.mark.parametrize("name", ["instance", "centerness", "offset", "flow"])
 def test_forward_is_to_the_right_in_every_orientation(name: str) -> None:
-    def arrows(ax: Any) -> list[list[float]]:
-        found = [np.column_stack([each.XY, each.U, each.V]) for each in of_kind(ax, Quiver)]
-        return sorted(np.round(np.concatenate(found), 6).tolist()) if found else []
-
-    first, *others = (
-        panel(two_cars(replace(CONFIG, orientation=each)), name) for each in ORIENTATIONS
+    first, *other_axes = (
+        draw_map(make_labels(replace(CONFIG, orientation=orientation)), name)
+        for orientation in ORIENTATIONS
     )
-    for other in others:
-        np.testing.assert_allclose(picture(other), picture(first))
-        assert other.images[0].get_extent() == first.images[0].get_extent() == [-20, 30, -15, 15]
-        assert arrows(other) == arrows(first)
+    for ax in other_axes:
+        np.testing.assert_allclose(first_image(ax), first_image(first))
+        assert ax.images[0].get_extent() == first.images[0].get_extent() == [-20, 30, -15, 15]
+        assert read_arrows(ax) == read_arrows(first)
 
 
 @pytest.mark.parametrize("protocol", ["released", "clean"])
 def test_frames_beyond_the_recording_are_grey(protocol: str) -> None:
-    labels = two_cars(replace(CONFIG, protocol=protocol), frames=2)
-    for figure in map(figure_of, (labels, labels.to_present())):
-        rows = [figure.axes[row : row + 3] for row in range(0, 16, 4)]
-        assert [[len(ax.images) for ax in row] for row in rows] == [[1, 1, 0]] * 4
-        assert [texts(beyond) for *_, beyond in rows] == [["not recorded"]] * 4
+    labels = make_labels(replace(CONFIG, protocol=protocol), num_recorded=2)
+    for figure in (draw_labels(labels), draw_labels(labels.to_present())):
+        for row in range(0, 16, 4):
+            first, second, unrecorded = figure.axes[row : row + 3]
+            assert [len(ax.images) for ax in (first, second, unrecorded)] == [1, 1, 0]
+            assert read_texts(unrecorded) == ["not recorded"]
         figure.canvas.draw()
 
 
 def test_an_empty_road_is_drawn() -> None:
-    nobody = FramePolygons(corners=np.zeros((0, 4, 2)), key=np.zeros(0))
-    figure = figure_of(labels_from_polygons([nobody] * 3, np.zeros((3, 6)), CONFIG), marked={7})
+    empty = FramePolygons(corners=np.zeros((0, 4, 2)), key=np.zeros(0))
+    labels = labels_from_polygons([empty] * 3, np.zeros((3, 6)), CONFIG)
+    figure = draw_labels(labels, marked={7})
     figure.canvas.draw()
-    np.testing.assert_array_equal(picture(figure.axes[0]), 1)
+    np.testing.assert_array_equal(first_image(figure.axes[0]), 1)
 
 
 def test_a_sample_of_an_accident(da_motion: DeepAccident) -> None:
-    accident = next(scenario for scenario in da_motion.scenario if scenario["collision"])
-    sample, figure = (
-        da_motion.get_sample(accident, "ego_vehicle", frame=15),
-        detached_figure((12, 9)),
-    )
+    sample = da_motion.get_sample(accident_scenario(da_motion), "ego_vehicle", frame=15)
+    figure = detached_figure((12, 9))
     assert da_motion.render_motion_labels(sample, fig=figure) is figure
-    assert (len(figure.axes), tokens_of(figure)) == (
-        4 * (5 + 1),
-        [sample["token"]],
-    )  # five frames and a key
+    assert len(figure.axes) == 4 * (5 + 1)  # five frames and a key
+    assert read_tokens(figure) == [sample["token"]]
+
     labels = da_motion.motion_labels(sample).to_present()
     pair = [
-        labels.id_map[OWN_BOX_ID if actor == -100 else actor]
-        for actor in collider_ids(da_motion, sample)
+        labels.id_map[OWN_BOX_ID if actor_id == -100 else actor_id]
+        for actor_id in collider_ids(da_motion, sample)
     ]
-    red = [np.isclose(picture(ax), to_rgb(COLLIDER_COLOR)).all(axis=-1) for ax in figure.axes[:5]]
-    np.testing.assert_array_equal(red, np.isin(labels.instance, pair))
+    are_red = [
+        np.isclose(first_image(ax), to_rgb(COLLIDER_COLOR)).all(axis=-1) for ax in figure.axes[:5]
+    ]
+    np.testing.assert_array_equal(are_red, np.isin(labels.instance, pair))
 
 
-def test_what_is_not_there_is_named(labels: MotionLabels) -> None:
-    alone = instances_of(labels.instance, labels.config.grid)
-    assert_refused(
+def test_unknown_maps_frames_and_predictions_are_refused(labels: MotionLabels) -> None:
+    instances = instances_of(labels.instance, labels.config.grid)
+    assert_raises(
         (
-            lambda: panel(two_cars(), "centre"),
+            lambda: draw_map(make_labels(), "centre"),
             ChoiceError,
             ("map", "instance, centerness, offset, flow", "'centre'"),
         ),
-        (lambda: panel(two_cars(), "flow", -1), ChoiceError, ("frame", "0 to 2", "found -1")),
-        (lambda: panel(two_cars(), "flow", 3), ChoiceError, ("frame", "0 to 2", "found 3")),
-        (lambda: draw_motion_map(alone, "flow", 0), ChoiceError, ("map", "only instance", "heads")),
         (
-            lambda: draw_motion_output(alone, number=1),
+            lambda: draw_map(make_labels(), "flow", -1),
+            ChoiceError,
+            ("frame", "0 to 2", "found -1"),
+        ),
+        (
+            lambda: draw_map(make_labels(), "flow", 3),
+            ChoiceError,
+            ("frame", "0 to 2", "found 3"),
+        ),
+        (
+            lambda: draw_motion_map(instances, "flow", 0),
+            ChoiceError,
+            ("map", "only instance", "heads"),
+        ),
+        (
+            lambda: draw_motion_output(instances, number=1),
             ChoiceError,
             ("prediction", "0 to 0", "found 1"),
         ),
         (
-            lambda: draw_motion_output(alone, style="film"),
+            lambda: draw_motion_output(instances, style="film"),
             ChoiceError,
             ("style", "maps, trail", "'film'"),
         ),
@@ -209,31 +238,40 @@ def test_what_is_not_there_is_named(labels: MotionLabels) -> None:
 
 
 def test_a_trail_is_opaque_at_the_present_and_paler_after(labels: MotionLabels) -> None:
-    grid, columns = labels.config.grid, (50, 56, 62)
+    grid = labels.config.grid
+    columns = (50, 56, 62)
     instance = np.zeros((3, *grid.shape), dtype=np.int32)
     for frame, column in zip(instance, columns, strict=True):
         frame[100:104, column : column + 8] = 1
-    ax = draw_motion_trail(instances_of(instance, grid), marked={1}, ax=new_axes())
+    instances = instances_of(instance, grid)
+
+    ax = draw_motion_trail(instances, marked={1}, ax=new_axes())
+
     opacity = [1, 1, (1 + MIN_TRAIL_OPACITY) / 2, MIN_TRAIL_OPACITY]  # the present is on top
-    expected = 1 - np.outer(opacity, 1 - np.array(to_rgb(COLLIDER_COLOR)))
-    np.testing.assert_allclose(picture(ax)[101, [51, 57, 60, 69]], expected)
-    np.testing.assert_allclose(picture(ax)[90, 51], 1)
-    (path,) = next(
-        each for each in ax.collections if isinstance(each, LineCollection)
-    ).get_segments()
+    expected_colors = 1 - np.outer(opacity, 1 - np.array(to_rgb(COLLIDER_COLOR)))
+    image = first_image(ax)
+    np.testing.assert_allclose(image[101, [51, 57, 60, 69]], expected_colors)
+    np.testing.assert_allclose(image[90, 51], 1)
+    lines = next(shape for shape in ax.collections if isinstance(shape, LineCollection))
+    (path,) = lines.get_segments()
     np.testing.assert_allclose(path, [(-50 + 0.5 * (column + 4), 1.0) for column in columns])
-    none = draw_motion_trail(instances_of(instance, grid), layers=["ids"], ax=new_axes())
-    assert (len(none.images), texts(none)) == (0, ["1"])
+
+    ids_only = draw_motion_trail(instances, layers=["ids"], ax=new_axes())
+    assert (len(ids_only.images), read_texts(ids_only)) == (0, ["1"])
 
 
 @pytest.mark.parametrize("orientation", ORIENTATIONS)
-def test_outputs_are_drawn_as_they_lie(labels: MotionLabels, orientation: Any) -> None:
+def test_outputs_are_drawn_like_labels_in_every_orientation(
+    labels: MotionLabels, orientation: Any
+) -> None:
     heads = MotionHeads.from_labels(labels).in_orientation(orientation)
     output = MotionOutput(grid=labels.config.grid.with_orientation(orientation), heads=(heads,))
-    shown = picture(draw_motion_map(output, "instance", 0, ax=new_axes()))
-    np.testing.assert_array_equal((shown != 1).any(axis=-1), labels.segmentation[0] == 1)
+    instance_image = first_image(draw_motion_map(output, "instance", 0, ax=new_axes()))
+
+    np.testing.assert_array_equal((instance_image != 1).any(axis=-1), labels.segmentation[0] == 1)
     for name in ("offset", "flow"):
-        mine, true = (
-            picture(draw_motion_map(each, name, 0, ax=new_axes())) for each in (output, labels)
+        output_image, label_image = (
+            first_image(draw_motion_map(motion, name, 0, ax=new_axes()))
+            for motion in (output, labels)
         )
-        np.testing.assert_allclose(mine, true, atol=1e-6)
+        np.testing.assert_allclose(output_image, label_image, atol=1e-6)

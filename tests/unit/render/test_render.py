@@ -1,6 +1,4 @@
-"""The texts of every view: in the picture, not over each other, and large enough to be read in
-print.
-"""
+"""The texts of every view are in the picture, apart from each other and large enough for print."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib import pyplot as plt
-from picture_texts import panels_share, text_faults
-from refusals import assert_refused
+from support.expected_errors import assert_raises
+from support.figure_texts import STYLES, find_text_faults, panel_area_ratio
+from support.replay_page import normal_scenario
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import (
@@ -32,27 +31,33 @@ from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import Link
 
-DRAWN = ("boxes", "trajectories", "grid")
+SENSORLESS_LAYERS = ("boxes", "trajectories", "grid")  # of releases without sensor files
 """Layers of releases without sensor files."""
 
 
-def countdown(da: DeepAccident, scenario: Any) -> Any:
+def render_countdown(da: DeepAccident, scenario: Any) -> Any:
     figure = detached_figure((12.8, 7.2))
-    draw_countdown(da, scenario["last_frame_token"], agents=AGENTS, layers=DRAWN, fig=figure)
+    draw_countdown(
+        da, scenario["last_frame_token"], agents=AGENTS, layers=SENSORLESS_LAYERS, fig=figure
+    )
     return figure
 
 
-def ego(scenario: Any) -> str:
+def ego_sample(scenario: Any) -> str:
+    """Return the token of the ego's last sample but one."""
     return f"{scenario['token']}/ego_vehicle/{scenario['num_frames'] - 1:03d}"
 
 
-def moments() -> tuple[float, ...]:
-    return (0.2, 0.0) if current_style().room == "column" else (0.2, 0.1, 0.0)
+def seconds_before() -> tuple[float, ...]:
+    """Return as many moments before the impact as the current style has room for."""
+    return (0.2, 0.0) if current_style().layout == "column" else (0.2, 0.1, 0.0)
 
 
 VIEWS: dict[str, Callable[[DeepAccident, Any], Any]] = {
-    "accident": lambda da, scenario: da.render_accident(scenario, seconds=moments(), layers=DRAWN),
-    "annotation": lambda da, scenario: da.render_annotation(f"{ego(scenario)}/1"),
+    "accident": lambda da, scenario: da.render_accident(
+        scenario, seconds=seconds_before(), layers=SENSORLESS_LAYERS
+    ),
+    "annotation": lambda da, scenario: da.render_annotation(f"{ego_sample(scenario)}/1"),
     "calibration": lambda da, scenario: da.render_calibration(
         scenario["last_frame_token"], layers=["boxes"]
     ),
@@ -60,64 +65,73 @@ VIEWS: dict[str, Callable[[DeepAccident, Any], Any]] = {
     "instance": lambda da, scenario: da.render_instance(
         f"{scenario['token']}/actor/{scenario['collision']['ids'][0]}"
     ),
-    "labels": lambda da, scenario: da.render_motion_labels(ego(scenario)),
-    "labels maps": lambda da, scenario: da.render_motion_labels(ego(scenario), style="maps"),
-    "labels trail": lambda da, scenario: da.render_motion_labels(ego(scenario), style="trail"),
-    "sample": lambda da, scenario: da.render_sample(ego(scenario), layers=["boxes"]),
-    "camera": lambda da, scenario: da.render_sample_data(
-        f"{ego(scenario)}/Camera_Front", layers=["boxes"]
+    "labels": lambda da, scenario: da.render_motion_labels(ego_sample(scenario)),
+    "labels maps": lambda da, scenario: da.render_motion_labels(ego_sample(scenario), style="maps"),
+    "labels trail": lambda da, scenario: da.render_motion_labels(
+        ego_sample(scenario), style="trail"
     ),
-    "bev": lambda da, scenario: da.render_bev(ego(scenario), agents="all", layers=["boxes", "ids"]),
+    "sample": lambda da, scenario: da.render_sample(ego_sample(scenario), layers=["boxes"]),
+    "camera": lambda da, scenario: da.render_sample_data(
+        f"{ego_sample(scenario)}/Camera_Front", layers=["boxes"]
+    ),
+    "bev": lambda da, scenario: da.render_bev(
+        ego_sample(scenario), agents="all", layers=["boxes", "ids"]
+    ),
     "link": lambda da, scenario: da.render_link(
-        ego(scenario), Link(latency=0.1, pose_noise=0.5), layers=["boxes"]
+        ego_sample(scenario), Link(latency=0.1, pose_noise=0.5), layers=["boxes"]
     ),
     "visibility": lambda da, scenario: da.render_visibility(scenario["last_frame_token"]),
     "visibility matrix": lambda da, scenario: da.render_visibility_matrix(
         scenario["last_frame_token"]
     ),
     "lidar": lambda da, scenario: da.render_sample_data(
-        f"{ego(scenario)}/lidar01", layers=["boxes"]
+        f"{ego_sample(scenario)}/lidar01", layers=["boxes"]
     ),
 }
 
-AT_THE_END = ("frame", "visibility")
-"""Views of the last moment, the first in world."""
-WHOLE = (*AT_THE_END, "bev", "sample", "link", "lidar", "labels trail")
-"""Views from above that show the pair wherever they are."""
+LAST_MOMENT = ("frame", "visibility")
+FROM_ABOVE = (*LAST_MOMENT, "bev", "sample", "link", "lidar", "labels trail")
 
 
-def accidents(da: DeepAccident) -> list[Any]:
+def find_accidents(da: DeepAccident) -> list[Any]:
     return [scenario for scenario in da.scenario if scenario["collision"]]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [None, "cvpr-column", "slide"])
+@pytest.mark.parametrize("medium", STYLES)
 @pytest.mark.parametrize("view", VIEWS)
 def test_texts_are_in_the_picture_and_apart_and_panels_are_large(
-    da_b: DeepAccident, view: str, where: Any
+    da_b: DeepAccident, view: str, medium: Any
 ) -> None:
-    """What is square on a slide is as high as it can be, and maps have keys; the pair is within the
-    view.
-    """
-    scenario = accidents(da_b)[0]
-    with style(where):
+    """A square view in a wide figure is as high as it can be; views from above show the pair."""
+    scenario = find_accidents(da_b)[0]
+    with style(medium):
         figure = VIEWS[view](da_b, scenario).figure
-        assert text_faults(figure) == []
+        assert find_text_faults(figure) == []
+
     panels = [ax for ax in figure.axes if ax.axison]
-    square = (
-        where == "slide" and len(panels) == 1 and panels[0].bbox.height > 0.75 * figure.bbox.height
+    is_high_square = (
+        medium in ("slide", "cvpr-page", "ieee-page")
+        and len(panels) == 1
+        and panels[0].bbox.height > 0.75 * figure.bbox.height
     )
-    assert panels_share(figure) >= 0.5 or square or view == "labels maps" or where is None
-    if view in WHOLE:
-        sample = (
-            f"{scenario['token']}/ego_vehicle/{scenario['num_frames'] - (view in AT_THE_END):03d}"
-        )
-        boxes = da_b.cooperative_boxes(sample, frame="world" if view in AT_THE_END[:1] else "ego")
-        pair = boxes.select(np.isin(boxes.actor_id, scenario["collision"]["ids"])).center[:, :2]
+    assert (
+        panel_area_ratio(figure) >= 0.5
+        or is_high_square
+        or view == "labels maps"  # they have keys
+        or medium is None
+    )
+
+    if view in FROM_ABOVE:
+        frame = scenario["num_frames"] - (view in LAST_MOMENT)
+        sample = f"{scenario['token']}/ego_vehicle/{frame:03d}"
+        boxes = da_b.cooperative_boxes(sample, frame="world" if view == "frame" else "ego")
+        is_in_pair = np.isin(boxes.actor_id, scenario["collision"]["ids"])
+        pair_centers = boxes.select(is_in_pair).center[:, :2]
         above = next(ax for ax in panels if "(m)" in ax.get_xlabel())
         low, high = np.array([above.get_xlim(), above.get_ylim()]).T
-        assert len(pair) == 2
-        assert ((low < pair) & (pair < high)).all()
+        assert len(pair_centers) == 2
+        assert ((low < pair_centers) & (pair_centers < high)).all()
 
 
 Draw = Callable[[Any, str], object]
@@ -127,32 +141,36 @@ def scenario_of(sample: str) -> str:
     return sample.rsplit("/", 2)[0]
 
 
-def of_layers(name: str, layer: str, *rest: Any, **how: Any) -> tuple[Draw, type[Exception], str]:
-    """A method that has no such layer."""
+def refuse_layer(
+    name: str, layer: str, *arguments: Any, **options: Any
+) -> tuple[Draw, type[Exception], str]:
+    """Return a case in which a method is asked for a layer that it lacks."""
     return (
-        lambda da, sample: getattr(da, name)(sample, *rest, layers=[layer], **how),
+        lambda da, sample: getattr(da, name)(sample, *arguments, layers=[layer], **options),
         ChoiceError,
         f"layers.*'{layer}'",
     )
 
 
-def of_range(name: str, metres: float, *rest: Any) -> tuple[Draw, type[Exception], str]:
-    """A method that cannot show so many metres."""
+def refuse_range(
+    name: str, view_range: float, *arguments: Any
+) -> tuple[Draw, type[Exception], str]:
+    """Return a case in which a method is asked for a range, in metres, that it cannot show."""
     return (
-        lambda da, sample: getattr(da, name)(sample, *rest, view_range=metres),
+        lambda da, sample: getattr(da, name)(sample, *arguments, view_range=view_range),
         ChoiceError,
-        f"view_range.*{metres}",
+        f"view_range.*{view_range}",
     )
 
 
-REFUSED: list[tuple[Draw, type[Exception], str]] = [
-    of_layers("render_bev", "image"),
-    of_layers("render_visibility", "image"),
-    of_layers("render_calibration", "bev"),
-    of_layers("render_link", "image", Link()),
-    of_layers("render_sample", "labels"),
-    of_layers("render_evaluation", "labels", []),
-    of_layers("render_motion_labels", "velocities", style="trail"),
+REFUSED_CASES: list[tuple[Draw, type[Exception], str]] = [
+    refuse_layer("render_bev", "image"),
+    refuse_layer("render_visibility", "image"),
+    refuse_layer("render_calibration", "bev"),
+    refuse_layer("render_link", "image", Link()),
+    refuse_layer("render_sample", "labels"),
+    refuse_layer("render_evaluation", "labels", []),
+    refuse_layer("render_motion_labels", "velocities", style="trail"),
     (
         lambda da, sample: da.render_accident(scenario_of(sample), layers=["labels"]),
         ChoiceError,
@@ -173,9 +191,9 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
         ChoiceError,
         r"layers: .*, found 'ids'",
     ),
-    *(of_range("render_bev", metres) for metres in (0.0, -5.0, float("nan"), float("inf"))),
-    of_range("render_visibility", 0.0),
-    of_range("render_link", -5.0, Link()),
+    *(refuse_range("render_bev", metres) for metres in (0.0, -5.0, float("nan"), float("inf"))),
+    refuse_range("render_visibility", 0.0),
+    refuse_range("render_link", -5.0, Link()),
     (
         lambda da, sample: da.render_bev(sample, frame="Camera_Front"),
         ChoiceError,
@@ -188,7 +206,7 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
     ),
     (lambda da, sample: da.render_bev(sample, agents="ego"), ChoiceError, "agents.*single"),
     (
-        lambda da, sample: da.render_frame(sample.rsplit("/", 2)[0] + "/004", agents="pole"),
+        lambda da, sample: da.render_frame(f"{scenario_of(sample)}/004", agents="pole"),
         ChoiceError,
         "agents: ",
     ),
@@ -203,9 +221,7 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
     (lambda da, _: da.render_calibration("nothing"), TokenError, "has no token"),
     (lambda da, _: da.render_instance("no/one/actor/9999"), TokenError, "has no token"),
     (
-        lambda da, _: da.render_accident(
-            next(each for each in da.scenario if not each["collision"])
-        ),
+        lambda da, _: da.render_accident(normal_scenario(da)),
         NotAvailableError,
         "nobody collides",
     ),
@@ -243,7 +259,7 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
     (
         lambda da, sample: render_outcome_in_cameras(da, sample, [], frame=1),
         ChoiceError,
-        "only motion has frames",
+        "only predicted motion has frames",
     ),
     (
         lambda da, sample: render_outcome_in_cameras(da, f"{sample}0", []),
@@ -253,19 +269,19 @@ REFUSED: list[tuple[Draw, type[Exception], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("draw", "error", "sentence"), REFUSED)
+@pytest.mark.parametrize(("draw", "error", "sentence"), REFUSED_CASES)
 def test_what_cannot_be_rendered_is_refused(
     draw: Draw, error: type[Exception], sentence: str, da_motion: DeepAccident, sample: str
 ) -> None:
-    assert_refused((lambda: draw(da_motion, sample), error, sentence))
+    assert_raises((lambda: draw(da_motion, sample), error, sentence))
     assert plt.get_fignums() == []
 
 
 @pytest.mark.parametrize(
     ("camera", "frame", "sentence"),
     [
-        ("Camera_Front", -1, "frame: expected a recorded one, from 0 to {last}, found -1"),
-        ("Camera_Front", 99, "frame: expected a recorded one, from 0 to {last}, found 99"),
+        ("Camera_Front", -1, "frame: expected a recorded frame, from 0 to {last}, found -1"),
+        ("Camera_Front", 99, "frame: expected a recorded frame, from 0 to {last}, found 99"),
         ("lidar01", None, "camera: expected one of .*, found 'lidar01'"),
     ],
 )
@@ -277,10 +293,10 @@ def test_a_panel_of_no_camera_or_frame_is_refused(
     frame: int | None,
     sentence: str,
 ) -> None:
-    verdict = sample_verdict(
-        da_motion, sample, instances_of(labels.instance, labels.config.grid), label=labels
-    )
-    assert_refused(
+    prediction = instances_of(labels.instance, labels.config.grid)
+    verdict = sample_verdict(da_motion, sample, prediction, label=labels)
+
+    assert_raises(
         (
             lambda: draw_outcome_in_camera(da_motion, verdict, camera, frame=frame),
             ChoiceError,
@@ -292,8 +308,8 @@ def test_a_panel_of_no_camera_or_frame_is_refused(
 @pytest.mark.slow
 @pytest.mark.parametrize("view", [*VIEWS, "countdown"])
 def test_texts_of_other_scenes_are_apart(da_designs: DeepAccident, view: str) -> None:
-    draw = {**VIEWS, "countdown": countdown}[view]
-    scenes = accidents(da_designs)[::3]
-    assert [
-        fault for scene in scenes for fault in text_faults(draw(da_designs, scene).figure)
-    ] == []
+    render = {**VIEWS, "countdown": render_countdown}[view]
+    faults = []
+    for scenario in find_accidents(da_designs)[::3]:
+        faults += find_text_faults(render(da_designs, scenario).figure)
+    assert faults == []

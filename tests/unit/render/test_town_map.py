@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawing import has_color, new_axes, on_canvas, rendered
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
-from refusals import assert_refused
+from support.expected_errors import assert_raises
+from support.rendered_pixels import canvas_positions, has_color, new_axes, render_canvas
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -23,79 +23,82 @@ from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR
 
 
 @pytest.fixture(scope="module")
-def mapped(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """The release without images and points; of its first scenario the ego has no BEV camera."""
-    root, ignored = (
-        tmp_path_factory.mktemp("mapped") / "release",
-        (".deepaccident", *CAMERAS, LIDAR),
-    )
-    shutil.copytree(
-        release_root, root, copy_function=os.link, ignore=shutil.ignore_patterns(*ignored)
-    )
+def unmapped_da(release_root: Path, tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
+    """The release without images and points; in its first scenario the ego has no BEV camera."""
+    root = tmp_path_factory.mktemp("mapped") / "release"
+    ignore = shutil.ignore_patterns(".deepaccident", *CAMERAS, LIDAR)
+    shutil.copytree(release_root, root, copy_function=os.link, ignore=ignore)
     da = DeepAccident("v1", root, verbose=False)
-    shutil.rmtree(
-        da.get_sample_data_path(f"{da.scenario[0]['token']}/ego_vehicle/001/{BEV_CAMERA}").parent
-    )
+    bev_image = f"{da.scenario[0]['token']}/ego_vehicle/001/{BEV_CAMERA}"
+    shutil.rmtree(da.get_sample_data_path(bev_image).parent)
     return da
 
 
-def ground_of(ax: Axes) -> list[set[str]]:
-    """The colours of the pictures drawn, the lowest first."""
-    pictures = [
-        np.asarray(one.get_array())
-        for one in sorted(ax.images, key=lambda image: image.get_zorder())
-    ]
-    return [
-        {to_hex(color / 255) for color in np.unique(each.reshape(-1, 3), axis=0)}
-        for each in pictures
-    ]
+def read_ground_colors(ax: Axes) -> list[set[str]]:
+    """Return the colours of each picture drawn, the lowest picture first."""
+    colors = []
+    for image in sorted(ax.images, key=lambda image: image.get_zorder()):
+        pixels = np.asarray(image.get_array()).reshape(-1, 3)
+        colors.append({to_hex(color / 255) for color in np.unique(pixels, axis=0)})
+    return colors
 
 
-def test_a_kept_map_takes_the_place_of_a_missing_bev_camera_and_is_not_made_for_it(
-    mapped: DeepAccident,
+def test_a_stored_map_replaces_a_missing_bev_camera_but_none_is_made_for_it(
+    unmapped_da: DeepAccident,
 ) -> None:
-    sample, how = f"{mapped.scenario[0]['token']}/ego_vehicle/003", {"layers": ("bev", "boxes")}
-    ax = render_bev(mapped, sample, ax=new_axes(), **how)
-    assert (ground_of(ax), missing_words(ax)) == ([], [f"{BEV_CAMERA}: not downloaded"])
-    town_map(mapped, mapped.scenario[0]["town"], workers=1)
-    ax = render_bev(mapped, sample, ax=new_axes(), **how)
-    assert (len(ground_of(ax)), missing_words(ax)) == (1, [])
-    there = render_bev(mapped, sample.replace("ego_vehicle", "other_vehicle"), ax=new_axes())
-    assert [image.get_zorder() for image in there.images] == [0]  # the camera's own picture alone
+    scenario = unmapped_da.scenario[0]
+    sample = f"{scenario['token']}/ego_vehicle/003"
+
+    ax = render_bev(unmapped_da, sample, layers=("bev", "boxes"), ax=new_axes())
+    assert read_ground_colors(ax) == []
+    assert missing_words(ax) == [f"{BEV_CAMERA}: not downloaded"]
+
+    town_map(unmapped_da, scenario["town"], workers=1)
+    ax = render_bev(unmapped_da, sample, layers=("bev", "boxes"), ax=new_axes())
+    assert (len(read_ground_colors(ax)), missing_words(ax)) == (1, [])
+
+    other_sample = sample.replace("ego_vehicle", "other_vehicle")
+    ax = render_bev(unmapped_da, other_sample, ax=new_axes())
+    assert [image.get_zorder() for image in ax.images] == [0]  # only the camera's own picture
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frame", ["ego", "world"])
 def test_the_map_lies_where_the_bev_camera_sees_the_ground(
-    mapped: DeepAccident, frame: str
+    unmapped_da: DeepAccident, frame: str
 ) -> None:
-    sample = f"{mapped.scenario[0]['token']}/other_vehicle/003"
-    ax = render_bev(mapped, sample, layers=("map",), frame=frame, view_range=40, ax=new_axes())
-    picture, tags = rendered(ax), mapped.load_bev(sample).semantic
+    sample = f"{unmapped_da.scenario[0]['token']}/other_vehicle/003"
+    ax = render_bev(unmapped_da, sample, layers=("map",), frame=frame, view_range=40, ax=new_axes())
+    canvas = render_canvas(ax)
+
+    tags = unmapped_da.load_bev(sample).semantic
     points = np.random.default_rng(2).uniform(-27, 27, (1500, 2))
     corners = np.rint(599.5 - points / 0.1).astype(int) - 12
-    inner = [
+    tags_around_points = [
         np.unique(tags[row : row + 25, column : column + 25]).tolist()
         for row, column in corners.tolist()
     ]
-    axes_from_ego = mapped.world_from(sample, frame).inverse() @ mapped.world_from(sample, "ego")
-    places = axes_from_ego.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
+    frame_from_world = unmapped_da.world_from(sample, frame).inverse()
+    frame_from_ego = frame_from_world @ unmapped_da.world_from(sample, "ego")
+    positions = frame_from_ego.apply(np.column_stack([points, np.zeros(len(points))]))[:, :2]
     for name in ("road", "sidewalk"):
-        alone = on_canvas(ax, places[[kinds == [TAGS[name]] for kinds in inner]])
-        assert len(alone) > 8
-        assert {has_color(picture, place, BEV_COLORS[name], tolerance=2.0) for place in alone} == {
-            True
-        }
+        is_inside = [tags_around == [TAGS[name]] for tags_around in tags_around_points]
+        pixels = canvas_positions(ax, positions[is_inside])
+        assert len(pixels) > 8
+        for pixel in pixels:
+            assert has_color(canvas, pixel, BEV_COLORS[name], tolerance=2.0)
 
 
 def test_where_no_agent_has_a_bev_camera_the_picture_says_so(da_b: DeepAccident) -> None:
     ax = render_bev(da_b, da_b.sample[0], layers=("map", "boxes"), ax=new_axes())
-    assert (ground_of(ax), missing_words(ax)) == ([], [f"no {BEV_CAMERA} for a map of the town"])
+    assert read_ground_colors(ax) == []
+    assert missing_words(ax) == [f"no {BEV_CAMERA} for a map of the town"]
 
 
-def test_a_town_as_a_picture(mapped: DeepAccident) -> None:
-    town = mapped.scenario[0]["town"]
-    ax, made = mapped.render_town_map(town, ax=new_axes()), town_map(mapped, town, workers=1)
-    assert (*ax.get_xlim(), *ax.get_ylim()) == made.extent
-    assert {*MAP_COLORS.values()} <= ground_of(ax)[0]
-    assert_refused((lambda: render_town_map(mapped, "Town99"), ChoiceError, ("'Town99'", town)))
+def test_a_town_as_a_picture(unmapped_da: DeepAccident) -> None:
+    town = unmapped_da.scenario[0]["town"]
+    ax = unmapped_da.render_town_map(town, ax=new_axes())
+    extent = town_map(unmapped_da, town, workers=1).extent
+    assert (*ax.get_xlim(), *ax.get_ylim()) == extent
+    assert {*MAP_COLORS.values()} <= read_ground_colors(ax)[0]
+    assert_raises((lambda: render_town_map(unmapped_da, "Town99"), ChoiceError, ("'Town99'", town)))

@@ -1,21 +1,23 @@
-"""Curves of a training run: a panel for each number, and a file that is there whole or not at
+"""Curves of a training run: a panel for each number, and a file that is written whole or not at
 all.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from picture_texts import text_faults
+from matplotlib.image import imread
+from support.figure_texts import STYLES, find_text_faults
 
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.training import render_curve, render_training, save_training
 
 
-def rows(steps: int) -> list[dict]:
-    """A log with two losses, and two scores at every fourth step."""
+def make_log(num_steps: int) -> list[dict]:
+    """Make a log with two losses at each step, and two scores at every fourth."""
     log = []
-    for step in range(1, steps + 1):
+    for step in range(1, num_steps + 1):
         row = {
             "step": step,
             "loss": 3.0,
@@ -30,29 +32,43 @@ def rows(steps: int) -> list[dict]:
 
 def test_each_number_has_a_panel() -> None:
     figure = detached_figure((10, 5))
-    assert render_training(rows(8), "a run", fig=figure) is figure
+
+    assert render_training(make_log(8), "a run", fig=figure) is figure
     titles = [ax.get_title() for ax in figure.axes]
-    assert titles == ["total", "seg", "flow", "validation: iou", "validation: score", ""]
+    assert titles == ["total", "seg", "flow", "validation: IoU", "validation: score", ""]
     dots, line = figure.axes[3].get_lines()
-    for each in (dots, line):
-        np.testing.assert_allclose(each.get_xydata(), [[4, 0.04], [8, 0.08]])
+    for curve in (dots, line):
+        np.testing.assert_allclose(curve.get_xydata(), [[4, 0.04], [8, 0.08]])
 
 
 def test_a_loss_of_nothing_is_a_gap() -> None:
+    losses = [1.0, 1.0, 0.0, 0.0, 1.0, 1.0]
+    log = [{"step": step, "losses": {"seg": loss}} for step, loss in enumerate(losses, start=1)]
+    ax = render_training(log, "a run", fig=detached_figure((10, 3))).axes[0]
+    dots, line = ax.get_lines()
+    assert np.isnan(dots.get_ydata()).tolist() == [False, False, True, True, False, False]
+    assert line.get_xdata().tolist() == [1, 2, 5, 6]
+
+
+def test_the_total_has_no_dip_where_a_loss_is_not_computed() -> None:
+    """A loss that no step computes leaves the total as it is."""
+    flows = [2.0, 0.0, 2.0]
     log = [
-        {"step": step, "losses": {"seg": 0.0 if step in (3, 4) else 1.0}} for step in range(1, 7)
+        {"step": step, "loss": 1.0 + flow, "losses": {"seg": 1.0, "flow": flow, "unused": 0.0}}
+        for step, flow in enumerate(flows, start=1)
     ]
-    (ax, *_) = render_training(log, "a run", fig=detached_figure((10, 3))).axes
-    for line in ax.get_lines():
-        assert np.isnan(line.get_ydata()).tolist() == [False, False, True, True, False, False]
+    ax = render_training(log, "a run", fig=detached_figure((10, 3))).axes[0]
+    assert ax.get_title() == "total"
+    np.testing.assert_array_equal(ax.get_lines()[0].get_ydata(), [3.0, np.nan, 3.0])
 
 
 def test_many_steps_are_averaged() -> None:
-    """Each dot stays, and the line keeps the mean."""
+    """All steps have a dot, and averaging does not change the mean."""
     values = np.random.default_rng(0).normal(2.0, 1.0, 600)
     ax = render_curve(range(600), values, "loss", ax=detached_figure((3, 2)).subplots())
     _, line = ax.get_lines()
-    assert (len(line.get_xydata()), line.get_ydata().mean()) == (60, pytest.approx(values.mean()))
+    assert len(line.get_xydata()) == 60
+    assert line.get_ydata().mean() == pytest.approx(values.mean())
     np.testing.assert_allclose(line.get_xydata()[0], [4.5, values[:10].mean()])
 
 
@@ -63,5 +79,21 @@ def test_short_logs_are_drawn(log: list[dict], tmp_path: Path) -> None:
     assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
-def test_words_are_apart_and_large() -> None:
-    assert text_faults(render_training(rows(12), "a run")) == []
+@pytest.mark.parametrize("medium", STYLES)
+def test_words_are_apart_and_large(medium: Any) -> None:
+    log = make_log(12)
+    for row in log:
+        row["losses"] |= dict.fromkeys(("motion_segmentation", "motion_centerness"), 1.0)
+        row.setdefault("validation", {}).update(iou_100x100=40.0, vpq_100x100=30.0)
+    with style(medium):
+        figure = render_training(log, "a run")
+        assert find_text_faults(figure) == []
+
+
+def test_a_style_writes_a_page_s_picture_and_a_paper_s_file(tmp_path: Path) -> None:
+    with style("cvpr-column", title=False):
+        save_training(make_log(4), "a run", tmp_path / "curves.png")
+    save_training(make_log(4), "a run", tmp_path / "plain.png")
+    widths = [imread(tmp_path / name).shape[1] for name in ("curves.png", "plain.png")]
+    assert widths[0] == widths[1]
+    assert b"/MediaBox [ 0 0 234 " in (tmp_path / "curves.pdf").read_bytes()  # 3.25 inches

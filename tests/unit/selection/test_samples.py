@@ -1,4 +1,4 @@
-"""Lists of samples: those that models are trained on, and those that they are evaluated at."""
+"""The lists of samples that models are trained and evaluated on."""
 
 import re
 import shutil
@@ -6,9 +6,9 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-import tiny
-from refusals import assert_refused
-from written_out import written_out
+from support import tiny_release
+from support.default_values import package_values
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError
@@ -21,17 +21,17 @@ from deepaccident_devkit.selection.samples import (
 from deepaccident_devkit.taxonomy import AGENTS
 
 
-def _frames(tokens: list[str], scenario: str, agent: str) -> list[int]:
-    return [int(one.rsplit("/", 1)[1]) for one in tokens if one.startswith(f"{scenario}/{agent}/")]
+def select_frames(tokens: list[str], scenario_token: str, agent: str) -> list[int]:
+    agent_tokens = [token for token in tokens if token.startswith(f"{scenario_token}/{agent}/")]
+    return [int(token.rsplit("/", 1)[1]) for token in agent_tokens]
 
 
 @pytest.fixture
 def every_scenario(da_motion: DeepAccident, tmp_path: Path) -> Path:
-    split = tmp_path / "mine.txt"
-    split.write_text(
-        "".join(f"{record['token'].replace('/', ' ')}\n" for record in da_motion.scenario)
-    )
-    return split
+    split_file = tmp_path / "mine.txt"
+    lines = [record["token"].replace("/", " ") for record in da_motion.scenario]
+    split_file.write_text("\n".join(lines))
+    return split_file
 
 
 def test_training_takes_a_sample_a_second_counted_from_the_end(
@@ -40,7 +40,7 @@ def test_training_takes_a_sample_a_second_counted_from_the_end(
     tokens = samples(da_motion, every_scenario, "train")
     for scenario in da_motion.scenario:
         for agent in AGENTS:
-            assert _frames(tokens, scenario["token"], agent) == [5, 15, 25, 35]
+            assert select_frames(tokens, scenario["token"], agent) == [5, 15, 25, 35]
 
 
 def test_evaluation_takes_the_last_two_seconds_of_accidents_but_the_end(
@@ -50,7 +50,7 @@ def test_evaluation_takes_the_last_two_seconds_of_accidents_but_the_end(
     for scenario in da_motion.scenario:
         expected = [15, 20, 25, 30] if scenario["designed_accident"] else []
         for agent in AGENTS:
-            assert _frames(tokens, scenario["token"], agent) == expected
+            assert select_frames(tokens, scenario["token"], agent) == expected
 
 
 def test_the_paper_leaves_horizon_and_scope_open(
@@ -58,29 +58,25 @@ def test_the_paper_leaves_horizon_and_scope_open(
 ) -> None:
     tokens = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
     for scenario in da_motion.scenario:
-        assert _frames(tokens, scenario["token"], "infrastructure") == [5, 10, 15, 20, 25, 30]
-    assert len(samples(da_motion, every_scenario, "all")) == 2 * 5 * 7
-    assert samples(da_motion, every_scenario, "Keyframes") == samples(
-        da_motion, every_scenario, "all"
-    )
-    assert samples(da_motion, "all", "all") == samples(da_motion, every_scenario, "all")
-    assert samples(da_motion, every_scenario, "every") == [
-        sample["token"] for sample in da_motion.sample
-    ]
-    assert {
-        token[-3:]
-        for token in samples(
-            da_motion, every_scenario, "evaluate", "paper", horizon=0.5, scope="all"
-        )
-    } == {"030"}
+        assert select_frames(tokens, scenario["token"], "infrastructure") == [5, 10, 15, 20, 25, 30]
+
+    tokens = samples(da_motion, every_scenario, "evaluate", "paper", horizon=0.5, scope="all")
+    assert {token[-3:] for token in tokens} == {"030"}
+
+    tokens = samples(da_motion, every_scenario, "all")
+    assert len(tokens) == 2 * 5 * 7
+    assert samples(da_motion, every_scenario, "Keyframes") == tokens
+    assert samples(da_motion, "all", "all") == tokens
+    every_token = [sample["token"] for sample in da_motion.sample]
+    assert samples(da_motion, every_scenario, "every") == every_token
 
 
-def test_a_split_belongs_to_its_scenarios_alone(da_motion: DeepAccident, tmp_path: Path) -> None:
-    one = da_motion.scenario[1]["token"]
-    (tmp_path / "one.txt").write_text(one.replace("/", " ") + "\n")
-    assert {
-        token.rsplit("/", 2)[0] for token in samples(da_motion, tmp_path / "one.txt", "all")
-    } == {one}
+def test_a_split_has_only_samples_of_its_scenarios(da_motion: DeepAccident, tmp_path: Path) -> None:
+    scenario_token = da_motion.scenario[1]["token"]
+    split_file = tmp_path / "one.txt"
+    split_file.write_text(scenario_token.replace("/", " ") + "\n")
+    tokens = samples(da_motion, split_file, "all")
+    assert {token.rsplit("/", 2)[0] for token in tokens} == {scenario_token}
 
 
 def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(
@@ -90,9 +86,9 @@ def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(
     assert tokens
     assert evaluation_samples(da_motion, every_scenario) == tokens
     assert da_motion.evaluation_samples(every_scenario, "released") == tokens
-    far = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
-    assert da_motion.evaluation_samples(every_scenario, "paper", horizon=3.0, scope="all") == far
-    assert_refused(
+    tokens = samples(da_motion, every_scenario, "evaluate", "paper", horizon=3.0, scope="all")
+    assert da_motion.evaluation_samples(every_scenario, "paper", horizon=3.0, scope="all") == tokens
+    assert_raises(
         (
             lambda: evaluation_samples(da_motion, every_scenario, horizon=3.0),
             ConfigError,
@@ -102,37 +98,37 @@ def test_evaluation_samples_are_those_of_the_purpose_to_evaluate(
 
 
 def test_a_split_that_was_not_unpacked_says_so(da_motion: DeepAccident) -> None:
-    here = {record["split"] for record in da_motion.scenario}
-    [absent] = {"train", "val"} - here
-    named = (f"{absent}: no scenario", "unpack", f"{here.pop()}: 2 scenarios")
-    assert_refused((lambda: training_samples(da_motion, absent), NotAvailableError, named))
+    (split,) = {record["split"] for record in da_motion.scenario}
+    absent_split = "val" if split == "train" else "train"
+    message = (f"{absent_split}: no scenario", "unpack", f"{split}: 2 scenarios")
+    assert_raises((lambda: training_samples(da_motion, absent_split), NotAvailableError, message))
 
 
 def test_samples_of_a_partial_release_can_be_those_that_have_their_files(
     da: DeepAccident, da_partial: DeepAccident
 ) -> None:
-    """The pole has no LiDAR there, and the ego no front camera."""
-    whole = da.samples("train", "every")
-    assert da.samples("train", "every", sensors=("Camera_Front", "lidar01")) == whole
+    """In the partial release the infrastructure has no LiDAR, and the ego no front camera."""
+
+    def keep_with_files(tokens: list[str], *channels: str) -> list[str]:
+        for channel in channels:
+            tokens = [token for token in tokens if da_partial.sensor_path(token, channel).is_file()]
+        return tokens
+
+    complete_tokens = da.samples("train", "every")
+    assert da.samples("train", "every", sensors=("Camera_Front", "lidar01")) == complete_tokens
     for sensors in ("lidar01", ["Camera_Front"], ("lidar01", "camera_front")):
         channels = [sensors] if isinstance(sensors, str) else sensors
-        there = [
-            token
-            for token in da_partial.samples("train", "every")
-            if all(da_partial.sensor_path(token, channel).is_file() for channel in channels)
-        ]
-        assert da_partial.samples("train", "every", sensors=sensors) == there != whole
-    assert da_partial.training_samples("train", sensors="lidar01") == [
-        token
-        for token in da_partial.training_samples("train")
-        if da_partial.sensor_path(token, "lidar01").is_file()
-    ]
+        expected = keep_with_files(da_partial.samples("train", "every"), *channels)
+        tokens = da_partial.samples("train", "every", sensors=sensors)
+        assert tokens == expected != complete_tokens
+    expected = keep_with_files(da_partial.training_samples("train"), "lidar01")
+    assert da_partial.training_samples("train", sensors="lidar01") == expected
 
 
 def test_choices_and_horizons_that_there_are_not(da_motion: DeepAccident) -> None:
-    """Horizons are numbers of half seconds, and the released protocol has one."""
+    """Horizons are multiples of half a second, and the released protocol has only one."""
     evaluate = partial(samples, da_motion, "train", "evaluate")
-    assert_refused(
+    assert_raises(
         (
             lambda: samples(da_motion, "train", "testing"),
             ChoiceError,
@@ -173,19 +169,20 @@ def test_choices_and_horizons_that_there_are_not(da_motion: DeepAccident) -> Non
 def test_a_split_without_labels_says_so(own_release: Path) -> None:
     for folder in own_release.glob("**/label"):
         shutil.rmtree(folder)
-    unlabelled, split = DeepAccident("v1", own_release, verbose=False), own_release / "mine.txt"
-    split.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
-    assert_refused(
+    unlabelled = DeepAccident("v1", own_release, verbose=False)
+    split_file = own_release / "mine.txt"
+    split_file.write_text(unlabelled.scenario[0]["token"].replace("/", " ") + "\n")
+    assert_raises(
         (
-            lambda: samples(unlabelled, split, "train"),
+            lambda: samples(unlabelled, split_file, "train"),
             NotAvailableError,
-            "none of its samples here has labels",
+            "no sample of this split has labels",
         ),
     )
 
 
 def test_every_default_written_out() -> None:
-    defaults = written_out("deepaccident_devkit.selection.samples")
+    defaults = package_values("deepaccident_devkit.selection.samples")
     assert defaults == {
         "samples.samples": "protocol='released', horizon=2.0, scope='accident', sensors=()",
         "samples.training_samples": "sensors=()",
@@ -194,16 +191,16 @@ def test_every_default_written_out() -> None:
 
 
 def test_a_list_without_samples_says_what_to_do(tmp_path: Path) -> None:
-    split = tmp_path / "one.txt"
-    for kind, told in (
-        ("normal", "leaves out all 1 of its scenarios, .* use scope='all'"),
-        ("accident", "^choose others"),
+    split_file = tmp_path / "one.txt"
+    for kind, message in (
+        ("normal", "excludes every scenario of this split, .* use scope='all'"),
+        ("accident", "^choose other samples"),
     ):
         scenario_type = f"type1_subtype1_{kind}"
-        root = tiny.write_tiny_release(
+        root = tiny_release.write_tiny_release(
             tmp_path / kind, frames=1, scenario_type=scenario_type, agents=("ego_vehicle",)
         )
         release = DeepAccident(dataroot=root, verbose=False, workers=1)
-        split.write_text(f"{scenario_type} {tiny.NAME}\n")
-        assert re.search(told, no_samples_text(release, split, "accident"))
-        assert no_samples_text(release, split, "all") == "choose others"
+        split_file.write_text(f"{scenario_type} {tiny_release.SCENARIO_NAME}\n")
+        assert re.search(message, no_samples_text(release, split_file, "accident"))
+        assert no_samples_text(release, split_file, "all") == "choose other samples"

@@ -1,6 +1,4 @@
-"""The facts of a release: planted in releases written by hand, computed again plainly, and what is
-said of them.
-"""
+"""The facts of a release: planted by hand, computed again by plain loops, and reported."""
 
 import json
 import math
@@ -11,7 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tiny import META, TYPE, ego_to_world, lidar_height, pose, write_tiny_release
+from support.tiny_release import (
+    META_TEXT,
+    SCENARIO_TYPE,
+    ego_to_world,
+    lidar_height,
+    pose,
+    write_tiny_release,
+)
+from support.tiny_release_index import label_path
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -22,29 +28,33 @@ from deepaccident_devkit.statistics.scenario_facts import counted_scenario_facts
 
 pytestmark = pytest.mark.slow
 
-QUIET = "ClearNoon -1 -1 -1 -1 -1 -1 -1 18\n" + "\n".join(META.splitlines()[1:]).replace(
+QUIET_META = "ClearNoon -1 -1 -1 -1 -1 -1 -1 18\n" + "\n".join(META_TEXT.splitlines()[1:]).replace(
     "ego other", "none none"
 )
-UNKNOWN = META.replace("1212 car", "0 car").replace("ego other", "ego none")
-NORMAL = TYPE.replace("accident", "normal")
+UNKNOWN_PARTNER_META = META_TEXT.replace("1212 car", "0 car").replace("ego other", "ego none")
+NORMAL_TYPE = SCENARIO_TYPE.replace("accident", "normal")
 
 
-def named(number: int) -> str:
+def name_scenario(number: int) -> str:
     return f"Town03_type001_subtype0001_scenario{number:05d}"
 
 
-def values_of(root: Path, key: str) -> list[float] | list[list[float]]:
-    """The values of a fact, of all scenarios of a release."""
+def read_values(root: Path, key: str) -> list[float] | list[list[float]]:
+    """Return the values of a fact in all scenarios of a release."""
     da = DeepAccident(dataroot=root, verbose=False)
-    found = [counted_scenario_facts(da, record).values.get(key) for record in da.scenario[:]]
-    return [value for each in found if each is not None for value in each.tolist()]
+    values = []
+    for scenario in da.scenario[:]:
+        scenario_values = counted_scenario_facts(da, scenario).values.get(key)
+        if scenario_values is not None:
+            values += scenario_values.tolist()
+    return values
 
 
 @pytest.mark.parametrize(
-    ("meta", "planted"),
+    ("meta", "expected"),
     [
         (
-            META,
+            META_TEXT,
             {
                 "pair_designed": 1,
                 "ids_ascend": 1,
@@ -55,7 +65,7 @@ def values_of(root: Path, key: str) -> list[float] | list[list[float]]:
             },
         ),
         (
-            META,
+            META_TEXT,
             {
                 "relation_known": 1,
                 "relation_opposite": 0,
@@ -64,67 +74,76 @@ def values_of(root: Path, key: str) -> list[float] | list[list[float]]:
                 "folder_right": 1,
             },
         ),
-        (META.replace("front_side 14", "left_side 15"), {"contact_known": 0, "frames_by_meta": 0}),
-        (META.replace("same", "opposite"), {"relation_known": 1, "relation_opposite": 1}),
         (
-            UNKNOWN,
+            META_TEXT.replace("front_side 14", "left_side 15"),
+            {"contact_known": 0, "frames_by_meta": 0},
+        ),
+        (META_TEXT.replace("same", "opposite"), {"relation_known": 1, "relation_opposite": 1}),
+        (
+            UNKNOWN_PARTNER_META,
             {"unknown_partner": 1, "pair_background": 0, "pair_designed": 0, "agents_named": 1},
         ),
-        (UNKNOWN.replace("0 car", "1300 van"), {"unknown_partner": 0, "pair_background": 1}),
         (
-            META.replace("1223 car", "1236 car"),
+            UNKNOWN_PARTNER_META.replace("0 car", "1300 van"),
+            {"unknown_partner": 0, "pair_background": 1},
+        ),
+        (
+            META_TEXT.replace("1223 car", "1236 car"),
             {"pair_follower": 1, "pair_behind": 0, "agents_named": 0},
         ),
-        (META.replace("id: 1223 1236", "id: 1236 1223"), {"ids_ascend": 0}),
-        (QUIET, {"none_none": 1, "accident_without": 1, "folder_right": 0}),
-        (QUIET.replace("none none", "ego other"), {"none_none": 0}),
-        (META.replace("straight", "up"), {"known_words": 0}),
+        (META_TEXT.replace("id: 1223 1236", "id: 1236 1223"), {"ids_ascend": 0}),
+        (QUIET_META, {"none_none": 1, "accident_without": 1, "folder_right": 0}),
+        (QUIET_META.replace("none none", "ego other"), {"none_none": 0}),
+        (META_TEXT.replace("straight", "up"), {"known_words": 0}),
     ],
 )
-def test_what_meta_says(tmp_path: Path, meta: str, planted: dict[str, float]) -> None:
+def test_what_meta_says(tmp_path: Path, meta: str, expected: dict[str, float]) -> None:
     write_tiny_release(tmp_path, meta=meta)
-    assert {key: min(values_of(tmp_path, key)) for key in planted} == planted
+    assert {key: min(read_values(tmp_path, key)) for key in expected} == expected
 
 
-FRAMES = 24
-CARS = ((1212, 0, 0, 0, 1), (1223, 0, 1, 0, 0), (20001, 60, 0, 20, 0), (20002, 62, 0, 20, 0))
-"""Id, x, metres a frame, y, whether it is tilted: one drives at 10 m/s to one that stands; two
-parked ones overlap.
-"""
+NUM_FRAMES = 24
 
 
 def write_crash(root: Path, lead: float, tilt: float) -> Path:
-    """A release in which the rear car is at x = frame, and the other's centre at `lead`, its yaw
-    `tilt` degrees.
+    """Write a release in which one car drives at 10 m/s towards one that stands.
+
+    The rear car is at x = frame and the other one at x = `lead`, with a yaw of `tilt` degrees. Two
+    parked cars overlap.
     """
-
-    def lines(agent: str, frame: int) -> list[str]:
-        there = ego_to_world(agent, frame) @ pose(z=lidar_height(agent))
-        made = ["0.0 10.0" if agent == "ego_vehicle" else "0.0 0.0"]
-        made += [f"car 0 0 -1.2 4 2 1.5 0 {made[0]} -100 900 False"] * (agent != "infrastructure")
-        for actor, start, speed, side, turned in (
-            CARS if agent in ("ego_vehicle", "infrastructure") else ()
-        ):
-            x, y, z, _ = np.linalg.inv(there) @ (
-                start + lead * (actor == 1212) + speed * frame,
-                side,
-                1,
-                1,
-            )
-            yaw = np.radians(tilt * turned) - np.arctan2(there[1, 0], there[0, 0])
-            velocity = f"{10 * speed * np.cos(yaw)} {10 * speed * np.sin(yaw)}"
-            made += [f"car {x} {y} {z} 4 2 1.5 {yaw} {velocity} {actor} 10 True"] * (
-                (actor, agent) != (1223, "ego_vehicle")
-            )
-        return made
-
-    return write_tiny_release(
-        root, frames=FRAMES, meta=META.replace("14\n", f"{FRAMES + 10}\n"), lines_of=lines
+    # id, x in metres, metres a frame, y in metres, yaw in degrees
+    cars = (
+        (1212, lead, 0, 0, tilt),
+        (1223, 0, 1, 0, 0),
+        (20001, 60, 0, 20, 0),
+        (20002, 62, 0, 20, 0),
     )
+
+    def make_lines(agent: str, frame: int) -> list[str]:
+        world_from_lidar = ego_to_world(agent, frame) @ pose(z=lidar_height(agent))
+        agent_yaw = np.arctan2(world_from_lidar[1, 0], world_from_lidar[0, 0])
+        agent_velocity = "0.0 10.0" if agent == "ego_vehicle" else "0.0 0.0"
+        lines = [agent_velocity]
+        if agent != "infrastructure":
+            lines.append(f"car 0 0 -1.2 4 2 1.5 0 {agent_velocity} -100 900 False")
+        if agent not in ("ego_vehicle", "infrastructure"):
+            return lines
+        for actor_id, start, speed, side, degrees in cars:
+            if (actor_id, agent) == (1223, "ego_vehicle"):
+                continue  # no agent labels its own car a second time
+            center = (start + speed * frame, side, 1, 1)
+            x, y, z, _ = np.linalg.inv(world_from_lidar) @ center
+            yaw = np.radians(degrees) - agent_yaw
+            velocity = f"{10 * speed * np.cos(yaw)} {10 * speed * np.sin(yaw)}"
+            lines.append(f"car {x} {y} {z} 4 2 1.5 {yaw} {velocity} {actor_id} 10 True")
+        return lines
+
+    meta = META_TEXT.replace("14\n", f"{NUM_FRAMES + 10}\n")
+    return write_tiny_release(root, frames=NUM_FRAMES, meta=meta, lines_of=make_lines)
 
 
 @pytest.mark.parametrize(
-    ("lead", "tilt", "planted"),
+    ("lead", "tilt", "expected"),
     [
         (
             26.5,
@@ -210,36 +229,42 @@ def write_crash(root: Path, lead: float, tilt: float) -> Path:
     ],
 )
 def test_what_labels_show(
-    tmp_path: Path, lead: float, tilt: float, planted: dict[str, list[float]]
+    tmp_path: Path, lead: float, tilt: float, expected: dict[str, list[float]]
 ) -> None:
     write_crash(tmp_path, lead, tilt)
-    found = {
-        key: np.unique(np.round(values_of(tmp_path, key), 6), axis=0).tolist() for key in planted
-    }
-    assert found == {
-        key: pytest.approx(sorted(each)) if np.ndim(each) == 1 else sorted(each)
-        for key, each in planted.items()
-    }
+    for key, expected_values in expected.items():
+        values = np.round(read_values(tmp_path, key), 6)
+        unique_values = np.unique(values, axis=0).tolist()
+        if np.ndim(expected_values) == 1:
+            assert unique_values == pytest.approx(sorted(expected_values)), key
+        else:
+            assert unique_values == sorted(expected_values), key
 
 
 def test_the_least_gaps_and_errors_are_those_of_plain_loops(da_motion: DeepAccident) -> None:
-    record = next(each for each in da_motion.scenario[:] if each["collision"])
-    rows = [row for row in da_motion.track[:] if row["scenario_token"] == record["token"]]
-    at = {(row["instance_token"], int(row["frame_token"].rsplit("/", 1)[1])): row for row in rows}
+    (scenario,) = da_motion.find(collision=True)
+    tracks = {}
+    for track in da_motion.track[:]:
+        if track["scenario_token"] == scenario["token"]:
+            frame = int(track["frame_token"].rsplit("/", 1)[1])
+            tracks[track["instance_token"], frame] = track
 
-    def box(actor: str, frame: int, seconds: float = 0) -> np.ndarray:
-        """The outline, after seconds at the mean velocity of the last half second."""
-        row, before = at[actor, frame], at.get((actor, frame - 5))
-        place = np.array(row["translation"][:2])
-        velocity = (
-            (place - before["translation"][:2]) * 2 if before else np.array(row["velocity"][:2])
-        )
-        return np.array(
-            [*(place + velocity * seconds), *row["size"][:2], quaternions.yaw_of(row["rotation"])]
-        )
+    def predict_box(actor: str, frame: int, seconds: float = 0) -> np.ndarray:
+        """Return the box after seconds at the mean velocity of the last half second."""
+        track = tracks[actor, frame]
+        earlier_track = tracks.get((actor, frame - 5))
+        center = np.array(track["translation"][:2])
+        velocity = np.array(track["velocity"][:2])
+        if earlier_track:
+            velocity = (center - earlier_track["translation"][:2]) * 2
+        yaw = quaternions.yaw_of(track["rotation"])
+        return np.array([*(center + velocity * seconds), *track["size"][:2], yaw])
 
-    found = counted_scenario_facts(da_motion, record).values
-    for frame, second, hit in (
+    def distance(box: np.ndarray, other_box: np.ndarray) -> float:
+        return np.hypot(*(box - other_box)[:2])
+
+    facts = counted_scenario_facts(da_motion, scenario).values
+    for frame, second, is_hit in (
         (11, 1, 0),
         (11, 2, 0),
         (11, 3, 1),
@@ -248,74 +273,83 @@ def test_the_least_gaps_and_errors_are_those_of_plain_loops(da_motion: DeepAccid
         (31, 1, 1),
     ):
         times = np.arange(10 * second - 9, 10 * second + 1) / 10
-        ahead = {
-            actor: np.array([box(actor, frame, time) for time in times])
-            for actor, when in at
-            if when == frame
+        actors = [actor for actor, actor_frame in tracks if actor_frame == frame]
+        boxes = {
+            actor: np.array([predict_box(actor, frame, time) for time in times]) for actor in actors
         }
         moving = {
-            each for each in ahead if np.hypot(*(box(each, frame, 1) - box(each, frame))[:2]) > 0.5
+            actor
+            for actor in actors
+            if distance(predict_box(actor, frame, 1), predict_box(actor, frame)) > 0.5
         }
-        pairs = [pair for pair in combinations(ahead, 2) if moving & set(pair)]
-        least = min(gaps_of_pairs(ahead[one], ahead[other]).min() for one, other in pairs)
-        assert [least, hit] == pytest.approx(found[f"foreseen_{second}"][frame // 10 - 1])
-    errors = [
-        [
-            np.hypot(*(box(actor, ahead) - box(actor, frame, (ahead - frame) / 10))[:2])
-            for ahead in seen
+        pairs = [pair for pair in combinations(actors, 2) if moving & set(pair)]
+        min_gap = min(gaps_of_pairs(boxes[first], boxes[second]).min() for first, second in pairs)
+        assert [min_gap, is_hit] == pytest.approx(facts[f"foreseen_{second}"][frame // 10 - 1])
+
+    average_errors, final_errors = [], []
+    for actor, frame in tracks:
+        future_frames = [
+            future for future in range(frame + 10, 36, 10) if (actor, future) in tracks
         ]
-        for actor, frame in at
-        if frame % 5 == 1
-        and frame > 5
-        and (seen := [each for each in range(frame + 10, 36, 10) if (actor, each) in at])
-    ]
-    assert np.sort([found["ade"], found["fde"]]) == pytest.approx(
-        np.sort([[np.mean(each) for each in errors], [each[-1] for each in errors]]), abs=1e-9
-    )
+        if frame % 5 == 1 and frame > 5 and future_frames:
+            errors = []
+            for future in future_frames:
+                predicted = predict_box(actor, frame, (future - frame) / 10)
+                errors.append(distance(predict_box(actor, future), predicted))
+            average_errors.append(np.mean(errors))
+            final_errors.append(errors[-1])
+    assert np.sort(facts["ade"]) == pytest.approx(np.sort(average_errors), abs=1e-9)
+    assert np.sort(facts["fde"]) == pytest.approx(np.sort(final_errors), abs=1e-9)
 
 
 @pytest.fixture(scope="module")
-def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve accidents and twelve twins; a collision with id 0, another with an odd word; in a
-    folder with a name.
+def many_accidents(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve accidents and their twins, in a folder with a person's name.
+
+    One collision has the id 0, another one an odd word.
     """
-    odd = {1: UNKNOWN, 2: META.replace("front_side", "left_side")}
+    odd_metas = {1: UNKNOWN_PARTNER_META, 2: META_TEXT.replace("front_side", "left_side")}
     root = tmp_path_factory.mktemp("facts") / "home of Jane Doe"
     for number in range(12):
         write_tiny_release(
-            root, name=named(number), meta=odd.get(number, META), agents=("ego_vehicle",)
+            root,
+            name=name_scenario(number),
+            meta=odd_metas.get(number, META_TEXT),
+            agents=("ego_vehicle",),
         )
         write_tiny_release(
             root,
-            name=named(number),
-            scenario_type=NORMAL,
-            meta=QUIET,
+            name=name_scenario(number),
+            scenario_type=NORMAL_TYPE,
+            meta=QUIET_META,
             agents=("ego_vehicle",),
             frames=8,
         )
     return root
 
 
-def row_of(report: ReleaseFacts, key: str, kind: str | None = None) -> Fact:
-    return next(row for row in report.facts if row.key == key and kind in (None, row.kind))
+def find_fact(report: ReleaseFacts, key: str, kind: str | None = None) -> Fact:
+    facts = [fact for fact in report.facts if fact.key == key]
+    return next(fact for fact in facts if kind in (None, fact.kind))
 
 
-def test_rows_say_share_interval_and_verdict(many: Path) -> None:
-    da = DeepAccident(dataroot=many, verbose=False, workers=1)
+def test_rows_say_share_interval_and_verdict(many_accidents: Path) -> None:
+    da = DeepAccident(dataroot=many_accidents, verbose=False, workers=1)
     report = release_facts(da, workers=1)
-    assert [row.name for row in report.facts] == [fact.name for fact in FACTS]
-    unknown = row_of(report, "unknown_partner")
-    assert (unknown.here, unknown.cases, unknown.scenarios, unknown.verdict) == (
-        1 / 12,
-        12,
-        12,
-        "agree",
-    )
-    for end in unknown.ends or ():  # Wilson's ends are where the share is 1.96 standard errors away
+    assert [fact.name for fact in report.facts] == [fact.name for fact in FACTS]
+
+    partner = find_fact(report, "unknown_partner")
+    assert partner.here == 1 / 12
+    assert partner.cases == partner.scenarios == 12
+    assert partner.verdict == "agree"
+    for end in partner.ends or ():  # Wilson's ends are where the share is 1.96 standard errors away
         assert abs(end - 1 / 12) == pytest.approx(1.96 * math.sqrt(end * (1 - end) / 12))
-    own = row_of(report, "own_row")  # 144 samples are as sure as their 24 scenarios
-    assert (own.cases, own.ends) == (144, (pytest.approx(24 / (24 + 1.96**2)), 1))
-    told = {
+
+    own_row = find_fact(report, "own_row")  # 144 samples are as sure as their 24 scenarios
+    assert own_row.cases == 144
+    assert own_row.ends == (pytest.approx(24 / (24 + 1.96**2)), 1)
+
+    verdicts = {
         ("contact_known", "all"): "differ",
         ("relation_known", "all"): "agree",
         ("relation_opposite", "some"): "differ",
@@ -332,42 +366,35 @@ def test_rows_say_share_interval_and_verdict(many: Path) -> None:
         ("foreseen_1", "area"): "cannot say",
         ("pole_height", "range"): "cannot say",
     }
-    assert {key: row_of(report, *key).verdict for key in told} == told
-    assert (row_of(report, "length").here, row_of(report, "accident_frames", "least").here) == (
-        1,
-        4,
-    )
-    assert (report.counts["token 8"], report.counts["label ids"]) == (
-        {"front_side": 11, "left_side": 1},
-        {"from 1 on": 144, "-100": 144, "-1": 144},
-    )
+    assert {key: find_fact(report, *key).verdict for key in verdicts} == verdicts
+    assert find_fact(report, "length").here == 1
+    assert find_fact(report, "accident_frames", "least").here == 4
+    assert report.counts["token 8"] == {"front_side": 11, "left_side": 1}
+    assert report.counts["label ids"] == {"from 1 on": 144, "-100": 144, "-1": 144}
     with ThreadPoolExecutor(2) as pool:
         assert release_facts(da, executor=pool) == report
-    few = release_facts(da, [da.scenario[0]["token"]], workers=1)
-    assert {
-        row.verdict
-        for row in few.facts
-        if row.kind in ("share", "mean", "median", "few", "area", "range")
-    } == {"cannot say"}
+
+    one_scenario = release_facts(da, [da.scenario[0]["token"]], workers=1)
+    kinds = ("share", "mean", "median", "few", "area", "range")
+    estimates = [fact for fact in one_scenario.facts if fact.kind in kinds]
+    assert {fact.verdict for fact in estimates} == {"cannot say"}
 
 
 def test_text_and_json_name_nobody_and_tell_what_is_left_out(tmp_path: Path) -> None:
     root = tmp_path / "Jane Doe's"
-    for number, kinds in enumerate(({}, {}, {}, {"meta": None}, {"labelled": False})):
-        write_tiny_release(root, name=named(number), frames=3, **kinds)
-    label = root / TYPE / "ego_vehicle" / "label"
-    (label / named(0) / f"{named(0)}_002.txt").unlink()
-    (label / named(1) / f"{named(1)}_002.txt").write_text("0 0\ncar 1 2 3\n")
-    asked = ["info", str(root), "--facts", "--workers", "1"]
-    text, as_json = (
-        CliRunner().invoke(deepaccident, [*asked, *more], catch_exceptions=False)
-        for more in ((), ("--json",))
-    )
-    found = json.loads(as_json.stdout)
-    assert (text.exit_code, found["scenarios"], found["left_out"]) == (0, 3, 2)
-    rows = {row["key"]: (row["here"], row["cases"], row["verdict"]) for row in found["facts"]}
-    assert [rows[key] for key in ("fields", "gapless")] == [(0.75, 4, "differ")] * 2
-    assert (rows["folder_right"][1], found["counts"]["agents with labels"]) == (2, {"5": 2, "0": 1})
-    assert not [
-        each for each in ("Jane", str(tmp_path), named(2)) if each in text.stdout + as_json.stdout
-    ]
+    for number, options in enumerate(({}, {}, {}, {"meta": None}, {"labelled": False})):
+        write_tiny_release(root, name=name_scenario(number), frames=3, **options)
+    label_path(root, name=name_scenario(0)).unlink()
+    label_path(root, name=name_scenario(1)).write_text("0 0\ncar 1 2 3\n")
+
+    arguments = ["info", str(root), "--facts", "--workers", "1"]
+    text = CliRunner().invoke(deepaccident, arguments, catch_exceptions=False)
+    as_json = CliRunner().invoke(deepaccident, [*arguments, "--json"], catch_exceptions=False)
+    report = json.loads(as_json.stdout)
+    assert (text.exit_code, report["scenarios"], report["left_out"]) == (0, 3, 2)
+    rows = {row["key"]: (row["here"], row["cases"], row["verdict"]) for row in report["facts"]}
+    assert rows["fields"] == rows["gapless"] == (0.75, 4, "differ")
+    assert rows["folder_right"][1] == 2
+    assert report["counts"]["agents with labels"] == {"5": 2, "0": 1}
+    for name in ("Jane", str(tmp_path), name_scenario(2)):
+        assert name not in text.stdout + as_json.stdout

@@ -1,5 +1,5 @@
-"""The cores that this process may use, by its affinity and by control groups in folders made
-here.
+"""The cores that this process may use, by its affinity and by control groups in folders of the
+test.
 """
 
 import math
@@ -14,17 +14,17 @@ VERSION_1 = {"cpu.cfs_quota_us": "{0}\n", "cpu.cfs_period_us": "{1}\n"}
 VERSION_2 = {"cpu.max": "{} {}\n"}
 
 
-def a_system(root: Path, groups: str, quotas: dict[str, str], files: dict[str, str]) -> Path:
-    """Write what a system says of this process; `quotas`: path below the control groups → quota and
-    period.
+def write_system(root: Path, groups: str, quotas: dict[str, str], files: dict[str, str]) -> Path:
+    """Write a system's files on this process; `quotas` has quota and period by path below the
+    control groups.
     """
     (root / "proc/self").mkdir(parents=True)
     (root / "proc/self/cgroup").write_text(f"9:name=systemd:/\n8:cpuset:/other\n{groups}\n")
     for path, words in quotas.items():
-        level = root / "sys/fs/cgroup" / path
-        level.mkdir(parents=True, exist_ok=True)
-        for name, text in files.items():
-            (level / name).write_text(text.format(*words.split()))
+        folder = root / "sys/fs/cgroup" / path
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, template in files.items():
+            (folder / name).write_text(template.format(*words.split()))
     return root
 
 
@@ -57,7 +57,7 @@ def a_system(root: Path, groups: str, quotas: dict[str, str], files: dict[str, s
 def test_quotas_of_control_groups(
     groups: str, quotas: dict[str, str], files: dict[str, str], expected: float, tmp_path: Path
 ) -> None:
-    assert quota_below(a_system(tmp_path, groups, quotas, files)) == expected
+    assert quota_below(write_system(tmp_path, groups, quotas, files)) == expected
 
 
 def test_workers_and_threads_follow_the_quota(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,6 +67,7 @@ def test_workers_and_threads_follow_the_quota(monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr(
             "deepaccident_devkit.support.cores.quota_below", lambda _, quota=quota: quota
         )
-        assert (usable_cores(), batches._worker_count(None, 10_000)) == (cores, cores)
+        assert usable_cores() == cores
+        assert batches._choose_worker_count(None, 10_000) == cores
         with own_threads() as threads:
             assert threads._max_workers == cores

@@ -1,5 +1,5 @@
-"""nuScenes' names that are not here: each error names a counterpart that is, and nothing else
-changes.
+"""Names of nuScenes that do not exist here: each error names a counterpart that does, and nothing
+else changes.
 """
 
 import copy
@@ -8,10 +8,11 @@ import json
 import pickle
 import re
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident, DeepAccidentError, render
 from deepaccident_devkit.errors import FieldError, KeywordError, MissingNameError, TableError
@@ -24,13 +25,14 @@ CLASSES: list[tuple[type, Mapping[str, str]]] = [
     (Box, nuscenes_names.BOX),
     (LidarPointCloud, nuscenes_names.CLOUD),
 ]
-NAMED = {"da": DeepAccident, "box": Box, "cloud": LidarPointCloud, "render": render}
-"""What the first words of counterparts stand for."""
+OWNERS_BY_WORD = {"da": DeepAccident, "box": Box, "cloud": LidarPointCloud, "render": render}
+"""Owners by the first word of a counterpart."""
 
 
 @pytest.fixture
 def box() -> Box:
-    return Box(Boxes.from_arrays([(1.0, 2.0, 3.0)], [(4.0, 2.0, 1.0)], [0.5]), "token", "instance")
+    boxes = Boxes.from_arrays([(1.0, 2.0, 3.0)], [(4.0, 2.0, 1.0)], [0.5])
+    return Box(boxes, "token", "instance")
 
 
 @pytest.fixture
@@ -39,7 +41,7 @@ def cloud() -> LidarPointCloud:
 
 
 @pytest.mark.parametrize(("kind", "names"), CLASSES)
-def test_none_of_the_names_is_here(kind: type, names: Mapping[str, str]) -> None:
+def test_no_name_of_nuscenes_exists_here(kind: type, names: Mapping[str, str]) -> None:
     assert [name for name in names if hasattr(kind, name)] == []
     assert nuscenes_names.TABLES.keys().isdisjoint(table_specs())
 
@@ -49,12 +51,13 @@ def test_none_of_the_names_is_here(kind: type, names: Mapping[str, str]) -> None
     [*(names for _, names in CLASSES), nuscenes_names.KEYWORDS, nuscenes_names.FIELD_HINTS],
     ids=["dataset", "box", "cloud", "keywords", "fields"],
 )
-def test_each_counterpart_is_here(names: Mapping[str, str]) -> None:
-    found = re.findall(r"\b(da|box|cloud|render)\.(\w+)", "\n".join(names.values()))
-    assert [(owner, name) for owner, name in found if not hasattr(NAMED[owner], name)] == []
+def test_each_counterpart_exists_here(names: Mapping[str, str]) -> None:
+    counterparts = re.findall(r"\b(da|box|cloud|render)\.(\w+)", "\n".join(names.values()))
+    for word, name in counterparts:
+        assert hasattr(OWNERS_BY_WORD[word], name), (word, name)
 
 
-OWNERS = {"DeepAccident": "da", "Box": "box", "LidarPointCloud": "cloud"}
+FIXTURE_NAMES = {"DeepAccident": "da", "Box": "box", "LidarPointCloud": "cloud"}
 
 
 @pytest.mark.parametrize(
@@ -63,20 +66,22 @@ OWNERS = {"DeepAccident": "da", "Box": "box", "LidarPointCloud": "cloud"}
 def test_a_name_of_nuscenes_names_the_counterpart(
     request: pytest.FixtureRequest, kind: type, name: str
 ) -> None:
-    """Ours, and an attribute error; of a cloud's class too, from which one is read."""
-    owner = request.getfixturevalue(OWNERS[kind.__name__])
-    named = (
-        f"{kind.__name__} has no '{name}': ",
-        "use " if kind is not DeepAccident else "(see docs/reading.md)",
-    )
-    assert_refused((lambda: getattr(owner, name), MissingNameError, named))
+    """The error is ours and an AttributeError; the class of a cloud raises it as well, since
+    nuScenes reads clouds by it.
+    """
+    owner = request.getfixturevalue(FIXTURE_NAMES[kind.__name__])
+    hint = "(see docs/nuscenes_names.md)" if kind is DeepAccident else "use "
+    message = (f"{kind.__name__} has no '{name}': ", hint)
+
+    assert_raises((lambda: getattr(owner, name), MissingNameError, message))
     if kind is LidarPointCloud:
-        assert_refused((lambda: getattr(kind, name), MissingNameError, named))
-    assert (hasattr(owner, name), issubclass(MissingNameError, DeepAccidentError)) == (False, True)
+        assert_raises((lambda: getattr(kind, name), MissingNameError, message))
+    assert not hasattr(owner, name)
+    assert issubclass(MissingNameError, DeepAccidentError)
 
 
-def test_other_names_fail_as_ever(da: DeepAccident) -> None:
-    assert_refused(
+def test_other_names_fail_as_usual(da: DeepAccident) -> None:
+    assert_raises(
         (lambda: da.samplex, AttributeError, r"^'DeepAccident' object has no attribute 'samplex'$"),
         # the error of the property itself
         (
@@ -91,27 +96,27 @@ def test_other_names_fail_as_ever(da: DeepAccident) -> None:
 
 @pytest.mark.parametrize("name", nuscenes_names.TABLES)
 def test_an_unknown_table_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
-    named = (f"no table '{name}'; ", f"; of nuScenes' table '{name}': ", "reading.md")
-    assert_refused((lambda: da.get(name, "x"), TableError, named))
+    message = (f"no table '{name}'; ", f"; for nuScenes' table '{name}': ", "nuscenes_names.md")
+    assert_raises((lambda: da.get(name, "x"), TableError, message))
 
 
 @pytest.mark.parametrize(
-    "name", ["get_sample_data", *(each for each in render.__all__ if each.startswith("render_"))]
+    "name", ["get_sample_data", *(name for name in render.__all__ if name.startswith("render_"))]
 )
 def test_an_argument_of_nuscenes_names_the_counterpart(da: DeepAccident, name: str) -> None:
     method = getattr(da, name)
-    own = inspect.signature(method).parameters
+    parameters = inspect.signature(method).parameters
     for argument, counterpart in nuscenes_names.KEYWORDS.items():
-        if argument in own:
+        if argument in parameters:
             continue
-        sentence = f"^{name} has no argument '{argument}': {re.escape(counterpart)} "
-        with pytest.raises(KeywordError, match=sentence) as raised:
+        message = f"^{name} has no argument '{argument}': {re.escape(counterpart)} "
+        with pytest.raises(KeywordError, match=message) as raised:
             method("x", **{argument: None})
         assert isinstance(raised.value, TypeError)
 
 
 @pytest.mark.parametrize(
-    ("call", "argument", "meant"),
+    ("call", "argument", "suggestion"),
     [
         (lambda _: DeepAccident(root="x"), "root", "did you mean 'dataroot'?"),
         (lambda _: DeepAccident(map_resolution=0.1), "map_resolution", "da.town_map"),
@@ -125,30 +130,33 @@ def test_an_argument_of_nuscenes_names_the_counterpart(da: DeepAccident, name: s
         ),
     ],
 )
-def test_a_misspelt_argument_is_named(da: DeepAccident, call, argument: str, meant: str) -> None:
-    assert_refused((lambda: call(da), KeywordError, (f"has no argument '{argument}'", meant)))
+def test_a_misspelt_argument_is_named(
+    da: DeepAccident, call, argument: str, suggestion: str
+) -> None:
+    assert_raises((lambda: call(da), KeywordError, (f"has no argument '{argument}'", suggestion)))
 
 
 @pytest.mark.parametrize("table", table_specs())
 def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str) -> None:
     record = getattr(da, table)[0]
-    ours = {"agent": {"first_sample_token", "last_sample_token"}}.get(table, set())
-    assert {field for field in nuscenes_names.FIELD_HINTS if field in record} <= ours
-    no = "the record has no field '{}'"
-    assert_refused(
+    shared_fields = {"agent": {"first_sample_token", "last_sample_token"}}.get(table, set())
+    hints = nuscenes_names.FIELD_HINTS
+
+    assert {field for field in hints if field in record} <= shared_fields
+    assert_raises(
         *(
             (
-                lambda field=field: record[field],
+                partial(record.__getitem__, field),
                 FieldError,
-                (f"{no.format(field)}: {counterpart} ",),
+                (f"the record has no field '{field}': {counterpart} ",),
             )
-            for field, counterpart in nuscenes_names.FIELD_HINTS.items()
+            for field, counterpart in hints.items()
             if field not in record
         ),
         (
             lambda: record["tokn"],
             KeyError,
-            (f"{no.format('tokn')}; it has token, ", "; did you mean 'token'?"),
+            ("the record has no field 'tokn'; it has token, ", "; did you mean 'token'?"),
         ),
     )
     assert record.get("data") is None
@@ -156,11 +164,9 @@ def test_a_field_of_nuscenes_names_the_counterpart(da: DeepAccident, table: str)
 
 def test_records_are_dicts_and_their_copies_plain(da: DeepAccident) -> None:
     record = da.sample[0]
-    assert (json.loads(json.dumps(record)), repr(record)) == (record, repr(dict(record)))
-    for copied in (
-        copy.copy(record),
-        copy.deepcopy(record),
-        pickle.loads(pickle.dumps(record)),
-        record.copy(),
-    ):
-        assert (type(copied), copied) == (dict, record)
+    assert json.loads(json.dumps(record)) == record
+    assert repr(record) == repr(dict(record))
+    unpickled = pickle.loads(pickle.dumps(record))
+    for copied in (copy.copy(record), copy.deepcopy(record), unpickled, record.copy()):
+        assert type(copied) is dict
+        assert copied == record

@@ -1,4 +1,4 @@
-"""Pages by templates: well-formed, and names are harmless."""
+"""Pages from templates are well-formed, and hostile names in them are harmless."""
 
 import subprocess
 import sys
@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2 import DictLoader
-from report_page import Page
+from support.report_page import ReportPage
 
 from deepaccident_devkit.support.pages import document, environment, result_text
 
 TREE = '{% from "macros.html" import tree %}{{ tree(value) }}'
 
 
-def filled(text: str, **context: Any) -> str:
+def fill_template(text: str, **context: Any) -> str:
     return environment().from_string(text).render(**context)
 
 
@@ -23,38 +23,37 @@ def filled(text: str, **context: Any) -> str:
 @given(
     st.recursive(
         st.text() | st.floats() | st.none() | st.booleans(),
-        lambda each: st.lists(each) | st.dictionaries(st.text(), each),
+        lambda values: st.lists(values) | st.dictionaries(st.text(), values),
     )
 )
 def test_any_value_becomes_well_formed_html(value: Any) -> None:
-    Page(filled(TREE, value=value))
-    Page(filled('<p title="{{ value }}">{{ value }}</p>', value=value))
+    ReportPage(fill_template(TREE, value=value))
+    ReportPage(fill_template('<p title="{{ value }}">{{ value }}</p>', value=value))
 
 
 def test_trees_hold_all_values() -> None:
-    assert filled(TREE, value={"<a>": [1.0, None, True]}) == (
+    assert fill_template(TREE, value={"<a>": [1.0, None, True]}) == (
         '<table class="tree"><tr><th scope="row">&lt;a&gt;</th><td>1, –, yes</td></tr></table>'
     )
-    assert "0.333333</td>" in filled(TREE, value=[{"name": "a", "share": 1 / 3}, {"other": 2}])
-    assert [filled(TREE, value=each) for each in ([], {}, [[1, 2], [3]], [""])] == [
-        "none",
-        "none",
-        "1, 2; 3",
-        "",
-    ]
+    assert "0.333333</td>" in fill_template(
+        TREE, value=[{"name": "a", "share": 1 / 3}, {"other": 2}]
+    )
+    assert fill_template(TREE, value=[]) == "none"
+    assert fill_template(TREE, value={}) == "none"
+    assert fill_template(TREE, value=[[1, 2], [3]]) == "1, 2; 3"
+    assert fill_template(TREE, value=[""]) == ""
 
 
 def test_results_have_three_decimals_or_digits() -> None:
-    values = [0.382271, 3.3e-14, 81.1111, 12533.4, 12533, 90.0, None, [1.5, [2, 0.25]]]
-    assert [result_text(each) for each in values] == [
-        *("0.382", "0.000", "81.1", "12,533", "12,533", "90", "–"),
-        "1.500; 2, 0.250",
-    ]
+    values = [0.382271, 3.3e-14, 81.1111, 12533.4, 12533, 90.0, None]
+    expected = ["0.382", "0.000", "81.1", "12,533", "12,533", "90", "–"]
+    assert [result_text(value) for value in values] == expected
+    assert result_text([1.5, [2, 0.25]]) == "1.500; 2, 0.250"
 
 
 def test_control_characters_of_names_are_shown_in_pages() -> None:
-    """Whoever prints a page in a terminal sees no colours, jumps or turned letters of a
-    stranger's.
+    """A page printed in a terminal must not show colours, jumps or reversed letters from a
+    stranger's name.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(environment(), "loader", DictLoader({"page.html": "<p>{{ name }}\n\t</p>"}))

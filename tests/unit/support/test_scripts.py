@@ -1,5 +1,5 @@
-"""Modules of JavaScript are joined in the order in which they need each other, or an error says why
-they cannot be.
+"""Modules of JavaScript are joined in the order of their imports, or an error explains why they
+cannot be.
 """
 
 from pathlib import Path
@@ -37,7 +37,7 @@ export class Two {}
 export async function wait() {}
 """,
 }
-JOINED = """(() => {
+BUNDLE = """(() => {
 "use strict";
 const module_numbers = (() => {
 const zero = 0;
@@ -70,14 +70,16 @@ return {  };
 """
 
 
-def script_of(folder: Path, **modules: str) -> str:
+def bundle_modules(folder: Path, **modules: str) -> str:
+    """Write modules into a folder and bundle them from the first one."""
     for name, text in modules.items():
         (folder / f"{name}.js").write_text(text, encoding="utf-8")
-    return bundled(lambda name: (folder / name).read_text(encoding="utf-8"), next(iter(modules)))
+    first = next(iter(modules))
+    return bundled(lambda name: (folder / name).read_text(encoding="utf-8"), first)
 
 
-def test_each_module_stands_once_and_after_those_that_it_imports(tmp_path: Path) -> None:
-    assert script_of(tmp_path, **MODULES) == JOINED
+def test_each_module_stands_once_and_after_its_imports(tmp_path: Path) -> None:
+    assert bundle_modules(tmp_path, **MODULES) == BUNDLE
 
 
 @pytest.mark.parametrize(
@@ -95,24 +97,19 @@ def test_each_module_stands_once_and_after_those_that_it_imports(tmp_path: Path)
         'export * from "./numbers.js";',
     ],
 )
-def test_other_forms_are_refused(line: str, tmp_path: Path) -> None:
-    with pytest.raises(
-        ValueError, match=r"page\.js: the bundler does not know this form: (import|export) "
-    ):
-        script_of(tmp_path, page=f"{line}\n", numbers=MODULES["numbers"])
+def test_other_forms_of_imports_and_exports_are_refused(line: str, tmp_path: Path) -> None:
+    message = r"page\.js: the bundler does not know this form: (import|export) "
+    with pytest.raises(ValueError, match=message):
+        bundle_modules(tmp_path, page=f"{line}\n", numbers=MODULES["numbers"])
 
 
 def test_modules_that_import_each_other_are_refused(tmp_path: Path) -> None:
-    circle = {
-        name: f'import {{ a }} from "./{other}.js";\n'
-        for name, other in (("a", "b"), ("b", "c"), ("c", "a"))
-    }
-    with pytest.raises(
-        ValueError, match="modules import each other: a imports b imports c imports a"
-    ):
-        script_of(tmp_path, **circle)
+    import_line = 'import {{ a }} from "./{}.js";\n'.format
+    message = "modules import each other: a imports b imports c imports a"
+    with pytest.raises(ValueError, match=message):
+        bundle_modules(tmp_path, a=import_line("b"), b=import_line("c"), c=import_line("a"))
 
 
 def test_a_module_that_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"sums\.js"):
-        script_of(tmp_path, page=MODULES["page"])
+        bundle_modules(tmp_path, page=MODULES["page"])

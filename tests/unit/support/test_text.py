@@ -1,5 +1,5 @@
-"""Words that the devkit knows are taken in any case of letters; of another word, the error says
-which was meant.
+"""Words that the devkit knows are taken in any case of letters; errors on other words suggest the
+word that was meant.
 """
 
 from collections.abc import Callable
@@ -8,8 +8,8 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from refusals import assert_refused
-from verbs import commands
+from support.command_calls import walk_commands
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -38,15 +38,16 @@ from deepaccident_devkit.plugins.baselines import Baseline
 from deepaccident_devkit.plugins.synth import SynthConfig
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.render.figures import layers_of
-from deepaccident_devkit.support.text import choice, differing_text, meant_text
+from deepaccident_devkit.support.text import choice, differing_text, distinct_names, meant_text
 from deepaccident_devkit.testing import SmallRelease
 from deepaccident_devkit.v2x import AgentConfig, cooperating_agents
 
 SETTINGS = {"grid_conf": {"xbound": (-50.0, 50.0, 0.5), "ybound": (-30.0, 50.0, 0.5)}}
 
 
-def warped(mode: str) -> np.ndarray:
-    return agents_to_ego(np.zeros((2, 200, 200), dtype=np.int16), np.zeros((2, 6)), mode=mode)
+def warp_dtype(mode: str) -> np.dtype:
+    frames = np.zeros((2, 200, 200), dtype=np.int16)
+    return agents_to_ego(frames, np.zeros((2, 6)), mode=mode).dtype
 
 
 CALLS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[DeepAccident, str], Any]]] = [
@@ -125,7 +126,7 @@ CALLS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[DeepAccident
         lambda da, word: find_release(da.dataroot, word).version,
     ),
 ]
-"""A word in another case, as it is known, a wrong one, its error, and a call."""
+"""A word in another case, as it is known, a wrong one, its error and a call that takes it."""
 MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]] = [
     ("FIERY", "fiery", "firy", ChoiceError, lambda word: BevGrid(orientation=word)),
     ("Fiery", "fiery", "fire", ChoiceError, MotionLabelConfig.preset),
@@ -173,7 +174,7 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
         "bilinear",
         "linear",
         ChoiceError,
-        lambda word: warped(word).dtype,
+        warp_dtype,
     ),
     (
         "Constant_Turn_Rate",
@@ -188,7 +189,7 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
 
 
 @pytest.mark.parametrize(
-    ("given", "known", "wrong", "error", "call"),
+    ("word", "known_word", "wrong_word", "error", "call"),
     [
         *CALLS,
         *((*words, error, lambda _, word, make=make: make(word)) for *words, error, make in MAKERS),
@@ -196,41 +197,45 @@ MAKERS: list[tuple[str, str, str, type[DeepAccidentError], Callable[[str], Any]]
 )
 def test_a_word_is_taken_in_any_case(
     da: DeepAccident,
-    given: str,
-    known: str,
-    wrong: str,
+    word: str,
+    known_word: str,
+    wrong_word: str,
     error: type[DeepAccidentError],
     call: Callable[..., Any],
 ) -> None:
-    assert call(da, given) == call(da, known)
-    assert_refused((lambda: call(da, wrong), error, r"; did you mean '[\w+-]+'\?$"))
+    assert call(da, word) == call(da, known_word)
+    assert_raises((lambda: call(da, wrong_word), error, r"; did you mean '[\w+-]+'\?$"))
 
 
 def test_every_option_with_words_takes_them_in_any_case() -> None:
     context = click.Context(deepaccident)
-    options = [(verb, option) for _, verb in commands(deepaccident) for option in verb.params]
-    of_words = [(verb, option) for verb, option in options if isinstance(option.type, click.Choice)]
-    assert len(of_words) > 40
-    for verb, option in of_words:
+    options = []
+    for _, verb in walk_commands(deepaccident):
+        options += [(verb, option) for option in verb.params]
+    word_options = [pair for pair in options if isinstance(pair[1].type, click.Choice)]
+
+    assert len(word_options) > 40
+    for verb, option in word_options:
         assert isinstance(option.type, WordChoice), f"{verb.name} {option.opts[0]}"
-        words = list(option.type.choices)
-        assert [option.type.convert(word.upper(), option, context) for word in words] == words
+        for word in option.type.choices:
+            assert option.type.convert(word.upper(), option, context) == word
 
 
-@pytest.mark.parametrize("wrong", ["qqq", None, 3, ["left"]])
-def test_a_word_that_is_like_none_has_no_suggestion(wrong: Any) -> None:
+@pytest.mark.parametrize("word", ["qqq", None, 3, ["left"]])
+def test_a_word_unlike_any_known_word_has_no_suggestion(word: Any) -> None:
     splits = ("train", "val", "test")
-    meant = [meant_text(wrong, splits) for wrong in ("validation", "training", "Testing")]
-    assert meant == [f"; did you mean {split!r}?" for split in ("val", "train", "test")]
-    assert (
-        meant_text("qqq", ["left", "right"])
-        == meant_text("", ["left"])
-        == meant_text(None, ["left"])
-        == ""
-    )
-    told = r"^turn: expected one of left, right, found .*[^?]$"
-    assert_refused(
-        (lambda: choice("turn", wrong, ("left", "right")), ChoiceError, told),
+    assert meant_text("validation", splits) == "; did you mean 'val'?"
+    assert meant_text("training", splits) == "; did you mean 'train'?"
+    assert meant_text("Testing", splits) == "; did you mean 'test'?"
+    assert meant_text("qqq", ["left", "right"]) == ""
+    assert meant_text("", ["left"]) == ""
+    assert meant_text(None, ["left"]) == ""
+    assert_raises(
+        (
+            lambda: choice("turn", word, ("left", "right")),
+            ChoiceError,
+            r"^turn: expected one of left, right, found .*[^?]$",
+        ),
         (
             lambda: choice("turn", 3, (None, "left")),
             ChoiceError,
@@ -240,22 +245,38 @@ def test_a_word_that_is_like_none_has_no_suggestion(wrong: Any) -> None:
     assert choice("turn", None, (None, "left")) is None
 
 
-def test_what_differs_is_told_with_both_values() -> None:
-    there = {"agents": ["ego"], "training": {"steps": 2, "rate": 0.1}, "old": 1}
-    asked = {"agents": ("ego",), "training": {"steps": 3, "rate": 0.1}}
-    assert differing_text(there, asked) == "old: 1, asked for None; training/steps: 2, asked for 3"
-    assert differing_text(there, there) == ""
-    assert differing_text({}, dict.fromkeys("abcde", 1)).endswith(
-        "c: None, asked for 1; and 2 more"
-    )
+def test_differing_settings_are_listed_with_both_values() -> None:
+    stored = {"agents": ["ego"], "training": {"steps": 2, "rate": 0.1}, "old": 1}
+    message = differing_text(stored, {"agents": ("ego",), "training": {"steps": 3, "rate": 0.1}})
+
+    assert message == "old: 1, asked for None; training/steps: 2, asked for 3"
+    assert differing_text(stored, stored) == ""
+    long_message = differing_text({}, dict.fromkeys("abcde", 1))
+    assert long_message.endswith("c: None, asked for 1; and 2 more")
 
 
-def test_a_word_that_means_something_elsewhere_is_told_so() -> None:
-    elsewhere = {"left": "; that is a side"}
-    assert_refused(
+def test_a_word_that_has_a_meaning_elsewhere_is_explained() -> None:
+    explanations = {"left": "; that is a side"}
+    assert_raises(
         (
-            lambda: choice("way", "LEFT", ("on", "off"), elsewhere=elsewhere),
+            lambda: choice("way", "LEFT", ("on", "off"), elsewhere=explanations),
             ChoiceError,
             ("a side",),
         )
     )
+
+
+@pytest.mark.parametrize(
+    ("paths", "expected"),
+    [
+        (["runs/single/accident", "runs/five/accident"], ["single", "five"]),
+        (["a", "b/c"], ["a", "c"]),
+        (["x/a/motion", "y/a/motion", "x/b/motion"], ["x/a/motion", "y/a/motion", "x/b/motion"]),
+        (["runs/one", "runs/one"], ["runs/one", "runs/one"]),
+    ],
+    ids=["tasks", "folders", "two parts", "same"],
+)
+def test_evaluations_are_named_by_the_part_that_differs(
+    paths: list[str], expected: list[str]
+) -> None:
+    assert distinct_names(paths) == expected

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
-import tiny
-from tiny_index import OTHER
+from support import tiny_release
+from support.tiny_release_index import OTHER_SCENARIO
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A release of two scenarios. Its path has a blank in it."""
-    tiny.write_tiny_release(tmp_path / "deep accident")
-    return tiny.write_tiny_release(tmp_path / "deep accident", name=OTHER)
+    tiny_release.write_tiny_release(tmp_path / "deep accident")
+    return tiny_release.write_tiny_release(tmp_path / "deep accident", name=OTHER_SCENARIO)

@@ -13,7 +13,7 @@ from deepaccident_devkit.taxonomy import VELOCITY_FRAMES
 NUMBERS = st.floats(-50, 50)
 
 
-def fit(boxes: int, **fits: int) -> VelocityFit:
+def make_fit(boxes: int, **fits: int) -> VelocityFit:
     return VelocityFit(boxes=boxes, fits={name: fits.get(name, 0) for name in VELOCITY_FRAMES})
 
 
@@ -40,25 +40,25 @@ def test_a_real_line_is_what_the_format_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("found", "best"),
+    ("velocity_fit", "best_frame"),
     [
-        (fit(100, released=97, lidar=18), "released"),
+        (make_fit(100, released=97, lidar=18), "released"),
         (
-            fit(100, released=96, lidar=100),
+            make_fit(100, released=96, lidar=100),
             "released",
         ),  # all drive along x: nothing tells them apart
-        (fit(100, released=60, lidar=100), "lidar"),
-        (fit(100, released=49, world=20), None),
-        (fit(19, released=19), None),
-        (fit(0), None),
+        (make_fit(100, released=60, lidar=100), "lidar"),
+        (make_fit(100, released=49, world=20), None),
+        (make_fit(19, released=19), None),
+        (make_fit(0), None),
     ],
 )
-def test_the_best_frame(found: VelocityFit, best: str | None) -> None:
-    assert found.best == best
+def test_the_best_frame(velocity_fit: VelocityFit, best_frame: str | None) -> None:
+    assert velocity_fit.best == best_frame
 
 
 def test_fits_add_up() -> None:
-    assert total_fit([fit(10, released=9), fit(15, released=15, box=2)]) == fit(
+    assert total_fit([make_fit(10, released=9), make_fit(15, released=15, box=2)]) == make_fit(
         25, released=24, box=2
     )
     assert total_fit([]).best is None

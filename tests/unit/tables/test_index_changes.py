@@ -1,5 +1,6 @@
-"""Files that were restored, edited or replaced since the index was made: what opening sees, and
-what mends the rest.
+"""Files that were restored, edited or replaced since the index was made.
+
+Opening a release sees some of these changes; the other tests say which command mends the index.
 """
 
 import os
@@ -9,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import tiny
-from tiny_index import INDEX, contents, opened
-from verbs import called
+from support import tiny_release
+from support.command_calls import invoke_command
+from support.tiny_release_index import INDEX_FOLDER, folder_contents, open_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.release import find_release
@@ -26,24 +27,24 @@ Change = Callable[[Path, bytes], None]
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    return tiny.write_tiny_release(tmp_path / "release")
+    return tiny_release.write_tiny_release(tmp_path / "release")
 
 
-def file_of(root: Path, kind: str) -> Path:
-    folder = root / tiny.TYPE / kind
-    return (
-        folder / f"{tiny.NAME}.txt" if kind == META else min((folder / tiny.NAME).glob("*_002.*"))
-    )
+def find_file(root: Path, kind: str) -> Path:
+    folder = root / tiny_release.SCENARIO_TYPE / kind
+    if kind == META:
+        return folder / f"{tiny_release.SCENARIO_NAME}.txt"
+    return min((folder / tiny_release.SCENARIO_NAME).glob("*_002.*"))
 
 
-def edited(path: Path) -> bytes:
-    """Other content that is as good, of the same length but for calib."""
+def edit_content(path: Path) -> bytes:
+    """Return other content that is valid; only that of calib has another length."""
     content = path.read_bytes()
     for old, new in ((b" 1300 12 ", b" 1300 72 "), (b"car 1212", b"car 1236")):
         content = content.replace(old, new)
-    return (
-        content + b" " if path.suffix == ".pkl" else content
-    )  # after a pickle's end nothing is read
+    if path.suffix == ".pkl":
+        content += b" "  # nothing is read after a pickle's end
+    return content
 
 
 def keep_times(path: Path, change: Callable[[], object]) -> None:
@@ -54,12 +55,12 @@ def keep_times(path: Path, change: Callable[[], object]) -> None:
     os.utime(path.parent, ns=(folder.st_atime_ns, folder.st_mtime_ns))
 
 
-def replaced(path: Path, content: bytes) -> None:
+def replace_file(path: Path, content: bytes) -> None:
     path.with_name("new").write_bytes(content)
     path.with_name("new").replace(path)
 
 
-def copied_folder(path: Path, content: bytes) -> None:
+def replace_folder(path: Path, content: bytes) -> None:
     folder, copy = path.parent, path.parent.with_name("copy")
     shutil.copytree(folder, copy)
     keep_times(copy / path.name, lambda: (copy / path.name).write_bytes(content))
@@ -69,15 +70,15 @@ def copied_folder(path: Path, content: bytes) -> None:
 
 
 CHANGES: dict[str, Change] = {
-    "replaced": replaced,
+    "replaced": replace_file,
     "replaced, with all times kept": lambda path, content: keep_times(
-        path, lambda: replaced(path, content)
+        path, lambda: replace_file(path, content)
     ),
-    "its folder replaced by a copy with kept times": copied_folder,
+    "its folder replaced by a copy with kept times": replace_folder,
 }
 
 
-def is_right(release: DeepAccident, root: Path) -> bool:
+def has_current_hashes(release: DeepAccident, root: Path) -> bool:
     (scenario,) = find_release(root).scenarios
     return release.indexed_hashes(scenario.token) == folder_hashes(scenario)
 
@@ -85,69 +86,68 @@ def is_right(release: DeepAccident, root: Path) -> bool:
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("kind", [LABEL, CALIB, META])
 def test_a_file_in_the_place_of_another_is_seen(root: Path, kind: str, change: str) -> None:
-    before = opened(root)
-    path = file_of(root, kind)
-    CHANGES[change](path, edited(path))
-    after = opened(root)
-    assert (is_right(before, root), is_right(after, root)) == (False, True)
-    assert opened(root).tables_folder == after.tables_folder != before.tables_folder
+    before = open_release(root)
+    path = find_file(root, kind)
+    CHANGES[change](path, edit_content(path))
+    after = open_release(root)
+    assert not has_current_hashes(before, root)
+    assert has_current_hashes(after, root)
+    assert open_release(root).tables_folder == after.tables_folder != before.tables_folder
 
 
 @pytest.mark.parametrize("kind", [LABEL, CALIB, META])
 def test_what_was_written_in_place_is_seen_by_index_and_told_by_validate(
     root: Path, kind: str
 ) -> None:
-    """Even if its size and time are those of before: its ctime is not."""
-    before = opened(root)
-    path = file_of(root, kind)
-    keep = path.stat()
-    path.write_bytes(edited(path))
-    os.utime(path, ns=(keep.st_atime_ns, keep.st_mtime_ns))
-    if path.stat().st_size == keep.st_size:
-        assert opened(root).tables_folder == before.tables_folder
-        (finding,) = [
-            each
-            for each in validate_release(root, workers=1).findings
-            if each.code == "index-outdated"
-        ]
-        assert (finding.severity, finding.scenario) == ("warning", tiny.TOKEN)
+    """A file may keep its size and time, but its ctime is new."""
+    release = open_release(root)
+    path = find_file(root, kind)
+    before = path.stat()
+    path.write_bytes(edit_content(path))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    if path.stat().st_size == before.st_size:
+        assert open_release(root).tables_folder == release.tables_folder
+        report = validate_release(root, workers=1)
+        (finding,) = [finding for finding in report.findings if finding.code == "index-outdated"]
+        assert finding.severity == "warning"
+        assert finding.scenario == tiny_release.SCENARIO_TOKEN
         assert "deepaccident check index DATAROOT" in finding.remedy
-    called("index", root)
-    assert is_right(opened(root), root)
-    assert "index-outdated" not in {
-        finding.code for finding in validate_release(root, workers=1).findings
-    }
+
+    invoke_command("index", root)
+    assert has_current_hashes(open_release(root), root)
+    codes = {finding.code for finding in validate_release(root, workers=1).findings}
+    assert "index-outdated" not in codes
 
 
 def test_a_release_that_moved_with_its_index_is_indexed_once_more(
     root: Path, tmp_path: Path
 ) -> None:
-    before = contents(opened(root).tables_folder)
+    before = folder_contents(open_release(root).tables_folder)
     shutil.copytree(root, tmp_path / "copy")
     assert current_index(find_release(tmp_path / "copy")) is None
-    assert contents(opened(tmp_path / "copy").tables_folder) == before
+    assert folder_contents(open_release(tmp_path / "copy").tables_folder) == before
     assert current_index(find_release(tmp_path / "copy")) is not None
 
 
 def test_an_index_of_an_earlier_devkit_is_made_again(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One without hashes, whose manifest has a digest of another kind."""
+    """It has no hashes, and its manifest has a digest of another kind."""
     with monkeypatch.context() as patch:
         patch.setattr(indexing, "HASHES", "contents")
         patch.setattr(index_module, "folder_digest", lambda *_: "0" * 32)
-        earlier = opened(root)
-    assert earlier.indexed_hashes(tiny.TOKEN) is None
-    earlier.tables_folder.rename(root / INDEX / "tables-00")
-    index = Index.read(root / INDEX)
+        earlier = open_release(root)
+    assert earlier.indexed_hashes(tiny_release.SCENARIO_TOKEN) is None
+    earlier.tables_folder.rename(root / INDEX_FOLDER / "tables-00")
+    index = Index.read(root / INDEX_FOLDER)
     assert index is not None
     replace(index, tables="tables-00").write()
-    assert is_right(opened(root), root)
-    assert contents(root / INDEX / "kept").keys() == {tiny.TOKEN}
+    assert has_current_hashes(open_release(root), root)
+    assert folder_contents(root / INDEX_FOLDER / "kept").keys() == {tiny_release.SCENARIO_TOKEN}
 
 
 def test_a_damaged_list_of_hashes_is_refused_and_validate_goes_on(root: Path) -> None:
-    release = opened(root)
+    release = open_release(root)
     table = release.tables_folder / "scenario.arrow"
     content = table.read_bytes()
     table.unlink()
@@ -156,4 +156,4 @@ def test_a_damaged_list_of_hashes_is_refused_and_validate_goes_on(root: Path) ->
     with pytest.raises(
         index_module.IndexStoreError, match=r"hashes of its files are damaged; .* check index"
     ):
-        opened(root).indexed_hashes(tiny.TOKEN)
+        open_release(root).indexed_hashes(tiny_release.SCENARIO_TOKEN)

@@ -15,7 +15,7 @@ KEYS = [
     for column in spec.columns
     if isinstance(column.kind, Key)
 ]
-CHAINED = [name for name, field, _ in KEYS if field == "next"]
+CHAINED_TABLES = [name for name, field, _ in KEYS if field == "next"]
 
 
 @pytest.mark.parametrize(("table", "field", "target"), KEYS)
@@ -28,22 +28,23 @@ def test_every_foreign_key_names_a_row(
         assert both_layouts.get(target, token)["token"] == token
 
 
-@pytest.mark.parametrize("table", CHAINED)
+@pytest.mark.parametrize("table", CHAINED_TABLES)
 def test_chains_reach_every_row_once_and_run_both_ways(
     both_layouts: DeepAccident, table: str
 ) -> None:
     records = {record["token"]: record for record in getattr(both_layouts, table)}
-    walked = []
-    for record in [record for record in records.values() if record["prev"] is None]:
-        before, token = None, record["token"]
+    first_records = [record for record in records.values() if record["prev"] is None]
+    visited_tokens = []
+    for record in first_records:
+        previous_token, token = None, record["token"]
         while token is not None:
-            assert records[token]["prev"] == before
-            walked.append(token)
-            before, token = token, records[token]["next"]
-    assert sorted(walked) == sorted(records)
+            assert records[token]["prev"] == previous_token
+            visited_tokens.append(token)
+            previous_token, token = token, records[token]["next"]
+    assert sorted(visited_tokens) == sorted(records)
 
 
-STREAMED = """
+STREAMING_PROGRAM = """
 import os
 import numpy as np
 import pyarrow
@@ -62,7 +63,7 @@ print(len(os.listdir("/proc/self/task")) - before)
 
 
 def test_streams_are_written_and_read_without_threads() -> None:
-    ran = subprocess.run(
-        [sys.executable, "-c", STREAMED], check=False, capture_output=True, text=True
+    process = subprocess.run(
+        [sys.executable, "-c", STREAMING_PROGRAM], check=False, capture_output=True, text=True
     )
-    assert (ran.stdout, ran.stderr) == ("0\n", "")
+    assert (process.stdout, process.stderr) == ("0\n", "")

@@ -1,10 +1,8 @@
-"""The plugin in a pytest of somebody else: found by its entry point, slow at nothing, and to be
-turned off.
-"""
+"""The plugin in a foreign project: pytest finds it, it costs nothing, and it can be turned off."""
 
 import pytest
 
-FOREIGN = """
+FOREIGN_TESTS = """
 import pytest
 
 seen = []
@@ -44,7 +42,7 @@ def test_the_folder_of_the_test_is_its_own(deepaccident_release_copy, deepaccide
 def test_both_layouts_were_there():
     assert seen == ["A", "B"]
 """  # noqa: E501
-LIGHT = """
+IMPORT_TEST = """
 import sys
 
 def test_nothing_else_was_imported():
@@ -53,20 +51,20 @@ def test_nothing_else_was_imported():
 """
 
 
-OFF = "def test_release(deepaccident_release): pass\n"
+FIXTURE_TEST = "def test_release(deepaccident_release): pass\n"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("code", "options", "told"),
+    ("code", "options", "output"),
     [
-        (FOREIGN, (), "12 passed"),  # in both layouts
-        (LIGHT, (), "1 passed"),
-        (OFF, ("-p", "no:deepaccident"), "fixture 'deepaccident_release' not found"),
+        (FOREIGN_TESTS, (), "12 passed"),  # in both layouts
+        (IMPORT_TEST, (), "1 passed"),
+        (FIXTURE_TEST, ("-p", "no:deepaccident"), "fixture 'deepaccident_release' not found"),
     ],
     ids=["fixtures", "imports nothing until a fixture is asked for", "turned off"],
 )
-def test_in_a_foreign_project(foreign, code: str, options: tuple[str, ...], told: str) -> None:
+def test_in_a_foreign_project(foreign, code: str, options: tuple[str, ...], output: str) -> None:
     (foreign.folder / "test_mine.py").write_text(code)
-    ran = foreign.pytest(*options)
-    assert told in ran.stdout, ran.stdout + ran.stderr
+    process = foreign.pytest(*options)
+    assert output in process.stdout, process.stdout + process.stderr

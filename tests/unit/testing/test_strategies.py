@@ -1,4 +1,4 @@
-"""The strategies: what they draw is what the readers take."""
+"""The strategies draw what the readers accept."""
 
 import subprocess
 import sys
@@ -14,26 +14,26 @@ from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 from deepaccident_devkit.testing.strategies import label_texts, small_releases
 
-UNSHRUNK = settings(phases=[Phase.generate])
+WITHOUT_SHRINKING = settings(phases=[Phase.generate])
 
 
 @pytest.fixture(scope="module")
-def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("strategies")
 
 
 @given(label_texts())
-def test_a_label_is_read_with_all_its_boxes_and_nothing_else(scratch: Path, text: str) -> None:
-    (scratch / "label.txt").write_text(text, encoding="ascii", newline="")
-    labels = read_label(scratch / "label.txt")
+def test_a_label_is_read_with_all_its_boxes_and_nothing_else(folder: Path, text: str) -> None:
+    (folder / "label.txt").write_text(text, encoding="ascii", newline="")
+    labels = read_label(folder / "label.txt")
     assert len(labels) == sum(len(line.split()) == 13 for line in text.splitlines())
     assert labels.actor_id[0] == OWN_ACTOR_ID
     np.testing.assert_array_equal(labels.velocity[0], labels.agent_velocity[0])
 
 
-@pytest.mark.parametrize("drawn", ["\r\n", "\ncar\n"])
-def test_labels_with_windows_lines_and_with_short_ones_are_drawn(drawn: str) -> None:
-    assert drawn in find(label_texts(), lambda text: drawn in text, settings=UNSHRUNK)
+@pytest.mark.parametrize("part", ["\r\n", "\ncar\n"])
+def test_labels_with_windows_lines_and_with_short_ones_are_drawn(part: str) -> None:
+    assert part in find(label_texts(), lambda text: part in text, settings=WITHOUT_SHRINKING)
 
 
 @given(small_releases())
@@ -52,8 +52,8 @@ def test_without_hypothesis_they_say_what_to_install() -> None:
         "import sys; sys.modules['hypothesis'] = None; import "
         "deepaccident_devkit.testing.strategies"
     )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (
-        "MissingExtraError: the strategies need hypothesis: in a checkout, pip install"
-        in ran.stderr
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
+    message = "MissingExtraError: the strategies need hypothesis; run pip install '.[testing]'"
+    assert message in process.stderr

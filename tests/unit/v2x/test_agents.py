@@ -1,4 +1,4 @@
-"""Whose sight counts: configurations of agents, and who of them sees an accident."""
+"""Configurations of cooperating agents, and which of them see an accident."""
 
 import itertools
 from collections.abc import Callable, Collection
@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tiny
 from numpy.testing import assert_array_equal
-from refusals import assert_refused
+from support import tiny_release
+from support.expected_errors import assert_raises
+from support.tiny_release import META_TEXT, SCENARIO_TOKEN, SCENARIO_TYPE
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, GeometryError, NotAvailableError, TokenError
@@ -43,7 +44,8 @@ EGO, EGO_BEHIND, OTHER, OTHER_BEHIND, POLE = AGENTS
 
 
 def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
-    assert {name: config.agents_for(EGO) for name, config in AGENT_CONFIGS.items()} == {
+    agents_by_config = {name: config.agents_for(EGO) for name, config in AGENT_CONFIGS.items()}
+    assert agents_by_config == {
         "single": (EGO,),
         "+behind": (EGO, EGO_BEHIND),
         "+other": (EGO, OTHER),
@@ -52,10 +54,8 @@ def test_the_papers_seven_as_seen_from_the_ego_vehicle() -> None:
         "vehicles": (EGO, EGO_BEHIND, OTHER, OTHER_BEHIND),
         "all": AGENTS,
     }
-    assert ((*AGENT_CONFIGS, "available"), AgentConfig("alone").agents_for(POLE)) == (
-        AGENT_SETS,
-        (POLE,),
-    )
+    assert (*AGENT_CONFIGS, "available") == AGENT_SETS
+    assert AgentConfig("alone").agents_for(POLE) == (POLE,)
 
 
 @pytest.mark.parametrize(
@@ -73,11 +73,12 @@ def test_partners_are_renamed_as_in_the_released_code(
     ego: str, side: str, expected: tuple[str, ...]
 ) -> None:
     """The released V2X dataset's name_mapping, written out (docs/released_code.md, Poses)."""
-    everyone = AGENT_CONFIGS["all"].agents_for(ego, side=side)
-    assert (everyone, set(everyone)) == ((ego, *expected), set(AGENTS))
+    agents = AGENT_CONFIGS["all"].agents_for(ego, side=side)
+    assert agents == (ego, *expected)
+    assert set(agents) == set(AGENTS)
 
 
-def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
+def test_agents_are_given_by_a_configuration_or_names(da_b: DeepAccident) -> None:
     sample = f"{da_b.scenario[0]['token']}/{OTHER}/002"
     assert cooperating_agents(da_b, sample) == (OTHER, EGO, EGO_BEHIND, OTHER_BEHIND, POLE)
     assert cooperating_agents(da_b, da_b.get("sample", sample), "+behind") == (OTHER, OTHER_BEHIND)
@@ -85,7 +86,7 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     assert cooperating_agents(da_b, sample, [POLE, OTHER, POLE]) == (OTHER, POLE)
     assert cooperating_agents(da_b, sample, [POLE]) == (POLE,)
     assert cooperating_agents(da_b, sample, "Available") == cooperating_agents(da_b, sample, None)
-    assert_refused(
+    assert_raises(
         (
             lambda: cooperating_agents(da_b, sample, "bus"),
             ChoiceError,
@@ -101,7 +102,7 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "several", "single"),
+    ("make_config", "names", "name"),
     [
         (lambda names: AgentConfig("mine", names), ("behind",), "Behind"),
         (lambda names: MotionLabelConfig(agents=names), [POLE], POLE),
@@ -120,58 +121,49 @@ def test_what_an_agents_argument_means(da_b: DeepAccident) -> None:
     ],
 )
 def test_a_single_name_is_a_list_of_one(
-    make: Callable[[Any], object], several: object, single: str
+    make_config: Callable[[Any], object], names: object, name: str
 ) -> None:
-    assert make(single) == make(several)
+    assert make_config(name) == make_config(names)
 
 
 def test_an_agent_that_was_not_downloaded_is_named(tmp_path: Path) -> None:
-    da = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path, agents=(EGO, POLE)), verbose=False)
-    sample = f"{tiny.TOKEN}/{EGO}/001"
+    tiny_release.write_tiny_release(tmp_path, agents=(EGO, POLE))
+    da = DeepAccident(dataroot=tmp_path, verbose=False)
+    sample = f"{SCENARIO_TOKEN}/{EGO}/001"
+    calls = (
+        da.cooperative_boxes,
+        da.visible_instances,
+        da.aggregate_point_cloud,
+        da.message_sizes,
+    )
+    message = r"other_vehicle is not in .* which has ego_vehicle, infrastructure"
+    advice = (
+        "; unpack its archive",
+        "name agents that the release has",
+        "agents='available' (--agents available)",
+    )
+
     assert cooperating_agents(da, sample) == (EGO, POLE)
-    assert_refused(
-        *[
-            (
-                partial(call, sample, agents="+other"),
-                NotAvailableError,
-                r"other_vehicle is not in .* which has ego_vehicle, infrastructure",
-            )
-            for call in (
-                da.cooperative_boxes,
-                da.visible_instances,
-                da.aggregate_point_cloud,
-                da.message_sizes,
-            )
-        ],
+    assert_raises(
+        *[(partial(call, sample, agents="+other"), NotAvailableError, message) for call in calls],
     )
     assert len(da.cooperative_boxes(sample)) > 0
-    assert_refused(
-        (
-            lambda: cooperating_agents(da, sample, "all"),
-            NotAvailableError,
-            (
-                "; unpack its archive",
-                "name the agents that are there",
-                "agents='available' (--agents available)",
-            ),
-        ),
-    )
+    assert_raises((lambda: cooperating_agents(da, sample, "all"), NotAvailableError, advice))
+
     assert cooperating_agents(da, sample, "available") == (EGO, POLE)
-    assert len(da.cooperative_boxes(sample, agents="available")) == len(
-        da.cooperative_boxes(sample)
-    )
+    available_boxes = da.cooperative_boxes(sample, agents="available")
+    assert len(available_boxes) == len(da.cooperative_boxes(sample))
     assert MotionLabelConfig(agents="available").digest == MotionLabelConfig().digest
 
 
-def test_names_roles_sides_and_views_that_are_none(da_b: DeepAccident) -> None:
-    sample, everyone, agents = (
-        da_b.sample[0],
-        AGENT_CONFIGS["all"],
-        np.array(["infrastructure", "ego_vehicle"]),
-    )
-    assert cooperating_agents(da_b, sample, agents) == ("ego_vehicle", "infrastructure")
+def test_agents_partners_sides_and_views_that_do_not_exist(da_b: DeepAccident) -> None:
+    sample = da_b.sample[0]
+    everyone = AGENT_CONFIGS["all"]
+    names = np.array(["infrastructure", "ego_vehicle"])
+
+    assert cooperating_agents(da_b, sample, names) == ("ego_vehicle", "infrastructure")
     assert AgentConfig("mine", ["behind"]) == AgentConfig("mine", ("behind",))
-    assert_refused(
+    assert_raises(
         (
             lambda: AgentConfig("mine", ("front",)),
             ChoiceError,
@@ -189,56 +181,59 @@ def test_names_roles_sides_and_views_that_are_none(da_b: DeepAccident) -> None:
         ),
         *[
             (
-                partial(da_b.cooperative_boxes, sample, agents=wrong),
+                partial(da_b.cooperative_boxes, sample, agents=agents),
                 ChoiceError,
                 ("agents: expected some of ego_vehicle",),
             )
-            for wrong in (3, 2.5, object())
+            for agents in (3, 2.5, object())
         ],
         *[
             (
-                partial(cooperating_agents, da_b, sample, wrong),
+                partial(cooperating_agents, da_b, sample, agents),
                 ChoiceError,
                 ("agents: expected one of ego_vehicle",),
             )
-            for wrong in ([None], [3], [np.zeros(2)])
+            for agents in ([None], [3], [np.zeros(2)])
         ],
         *[
             (
-                partial(AgentConfig, "mine", wrong),
+                partial(AgentConfig, "mine", partners),
                 ChoiceError,
                 ("partners: expected some of behind",),
             )
-            for wrong in (3, None)
+            for partners in (3, None)
         ],
         *[
-            (partial(accident_visible_mask, views), GeometryError, ("in_view: expected",))
-            for views in ([True], np.zeros((3, 2)), True, "abc", None)
+            (partial(accident_visible_mask, in_view), GeometryError, ("in_view: expected",))
+            for in_view in ([True], np.zeros((3, 2)), True, "abc", None)
         ],
     )
 
 
-VIEWS = np.array(list(itertools.product([False, True], repeat=3)))
-SEEN = [False, True, False, True, False, True, True, True]
+IN_VIEW = np.array(list(itertools.product([False, True], repeat=3)))
+ACCIDENT_VISIBLE = [False, True, False, True, False, True, True, True]
 
 
 def test_unseen_is_not_in_view_now_and_at_one_moment_before() -> None:
-    assert_array_equal(accident_visible_mask(VIEWS), SEEN)
-    assert_array_equal(accident_visible_mask(VIEWS.reshape(2, 4, 3)), np.reshape(SEEN, (2, 4)))
-    assert (accident_visible_mask([1, 0, 0]), accident_visible_mask(np.zeros((0, 3))).shape) == (
-        np.array(False),
-        (0,),
-    )
+    assert_array_equal(accident_visible_mask(IN_VIEW), ACCIDENT_VISIBLE)
+    two_rows = np.reshape(ACCIDENT_VISIBLE, (2, 4))
+    assert_array_equal(accident_visible_mask(IN_VIEW.reshape(2, 4, 3)), two_rows)
+    assert accident_visible_mask([1, 0, 0]) == np.array(False)
+    assert accident_visible_mask(np.zeros((0, 3))).shape == (0,)
 
 
 def test_without_a_collision_and_behind_sheer_curtains_all_is_seen() -> None:
-    assert accident_visible_mask(VIEWS, collision=False).all()
-    assert accident_visible_mask(VIEWS, exempt=True).all()
-    assert_array_equal(accident_visible_mask(VIEWS, exempt=[True] + [False] * 7), [True, *SEEN[1:]])
+    first_is_exempt = [True] + [False] * 7
+    visible = accident_visible_mask(IN_VIEW, exempt=first_is_exempt)
+    assert accident_visible_mask(IN_VIEW, collision=False).all()
+    assert accident_visible_mask(IN_VIEW, exempt=True).all()
+    assert_array_equal(visible, [True, *ACCIDENT_VISIBLE[1:]])
 
 
 def test_a_pair_is_in_view_if_all_but_the_agent_itself_are() -> None:
-    ids, mask = [5, 6, -1, -100, 5], [True, False, True, True, True]
+    ids = [5, 6, -1, -100, 5]
+    mask = [True, False, True, True, True]
+
     assert pair_in_view(mask, ids, (5, 7), own_id=7)
     assert not pair_in_view(mask, ids, (5, 7))
     assert not pair_in_view(mask, ids, (5, 6), own_id=7)
@@ -246,25 +241,39 @@ def test_a_pair_is_in_view_if_all_but_the_agent_itself_are() -> None:
     assert pair_in_view(mask, ids, np.array([5, 7]), own_id=7)
 
 
-def watched(
-    root: Path, seen: Collection[int], frames: int = 21, agent: str = "ego_vehicle", **release
-) -> DeepAccident:
-    """One agent alone, which sees 1212 at the frames `seen`, and 1223 (the ego) always."""
+UNJUDGED_RELEASES = {
+    "silent": {"meta": None},
+    "unlabelled": {"labelled": False},
+    "nameless": {"meta": META_TEXT.replace(" agents id: 1223 1236 1212 1237\n", "")},
+}
+"""Options of releases that lack what a judgement needs: meta, labels or the agents' ids."""
 
-    def lines(_: str, frame: int) -> list[str]:
-        there = frame in seen
+
+def make_watched_release(
+    root: Path,
+    visible_frames: Collection[int],
+    frames: int = 21,
+    agent: str = "ego_vehicle",
+    **release,
+) -> DeepAccident:
+    """Write a release of one agent, which sees 1212 at some frames, and 1223 (the ego) always."""
+
+    def make_lines(_: str, frame: int) -> list[str]:
+        visible = frame in visible_frames
         return [
             "0 0",
-            f"car 20.0 0.0 0.0 4.0 2.0 1.5 0 0 0 1212 {9 * there} {there}",
+            f"car 20.0 0.0 0.0 4.0 2.0 1.5 0 0 0 1212 {9 * visible} {visible}",
             "car 9.0 5.0 0.0 4.0 2.0 1.5 0 0 0 1223 9 True",
         ]
 
-    tiny.write_tiny_release(root, frames=frames, agents=(agent,), lines_of=lines, **release)
+    tiny_release.write_tiny_release(
+        root, frames=frames, agents=(agent,), lines_of=make_lines, **release
+    )
     return DeepAccident(dataroot=root, verbose=False, workers=1)
 
 
 @pytest.mark.parametrize(
-    ("frames", "seen", "expected"),
+    ("frames", "visible_frames", "expected"),
     [
         (21, range(1, 22), "visible"),
         (21, {1, 6, 11, 16}, "visible"),
@@ -278,22 +287,20 @@ def watched(
     ],
 )
 def test_an_accident_is_seen_at_the_four_moments_or_at_some(
-    tmp_path: Path, frames: int, seen: Collection[int], expected: str | None
+    tmp_path: Path, frames: int, visible_frames: Collection[int], expected: str | None
 ) -> None:
-    da = watched(tmp_path, seen, frames)
-    assert accident_visibility(da, tiny.TOKEN) == expected
-    for index in range(1, frames + 1):
-        now, missed = (
-            index in seen,
-            sum(moment not in seen for moment in (index, index - 5, index - 10)),
-        )
-        assert accident_visible(da, f"{tiny.TOKEN}/ego_vehicle/{index:03d}") == (
-            now or missed < 2
-        ), index
+    da = make_watched_release(tmp_path, visible_frames, frames)
+    assert accident_visibility(da, SCENARIO_TOKEN) == expected
+    for frame in range(1, frames + 1):
+        moments = (frame, frame - 5, frame - 10)
+        unseen_moments = sum(moment not in visible_frames for moment in moments)
+        expected_visible = frame in visible_frames or unseen_moments < 2
+        sample = f"{SCENARIO_TOKEN}/ego_vehicle/{frame:03d}"
+        assert accident_visible(da, sample) == expected_visible, frame
 
 
 @pytest.mark.parametrize(
-    ("frames", "seen", "expected"),
+    ("frames", "visible_frames", "expected"),
     [
         (30, (), True),
         (30, {*range(1, 10), *range(21, 31)}, True),  # 2.1 s before the last frame, and 0.9 s
@@ -306,61 +313,50 @@ def test_an_accident_is_seen_at_the_four_moments_or_at_some(
     ],
 )
 def test_a_collider_is_hidden_if_ego_sees_it_at_no_frame_from_2_to_1_s_before_the_last(
-    tmp_path: Path, frames: int, seen: Collection[int], expected: bool | None
+    tmp_path: Path, frames: int, visible_frames: Collection[int], expected: bool | None
 ) -> None:
-    assert hidden_collider(watched(tmp_path, seen, frames), tiny.TOKEN) is expected
+    da = make_watched_release(tmp_path, visible_frames, frames)
+    assert hidden_collider(da, SCENARIO_TOKEN) is expected
 
 
 def test_whether_a_collider_is_hidden_may_be_unknown(tmp_path: Path, da: DeepAccident) -> None:
-    for place, release in (
-        ("silent", {"meta": None}),
-        ("unlabelled", {"labelled": False}),
-        ("nameless", {"meta": tiny.META.replace(" agents id: 1223 1236 1212 1237\n", "")}),
-        ("pole", {"agent": "infrastructure"}),
-    ):
-        assert hidden_collider(watched(tmp_path / place, (), **release), tiny.TOKEN) is None, place
-    bystander = tiny.META.replace("id: 1223 1236", "id: 1300 1236")
-    assert hidden_collider(
-        watched(tmp_path / "one", (), meta=bystander), tiny.TOKEN
-    )  # of two, one is seen
-    assert (
-        hidden_collider(
-            da, next(scenario for scenario in da.scenario if scenario["collision"] is None)
-        )
-        is None
-    )
+    scenario = SCENARIO_TOKEN
+    releases = {**UNJUDGED_RELEASES, "pole": {"agent": "infrastructure"}}
+    for name, release in releases.items():
+        da_unknown = make_watched_release(tmp_path / name, (), **release)
+        assert hidden_collider(da_unknown, scenario) is None, name
+
+    # the labels show one of the pair; the other is a bystander
+    bystander = META_TEXT.replace("id: 1223 1236", "id: 1300 1236")
+    da_one_seen = make_watched_release(tmp_path / "one", (), meta=bystander)
+    assert hidden_collider(da_one_seen, scenario)
+
+    without_collision = next(scenario for scenario in da.scenario if scenario["collision"] is None)
+    assert hidden_collider(da, without_collision) is None
+
     [curtain, *_] = SHEER_CURTAINS
-    assert (
-        hidden_collider(watched(tmp_path / "curtain", (), name=curtain), f"{tiny.TYPE}/{curtain}")
-        is False
-    )
+    da_curtained = make_watched_release(tmp_path / "curtain", (), name=curtain)
+    assert hidden_collider(da_curtained, f"{SCENARIO_TYPE}/{curtain}") is False
 
 
-def test_what_cannot_be_judged_and_what_always_counts_as_seen(
+def test_accidents_without_facts_are_unknown_and_sheer_curtains_hide_nothing(
     tmp_path: Path, da: DeepAccident
 ) -> None:
-    for place, told, release in (
-        ("silent", None, {"meta": None}),
-        ("unlabelled", None, {"labelled": False}),
-        ("nameless", None, {"meta": tiny.META.replace(" agents id: 1223 1236 1212 1237\n", "")}),
-    ):
-        other = watched(tmp_path / place, (), 6, **release)
-        assert accident_visible(other, f"{tiny.TOKEN}/ego_vehicle/006") is told, place
-        assert accident_visibility(other, tiny.TOKEN) is told, place
-    pole = watched(tmp_path / "pole", {6}, 6, "infrastructure")
-    assert accident_visibility(pole, tiny.TOKEN) is None
-    assert [
-        accident_visible(pole, f"{tiny.TOKEN}/infrastructure/{frame:03d}") for frame in (5, 6)
-    ] == [False, True]
+    scenario = SCENARIO_TOKEN
+    for name, release in UNJUDGED_RELEASES.items():
+        da_unknown = make_watched_release(tmp_path / name, (), 6, **release)
+        assert accident_visible(da_unknown, f"{scenario}/ego_vehicle/006") is None, name
+        assert accident_visibility(da_unknown, scenario) is None, name
+
+    da_pole = make_watched_release(tmp_path / "pole", {6}, 6, "infrastructure")
+    assert accident_visibility(da_pole, scenario) is None
+    assert accident_visible(da_pole, f"{scenario}/infrastructure/005") is False
+    assert accident_visible(da_pole, f"{scenario}/infrastructure/006") is True
+
     for number, name in enumerate(SHEER_CURTAINS):
-        assert (
-            accident_visibility(
-                watched(tmp_path / f"{number}", (), 6, name=name), f"{tiny.TYPE}/{name}"
-            )
-            == "visible"
-        )
-    [calm] = [scenario for scenario in da.scenario if scenario["collision"] is None][:1]
-    assert (
-        accident_visibility(da, calm),
-        accident_visible(da, f"{calm['token']}/infrastructure/001"),
-    ) == (None, True)
+        da_curtained = make_watched_release(tmp_path / f"{number}", (), 6, name=name)
+        assert accident_visibility(da_curtained, f"{SCENARIO_TYPE}/{name}") == "visible"
+
+    calm_scenario = next(scenario for scenario in da.scenario if scenario["collision"] is None)
+    assert accident_visibility(da, calm_scenario) is None
+    assert accident_visible(da, f"{calm_scenario['token']}/infrastructure/001") is True

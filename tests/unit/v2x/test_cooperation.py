@@ -1,38 +1,39 @@
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-import tiny
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import assert_refused
+from support import tiny_release
+from support.expected_errors import assert_raises
+from support.tiny_release import SCENARIO_TOKEN
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import cooperative_view
 
+SAMPLE_TOKEN = f"{SCENARIO_TOKEN}/ego_vehicle/001"
 
-def label_ids(da: DeepAccident, sample: str) -> set[int]:
+
+def tracked_actor_ids(da: DeepAccident, sample: str) -> set[int]:
+    """Return the ids of a sample's labelled actors, without -1."""
     return set(da.actor_ids(sample).tolist()) - {-1}
 
 
-def test_the_union_has_each_actor_once_and_nobody_else(da: DeepAccident) -> None:
-    for frame in (da.frame[2], da.frame[-1]):
-        samples = [sample["token"] for sample in da.samples_of(frame)]
-        for agents in (AGENTS, AGENTS[1:3], AGENTS[4:]):
-            tokens = [token for token in samples if token.split("/")[-2] in agents]
-            view = cooperative_view(da, tokens[0], agents=agents)
-            ids = view.boxes.actor_id
-            assert ids[ids >= 0].tolist() == sorted(
-                set.union(*(label_ids(da, token) for token in tokens))
-            )
-            assert -100 not in ids
-            for agent in AGENTS:
-                seen = (view.seen_by >> AGENTS.index(agent) & 1).astype(bool)
-                token = next((token for token in tokens if f"/{agent}/" in token), None)
-                assert set(ids[seen & (ids >= 0)].tolist()) == (
-                    label_ids(da, token) if token else set()
-                )
+def test_the_union_has_each_labelled_actor_once_and_no_other(da: DeepAccident) -> None:
+    agent_sets = (AGENTS, AGENTS[1:3], AGENTS[4:])
+    for frame, agents in itertools.product((da.frame[2], da.frame[-1]), agent_sets):
+        tokens = [sample["token"] for sample in da.samples_of(frame)]
+        samples = {token.split("/")[-2]: token for token in tokens}
+        ids_by_agent = {agent: tracked_actor_ids(da, samples[agent]) for agent in agents}
+        view = cooperative_view(da, samples[agents[0]], agents=agents)
+        ids = view.boxes.actor_id
+        assert ids[ids >= 0].tolist() == sorted(set.union(*ids_by_agent.values()))
+        assert -100 not in ids
+        for agent in AGENTS:
+            is_seen = (view.seen_by >> AGENTS.index(agent) & 1).astype(bool)
+            assert set(ids[is_seen & (ids >= 0)].tolist()) == ids_by_agent.get(agent, set())
 
 
 def test_each_box_is_its_sources_own_in_the_frame_asked_for(da: DeepAccident) -> None:
@@ -42,128 +43,139 @@ def test_each_box_is_its_sources_own_in_the_frame_asked_for(da: DeepAccident) ->
         assert view.boxes.frame == frame
         for agent in AGENTS:
             token = f"{da.scenario[0]['token']}/{agent}/003"
-            mine = view.source == AGENTS.index(agent)
-            theirs = da.boxes(token, "world").select(view.boxes.row[mine])
-            expected = theirs.transform(da.world_from(sample, frame).inverse(), frame)
-            assert_allclose(view.boxes.center[mine], expected.center, atol=1e-6)
-            assert_allclose(view.boxes.velocity[mine], expected.velocity, atol=1e-6)
-            assert_array_equal(view.boxes.size[mine], expected.size)
+            from_agent = view.source == AGENTS.index(agent)
+            labels = da.boxes(token, "world").select(view.boxes.row[from_agent])
+            expected = labels.transform(da.world_from(sample, frame).inverse(), frame)
+            assert_allclose(view.boxes.center[from_agent], expected.center, atol=1e-6)
+            assert_allclose(view.boxes.velocity[from_agent], expected.velocity, atol=1e-6)
+            assert_array_equal(view.boxes.size[from_agent], expected.size)
+
     assert (view.source == AGENTS.index("other_vehicle")).sum() > len(view.source) / 2
 
 
 def test_actor_ids_are_those_of_the_instances(da: DeepAccident) -> None:
     for sample in (da.sample[7], da.sample[-1]):
         instances = [box.instance_token for box in da.get_boxes(sample)]
-        assert_array_equal(
-            da.actor_ids(sample),
-            [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances],
-        )
+        expected = [-1 if token is None else int(token.rsplit("/", 1)[1]) for token in instances]
+        assert_array_equal(da.actor_ids(sample), expected)
 
 
-def scene(rows: dict[str, Sequence[str]]):
-    """Lines of agents who all stand at the same place: what one has at x the others have there
-    too.
+def place_agents_together(rows: dict[str, Sequence[str]]):
+    """Return a function that writes given label rows of agents at one place (a row's x is the same
+    for all).
     """
     return lambda agent, _frame: ["0.0 0.0", *rows.get(agent, ())]
 
 
 @pytest.fixture
-def stacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Open a release of two frames whose agents all stand in the origin, with given rows."""
+def open_release_at_origin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Open a release of two frames with given label rows; all its agents stand at the origin."""
 
-    def opened(rows: dict[str, Sequence[str]]) -> DeepAccident:
-        monkeypatch.setattr(tiny, "ego_to_world", lambda *_: tiny.pose())
-        monkeypatch.setattr(tiny, "lidar_height", lambda _: 0.0)
-        return DeepAccident(
-            dataroot=tiny.write_tiny_release(tmp_path, frames=2, lines_of=scene(rows)),
-            verbose=False,
-        )
+    def open_release(rows: dict[str, Sequence[str]]) -> DeepAccident:
+        monkeypatch.setattr(tiny_release, "ego_to_world", lambda *_: tiny_release.pose())
+        monkeypatch.setattr(tiny_release, "lidar_height", lambda _: 0.0)
+        tiny_release.write_tiny_release(tmp_path, frames=2, lines_of=place_agents_together(rows))
+        return DeepAccident(dataroot=tmp_path, verbose=False)
 
-    return opened
+    return open_release
 
 
-def row(x: float, actor: int, points: int = 9, category: str = "car", camera: bool = True) -> str:
-    return f"{category} {x} 0.0 0.0 4.0 2.0 1.5 0.0 0.0 0.0 {actor} {points} {camera}"
+def label_row(
+    x_m: float, actor: int, num_points: int = 9, category: str = "car", camera_visible: bool = True
+) -> str:
+    return f"{category} {x_m} 0.0 0.0 4.0 2.0 1.5 0.0 0.0 0.0 {actor} {num_points} {camera_visible}"
 
 
-def test_own_rows_become_actors_and_give_way_to_what_others_see(stacked) -> None:
-    da = stacked(
+def test_own_rows_become_actors_and_give_way_to_labels_of_others(open_release_at_origin) -> None:
+    da = open_release_at_origin(
         {
-            "ego_vehicle": [row(0.1, -100, 900, camera=False)],
-            "other_vehicle": [row(30.0, -100), row(0.0, 1223, 7)],
+            "ego_vehicle": [label_row(0.1, -100, 900, camera_visible=False)],
+            "other_vehicle": [label_row(30.0, -100), label_row(0.0, 1223, 7)],
         }
     )
-    view = cooperative_view(da, f"{tiny.TOKEN}/ego_vehicle/001")
+    view = cooperative_view(da, SAMPLE_TOKEN)
+
     assert_array_equal(view.boxes.actor_id, [1212, 1223])
     assert_allclose(view.boxes.center[:, 0], [30.0, 0.0])
     assert_array_equal(view.boxes.num_lidar_pts, [0, 7])
     assert_array_equal(view.boxes.camera_visible, [False, True])
     assert_array_equal(view.seen_by, [0b00100, 0b00101])
-    alone = da.cooperative_boxes(f"{tiny.TOKEN}/ego_vehicle/001", agents="single")
-    assert_array_equal(alone.actor_id, [1223])
-    assert_allclose(alone.center[0, 0], 0.1)
+    own_boxes = da.cooperative_boxes(SAMPLE_TOKEN, agents="single")
+    assert_array_equal(own_boxes.actor_id, [1223])
+    assert_allclose(own_boxes.center[0, 0], 0.1)
 
 
-def test_the_egos_box_counts_before_the_others_and_points_add_up(stacked) -> None:
-    da = stacked({"ego_vehicle": [row(20.0, 5, 3)], "infrastructure": [row(20.2, 5, 4)]})
-    for ego, x in (("ego_vehicle", 20.0), ("infrastructure", 20.2), ("other_vehicle", 20.0)):
-        boxes = da.cooperative_boxes(f"{tiny.TOKEN}/{ego}/001", agents=None)
-        assert_allclose(boxes.center[:, 0], [x])
+def test_the_egos_box_counts_before_the_others_and_points_add_up(open_release_at_origin) -> None:
+    rows = {
+        "ego_vehicle": [label_row(20.0, 5, 3)],
+        "infrastructure": [label_row(20.2, 5, 4)],
+    }
+    da = open_release_at_origin(rows)
+    for ego, x_m in (("ego_vehicle", 20.0), ("infrastructure", 20.2), ("other_vehicle", 20.0)):
+        boxes = da.cooperative_boxes(f"{SCENARIO_TOKEN}/{ego}/001", agents=None)
+        assert_allclose(boxes.center[:, 0], [x_m])
         assert_array_equal(boxes.num_lidar_pts, [7])
 
 
-def test_untracked_rows_stay_but_once_a_place(stacked) -> None:
+def test_untracked_rows_stay_but_only_once_at_a_place(open_release_at_origin) -> None:
     rows = {
-        "ego_vehicle": [row(50.0, -1), row(50.3, -1), row(70.0, 8)],
+        "ego_vehicle": [label_row(50.0, -1), label_row(50.3, -1), label_row(70.0, 8)],
         "other_vehicle": [
-            row(50.2, -1),
-            row(50.2, -1, category="truck"),
-            row(70.1, -1),
-            row(90.0, -1),
+            label_row(50.2, -1),
+            label_row(50.2, -1, category="truck"),
+            label_row(70.1, -1),
+            label_row(90.0, -1),
         ],
-        "infrastructure": [row(90.4, -1), row(91.0, -1)],
+        "infrastructure": [label_row(90.4, -1), label_row(91.0, -1)],
     }
-    boxes = stacked(rows).cooperative_boxes(f"{tiny.TOKEN}/ego_vehicle/001")
+    boxes = open_release_at_origin(rows).cooperative_boxes(SAMPLE_TOKEN)
+
     assert_array_equal(boxes.actor_id, [8, -1, -1, -1, -1, -1])
     assert_allclose(boxes.center[:, 0], [70.0, 50.0, 50.3, 50.2, 90.0, 91.0])
     assert boxes.category_names == ["car", "car", "car", "truck", "car", "car"]
 
 
-@pytest.mark.parametrize(("apart", "kept"), [(0.25, 2), (0.5, 4)])
-def test_half_a_metre_apart_are_two_actors(stacked, apart: float, kept: int) -> None:
+@pytest.mark.parametrize(("distance_m", "num_boxes"), [(0.25, 2), (0.5, 4)])
+def test_half_a_metre_apart_are_two_actors(
+    open_release_at_origin, distance_m: float, num_boxes: int
+) -> None:
     rows = {
-        "ego_vehicle": [row(50.0, -1), row(70.0, 8)],
-        "infrastructure": [row(50.0 + apart, -1), row(70 + apart, -1)],
+        "ego_vehicle": [label_row(50.0, -1), label_row(70.0, 8)],
+        "infrastructure": [label_row(50.0 + distance_m, -1), label_row(70 + distance_m, -1)],
     }
-    view = cooperative_view(stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001")
-    assert_array_equal(view.boxes.actor_id, [8, -1, -1, -1][:kept])
-    assert_array_equal(view.seen_by, [1, 1, 16, 16][:kept])
-    assert_array_equal(view.boxes.num_lidar_pts, [9] * kept)
+    view = cooperative_view(open_release_at_origin(rows), SAMPLE_TOKEN)
+
+    assert_array_equal(view.boxes.actor_id, [8, -1, -1, -1][:num_boxes])
+    assert_array_equal(view.seen_by, [1, 1, 16, 16][:num_boxes])
+    assert_array_equal(view.boxes.num_lidar_pts, [9] * num_boxes)
 
 
-def test_visible_only(stacked) -> None:
+def test_visible_only(open_release_at_origin) -> None:
     rows = {
         "ego_vehicle": [
-            row(0.0, -100),
-            row(20.0, 5, 1),
-            row(40.0, 6, 9, camera=False),
-            row(12.0, -1),
+            label_row(0.0, -100),
+            label_row(20.0, 5, 1),
+            label_row(40.0, 6, 9, camera_visible=False),
+            label_row(12.0, -1),
         ],
-        "infrastructure": [row(40.0, 6, 2), row(14.0, 7, 1, camera=False)],
+        "infrastructure": [label_row(40.0, 6, 2), label_row(14.0, 7, 1, camera_visible=False)],
     }
-    da, sample = stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001"
-    seen = {
-        visible: da.cooperative_boxes(sample, visible=visible)
-        for visible in (None, "camera", "released")
-    }
-    assert_array_equal(seen[None].actor_id, [5, 6, 7, 1223, -1])
-    assert_array_equal(seen["camera"].actor_id, [5, 6, 1223, -1])
-    assert_array_equal(seen["released"].actor_id, [6, 7])
-    assert da.visible_instances(sample) == [f"{tiny.TOKEN}/actor/6", f"{tiny.TOKEN}/actor/7"]
-    assert da.visible_instances(sample, agents="single") == []
-    assert_refused(
+    da = open_release_at_origin(rows)
+    boxes = da.cooperative_boxes(SAMPLE_TOKEN, visible=None)
+    camera_boxes = da.cooperative_boxes(SAMPLE_TOKEN, visible="camera")
+    released_boxes = da.cooperative_boxes(SAMPLE_TOKEN, visible="released")
+
+    assert_array_equal(boxes.actor_id, [5, 6, 7, 1223, -1])
+    assert_array_equal(camera_boxes.actor_id, [5, 6, 1223, -1])
+    assert_array_equal(released_boxes.actor_id, [6, 7])
+    assert da.visible_instances(SAMPLE_TOKEN) == [
+        f"{SCENARIO_TOKEN}/actor/6",
+        f"{SCENARIO_TOKEN}/actor/7",
+    ]
+    assert da.visible_instances(SAMPLE_TOKEN, agents="single") == []
+    assert_raises(
         (
-            lambda: da.cooperative_boxes(sample, visible="all"),
+            lambda: da.cooperative_boxes(SAMPLE_TOKEN, visible="all"),
             ChoiceError,
             "visible: expected one of camera, released, or None, found 'all'",
         ),
@@ -172,25 +184,38 @@ def test_visible_only(stacked) -> None:
 
 def test_visible_instances_of_all_agents_are_those_of_the_released_labels(da: DeepAccident) -> None:
     for sample in (da.sample[0], da.sample[33]):
-        instances = {int(token.rsplit("/", 1)[1]) for token in da.visible_instances(sample)}
-        assert set(da.boxes(sample, visible="released").actor_id.tolist()) == instances & set(
-            da.boxes(sample).actor_id.tolist()
-        )
-        assert len(instances) >= len(da.visible_instances(sample, agents="single")) > 0
+        instances = da.visible_instances(sample)
+        visible_ids = {int(token.rsplit("/", 1)[1]) for token in instances}
+        labelled_ids = set(da.boxes(sample).actor_id.tolist())
+        released_ids = set(da.boxes(sample, visible="released").actor_id.tolist())
+        assert released_ids == visible_ids & labelled_ids
+        assert len(visible_ids) >= len(da.visible_instances(sample, agents="single")) > 0
 
 
 def test_agents_without_labels_see_nothing(tmp_path: Path) -> None:
-    da = DeepAccident(dataroot=tiny.write_tiny_release(tmp_path, labelled=False), verbose=False)
-    sample = f"{tiny.TOKEN}/ego_vehicle/001"
-    assert (len(da.cooperative_boxes(sample, frame="ego")), da.visible_instances(sample)) == (0, [])
+    tiny_release.write_tiny_release(tmp_path, labelled=False)
+    da = DeepAccident(dataroot=tmp_path, verbose=False)
+    assert len(da.cooperative_boxes(SAMPLE_TOKEN, frame="ego")) == 0
+    assert da.visible_instances(SAMPLE_TOKEN) == []
 
 
-def test_a_row_that_a_label_repeats_counts_once(stacked) -> None:
+def test_a_row_that_a_label_repeats_counts_once(open_release_at_origin) -> None:
     rows = {
-        "ego_vehicle": [row(20.0, 5, 3), row(20.4, 5, 8), row(0.0, -100), row(0.1, -100, 70)],
-        "infrastructure": [row(20.2, 5, 4), row(20.2, 5, 4), row(0.0, 1223, 6), row(0.0, 1223, 6)],
+        "ego_vehicle": [
+            label_row(20.0, 5, 3),
+            label_row(20.4, 5, 8),
+            label_row(0.0, -100),
+            label_row(0.1, -100, 70),
+        ],
+        "infrastructure": [
+            label_row(20.2, 5, 4),
+            label_row(20.2, 5, 4),
+            label_row(0.0, 1223, 6),
+            label_row(0.0, 1223, 6),
+        ],
     }
-    view = cooperative_view(stacked(rows), f"{tiny.TOKEN}/ego_vehicle/001")
+    view = cooperative_view(open_release_at_origin(rows), SAMPLE_TOKEN)
+
     assert_array_equal(view.boxes.actor_id, [5, 1223])
     assert_array_equal(view.boxes.num_lidar_pts, [7, 6])
     assert_allclose(view.boxes.center[:, 0], [20.0, 0.0])

@@ -1,12 +1,13 @@
 import math
 import pickle
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from functools import partial
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, MissingFileError
@@ -15,7 +16,7 @@ from deepaccident_devkit.v2x import Link, PoseNoise
 from deepaccident_devkit.v2x.cooperation import seen_actors
 from deepaccident_devkit.v2x.messages import message_bytes, messages, traffic
 
-BEHIND = AGENTS[1]
+EGO_BEHIND = AGENTS[1]
 
 
 @pytest.fixture
@@ -23,90 +24,87 @@ def sample(da_b: DeepAccident) -> str:
     return f"{da_b.scenario[0]['token']}/ego_vehicle/004"
 
 
+def calls_with_links(da: DeepAccident) -> tuple[Callable[..., object], ...]:
+    return (
+        da.cooperative_boxes,
+        da.visible_instances,
+        da.aggregate_point_cloud,
+        da.message_sizes,
+    )
+
+
 def test_a_latency_that_is_no_multiple_of_a_frame_names_the_two_nearest() -> None:
     assert [Link(latency=frames / 10).latency_frames for frames in range(12)] == list(range(12))
     assert Link(latency=0.1 + 0.2).latency_frames == 3
-    assert_refused(
+    assert_raises(
         (
             lambda: Link(latency=0.25),
             ConfigError,
-            r"0\.25 s is no multiple of a frame \(0\.1 s\); the nearest are 0\.2 s and 0\.3",
+            r"0\.25 s is not a multiple of a frame \(0\.1 s\); the nearest are 0\.2 s and 0\.3",
         ),
         *[
-            (partial(Link, latency=wrong), ConfigError, r"latency: .* is not possible")
-            for wrong in (-0.1, math.nan, math.inf)
+            (partial(Link, latency=latency), ConfigError, r"latency: .* is not possible")
+            for latency in (-0.1, math.nan, math.inf)
         ],
     )
 
 
-def test_a_latency_longer_than_the_past_names_what_there_is(
+def test_a_latency_longer_than_the_past_names_the_longest_possible(
     da_b: DeepAccident, sample: str
 ) -> None:
+    options = {"agents": ["infrastructure"], "link": Link(latency=0.5)}
+    message = r"from frame 004 .*longest possible latency is 0\.3 s; .* frame 006 or a later"
+
     assert len(da_b.cooperative_boxes(sample, link=Link(latency=0.3))) > 0
-    assert_refused(
+    assert_raises(
         *[
-            (
-                partial(call, sample, agents=["infrastructure"], link=Link(latency=0.5)),
-                ConfigError,
-                (
-                    r"from frame 004; the longest possible is 0\.3 s; .* a frame that "
-                    r"has 5 others before it"
-                ),
-            )
-            for call in (
-                da_b.cooperative_boxes,
-                da_b.visible_instances,
-                da_b.aggregate_point_cloud,
-                da_b.message_sizes,
-            )
-        ],
+            (partial(call, sample, **options), ConfigError, message)
+            for call in calls_with_links(da_b)
+        ]
     )
 
 
-def test_settings_that_are_not_possible() -> None:
-    assert_refused(
-        (lambda: Link(packet_loss=2), ConfigError, "packet_loss: 2 is no probability"),
+def test_link_settings_that_are_not_possible() -> None:
+    assert_raises(
+        (lambda: Link(packet_loss=2), ConfigError, "packet_loss: 2 is not a probability"),
         (lambda: PoseNoise(std=-1), ConfigError, "std is -1; choose a finite number"),
     )
-    with pytest.raises(
-        ConfigError, match="pose_noise: expected metres or a PoseNoise, found 'much'"
-    ):
+    message = "pose_noise: expected metres or a PoseNoise, found 'much'"
+    with pytest.raises(ConfigError, match=message):
         Link(pose_noise="much")  # type: ignore[arg-type]
     assert Link(pose_noise=0.3) == Link(pose_noise=PoseNoise(mean=0.3, std=0.02, heading_std=0))
     assert pickle.loads(pickle.dumps(Link(pose_noise=0.3))) == Link(pose_noise=0.3)
 
 
-def test_a_draw_depends_on_seed_scenario_partner_and_frame_alone(
+def test_a_draw_depends_only_on_seed_scenario_partner_and_frame(
     da_b: DeepAccident, sample: str
 ) -> None:
-    link = Link(pose_noise=0.3, packet_loss=0.4, seed=7)
+    def read_pose_errors(agents: list[str] | None, link: Link) -> dict[str, bytes]:
+        received = [
+            message for message in messages(da_b, sample, agents, link) if message.pose_error
+        ]
+        return {message.agent: message.pose_error.matrix.tobytes() for message in received}
 
-    def errors(agents: list[str] | None, link: Link) -> dict[str, bytes]:
-        received = messages(da_b, sample, agents, link)
-        return {
-            message.agent: message.pose_error.matrix.tobytes()
-            for message in received
-            if message.pose_error
-        }
-
-    together = errors(None, Link(pose_noise=0.3, seed=7))
-    assert len(set(together.values())) == len(AGENTS) - 1
+    all_errors = read_pose_errors(None, Link(pose_noise=0.3, seed=7))
+    assert len(set(all_errors.values())) == len(AGENTS) - 1
+    lossy_link = Link(pose_noise=0.3, packet_loss=0.4, seed=7)
     for agent in AGENTS[:0:-1]:
-        assert errors([agent], link) in ({}, {agent: together[agent]})
-    assert not set(errors(None, Link(pose_noise=0.3, seed=8)).values()) & set(together.values())
+        assert read_pose_errors([agent], lossy_link) in ({}, {agent: all_errors[agent]})
+
+    other_errors = read_pose_errors(None, Link(pose_noise=0.3, seed=8))
+    assert not set(other_errors.values()) & set(all_errors.values())
 
 
 def test_the_egos_own_data_are_never_disturbed(da_b: DeepAccident, sample: str) -> None:
     link = Link(latency=0.2, pose_noise=0.5, packet_loss=1)
-    alone, through = (
-        da_b.cooperative_boxes(sample, agents="single", link=way) for way in (None, link)
-    )
-    everyone = da_b.cooperative_boxes(sample, link=link)
-    for got in (through, everyone):
-        assert_array_equal(got.center, alone.center)
-        assert_array_equal(got.actor_id, alone.actor_id)
-    nobody = da_b.cooperative_boxes(sample, agents=["infrastructure"], link=link)
-    assert (len(nobody), nobody.frame) == (0, "world")
+    undisturbed = da_b.cooperative_boxes(sample, agents="single", link=None)
+    own_boxes = da_b.cooperative_boxes(sample, agents="single", link=link)
+    for boxes in (own_boxes, da_b.cooperative_boxes(sample, link=link)):
+        assert_array_equal(boxes.center, undisturbed.center)
+        assert_array_equal(boxes.actor_id, undisturbed.actor_id)
+
+    lost_boxes = da_b.cooperative_boxes(sample, agents=["infrastructure"], link=link)
+    assert (len(lost_boxes), lost_boxes.frame) == (0, "world")
     assert da_b.visible_instances(sample, agents=["infrastructure"], link=link) == []
 
 
@@ -114,76 +112,75 @@ def test_pose_noise_moves_all_of_a_partners_boxes_by_the_same_distance(
     da_b: DeepAccident, sample: str
 ) -> None:
     pole = ["infrastructure"]
-    true, noisy = (
-        da_b.cooperative_boxes(sample, agents=pole, link=link)
-        for link in (None, Link(pose_noise=0.4))
-    )
-    off = noisy.center - true.center
-    assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=1e-9)
-    assert (off[0, 2], np.hypot(*off[0, :2])) == (
-        pytest.approx(0, abs=1e-9),
-        pytest.approx(0.4, abs=0.1),
-    )
+    boxes = da_b.cooperative_boxes(sample, agents=pole)
+    noisy_boxes = da_b.cooperative_boxes(sample, agents=pole, link=Link(pose_noise=0.4))
+    shift = noisy_boxes.center - boxes.center
+
+    assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=1e-9)
+    assert shift[0, 2] == pytest.approx(0, abs=1e-9)
+    assert np.hypot(*shift[0, :2]) == pytest.approx(0.4, abs=0.1)
 
 
 def test_a_wrong_heading_turns_about_the_partner(da_b: DeepAccident, sample: str) -> None:
-    link = Link(pose_noise=PoseNoise(std=0, heading_std=0.1))
     pole = da_b.world_from(sample.replace("ego_vehicle", "infrastructure"), "ego").translation
-    true, noisy = (
-        da_b.cooperative_boxes(sample, agents=["infrastructure"], link=way) for way in (None, link)
-    )
-    assert_allclose(
-        *[np.linalg.norm(boxes.center - pole, axis=1) for boxes in (true, noisy)], atol=1e-9
-    )
-    turned = np.angle(np.exp(1j * (noisy.yaw - true.yaw)))
-    assert_allclose(turned, turned[0], atol=1e-6)
-    assert abs(turned[0]) > 1e-3
+    link = Link(pose_noise=PoseNoise(std=0, heading_std=0.1))
+    boxes = da_b.cooperative_boxes(sample, agents=["infrastructure"])
+    turned_boxes = da_b.cooperative_boxes(sample, agents=["infrastructure"], link=link)
+
+    distances = np.linalg.norm(boxes.center - pole, axis=1)
+    turned_distances = np.linalg.norm(turned_boxes.center - pole, axis=1)
+    assert_allclose(distances, turned_distances, atol=1e-9)
+    turns = np.angle(np.exp(1j * (turned_boxes.yaw - boxes.yaw)))
+    assert_allclose(turns, turns[0], atol=1e-6)
+    assert abs(turns[0]) > 1e-3
 
 
-def test_latency_shows_what_the_partner_saw_then(da_b: DeepAccident, sample: str) -> None:
+def test_a_late_partner_sends_its_earlier_boxes(da_b: DeepAccident, sample: str) -> None:
     pole = ["infrastructure"]
-    late = da_b.cooperative_boxes(sample, agents=pole, link=Link(latency=0.2))
-    then = da_b.cooperative_boxes(sample.replace("/004", "/002"), agents=pole)
-    assert_array_equal(late.center, then.center)
-    assert_array_equal(late.actor_id, then.actor_id)
+    late_boxes = da_b.cooperative_boxes(sample, agents=pole, link=Link(latency=0.2))
+    earlier_boxes = da_b.cooperative_boxes(sample.replace("/004", "/002"), agents=pole)
+    assert_array_equal(late_boxes.center, earlier_boxes.center)
+    assert_array_equal(late_boxes.actor_id, earlier_boxes.actor_id)
 
 
 def test_a_sweep_arrives_as_it_did_when_it_was_the_present(da_b: DeepAccident, sample: str) -> None:
-    """Of four sweeps each is what its own frame received, as far as the latency lets anything
+    """Each of four sweeps is what its own frame received, as far as the latency lets anything
     arrive there.
     """
-    link, agents = Link(latency=0.1, pose_noise=0.3, packet_loss=0.4, seed=5), list(AGENTS[1:])
+    link = Link(latency=0.1, pose_noise=0.3, packet_loss=0.4, seed=5)
 
-    def facts(token: str, sweeps: int) -> list[tuple[str, str, bytes]]:
+    def read_messages(token: str, sweeps: int) -> list[tuple[str, str, bytes]]:
         return [
             (message.agent, message.sample, message.pose_error.matrix.tobytes())
-            for message in messages(da_b, token, agents, link, sweeps=sweeps)
+            for message in messages(da_b, token, list(AGENTS[1:]), link, sweeps=sweeps)
         ]
 
-    tokens = [sample.replace("/004", f"/{index:03d}") for index in (4, 3, 2)]
-    assert facts(sample, 4) == [fact for token in tokens for fact in facts(token, 1)]
+    expected = []
+    for frame in ("004", "003", "002"):
+        expected += read_messages(sample.replace("004", frame), 1)
+    assert read_messages(sample, 4) == expected
 
 
-@pytest.mark.parametrize("wrong", ["0.2", None, [0.2], (0.1, 0.02), 1j])
-def test_what_is_no_number_is_refused(wrong: object) -> None:
-    assert_refused(
+@pytest.mark.parametrize("value", ["0.2", None, [0.2], (0.1, 0.02), 1j])
+def test_a_value_that_is_no_number_is_refused(value: object) -> None:
+    assert_raises(
         *[
-            (partial(Link, **{name: wrong}), ConfigError, f"{name}: expected .*, found")
+            (partial(Link, **{name: value}), ConfigError, f"{name}: expected .*, found")
             for name in ("latency", "packet_loss")
         ],
         *[
             (
-                partial(PoseNoise, **{name: wrong}),
+                partial(PoseNoise, **{name: value}),
                 ConfigError,
                 f"pose noise: {name}: expected a number from 0, found",
             )
             for name in ("mean", "std", "heading_std")
         ],
     )
-    if wrong is not None:
-        assert_refused(
+    if value is not None:
+        assert_raises(
             (
-                lambda: Link(pose_noise=wrong),
+                lambda: Link(pose_noise=value),
                 ConfigError,
                 "pose_noise: expected metres or a PoseNoise, found",
             ),
@@ -191,16 +188,16 @@ def test_what_is_no_number_is_refused(wrong: object) -> None:
 
 
 def test_seeds_are_whole_numbers() -> None:
-    assert_refused(
+    assert_raises(
         *[
-            (partial(Link, seed=wrong), ConfigError, "seed: expected a whole number, found")
-            for wrong in (1.5, "a", None, 1.0)
+            (partial(Link, seed=seed), ConfigError, "seed: expected a whole number, found")
+            for seed in (1.5, "a", None, 1.0)
         ],
     )
     assert Link(seed=-1) != Link(seed=1)
 
 
-def test_equal_links_draw_alike_whatever_their_numbers_types() -> None:
+def test_equal_links_draw_alike_whatever_the_types_of_their_numbers() -> None:
     links = [
         Link(latency=0.3, pose_noise=0.5, packet_loss=0.5, seed=1),
         Link(
@@ -218,48 +215,36 @@ def test_equal_links_draw_alike_whatever_their_numbers_types() -> None:
     ]
     assert len(set(links)) == 1
     for link in links:
-        assert (type(link.latency), type(link.packet_loss), type(link.seed)) == (float, float, int)
+        assert type(link.latency) is float
+        assert type(link.packet_loss) is float
+        assert type(link.seed) is int
         assert type(link.pose_noise.mean) is float
-        assert (
-            len(
-                {
-                    link.pose_error("scenario", "agent", 4, np.zeros(3)).matrix.tobytes()
-                    for link in links
-                }
-            )
-            == 1
-        )
-    assert (
-        Link(pose_noise=np.int64(1))
-        == Link(pose_noise=1.0)
-        == Link(pose_noise=PoseNoise(mean=np.uint8(1)))
-    )
+
+    pose_errors = [link.pose_error("scenario", "agent", 4, np.zeros(3)) for link in links]
+    assert len({pose_error.matrix.tobytes() for pose_error in pose_errors}) == 1
+    one_metre = Link(pose_noise=1.0)
+    assert Link(pose_noise=np.int64(1)) == one_metre
+    assert Link(pose_noise=PoseNoise(mean=np.uint8(1))) == one_metre
 
 
-@pytest.mark.parametrize("wrong", [{"latency": 0.2}, "a", 0.2, Link])
-def test_what_is_no_link_is_refused_by_every_call(
-    da_b: DeepAccident, sample: str, wrong: object
+@pytest.mark.parametrize("link", [{"latency": 0.2}, "a", 0.2, Link])
+def test_every_call_refuses_a_link_that_is_none(
+    da_b: DeepAccident, sample: str, link: object
 ) -> None:
-    calls = (
-        da_b.cooperative_boxes,
-        da_b.visible_instances,
-        da_b.aggregate_point_cloud,
-        da_b.message_sizes,
-    )
-    assert_refused(
+    assert_raises(
         *[
             (
-                partial(call, sample, link=wrong),
+                partial(call, sample, link=link),
                 ConfigError,
                 r"link: expected a Link, such as Link\(latency=0\.2, .* found",
             )
-            for call in calls
+            for call in calls_with_links(da_b)
         ],
     )
 
 
 def test_likely_mistakes_of_units_are_named() -> None:
-    assert_refused(
+    assert_raises(
         (
             lambda: Link(latency=200),
             ConfigError,
@@ -278,17 +263,17 @@ def test_the_ends_of_each_range() -> None:
     assert [Link(packet_loss=loss).packet_loss for loss in (0, 1)] == [0, 1]
     assert Link(latency=0.1 + 0.9e-7).latency == Link(latency=0.1 - 0.9e-7).latency == 0.1
     assert PoseNoise(mean=0, std=0, heading_std=math.pi).heading_std == math.pi
-    assert_refused(
+    assert_raises(
         (
             lambda: Link(packet_loss=-0.01),
             ConfigError,
-            "packet_loss: -0.01 is no probability; choose a number from 0",
+            "packet_loss: -0.01 is not a probability; choose a number from 0",
         ),
-        (lambda: Link(packet_loss=1.01), ConfigError, "packet_loss: 1.01 is no probability"),
+        (lambda: Link(packet_loss=1.01), ConfigError, "packet_loss: 1.01 is not a probability"),
         (
             lambda: Link(latency=0.1 + 1.1e-7),
             ConfigError,
-            r"is no multiple of a frame .* nearest are 0\.1 s and 0\.2 s",
+            r"is not a multiple of a frame .* nearest are 0\.1 s and 0\.2 s",
         ),
         (
             lambda: Link(latency=20.1),
@@ -307,128 +292,135 @@ def test_the_ends_of_each_range() -> None:
         ),
     )
     assert Link(latency=0.3).frame_sent("scenario", 4) == 1
-    assert_refused(
+    assert_raises(
         (
             lambda: Link(latency=0.3).frame_sent("scenario", 3),
             ConfigError,
             (
-                r"of scenario from frame 003; the longest possible is 0\.2 s; .* "
-                r"has 3 others before it"
+                r"from frame 003 .* of scenario; the longest possible latency is 0\.2 s; .* "
+                r"frame 004 or a later one"
             ),
         ),
     )
 
 
-def box_bytes(da: DeepAccident, sample: str) -> dict[str, int]:
-    """Partner → bytes of its boxes, in their order."""
+def read_box_bytes(da: DeepAccident, sample: str) -> dict[str, int]:
+    """Return the bytes of each partner's boxes, in the order of the partners."""
     sizes = da.message_sizes(sample, clouds=False)
-    return {agent: each.boxes for agent, each in sizes.items() if agent != sample.split("/")[2]}
+    del sizes[sample.split("/")[2]]
+    return {agent: size.boxes for agent, size in sizes.items()}
 
 
-def senders(
+def list_senders(
     da: DeepAccident, sample: str, link: Link, agents: object = "all", sweeps: int = 1
 ) -> list[str]:
-    return [message.agent for message in messages(da, sample, agents, link, sweeps=sweeps)]  # type: ignore[arg-type]
+    received = messages(da, sample, agents, link, sweeps=sweeps)  # type: ignore[arg-type]
+    return [message.agent for message in received]
 
 
 def test_within_a_budget_each_partner_sends_that_still_fits(
     da_b: DeepAccident, sample: str
 ) -> None:
-    sizes = box_bytes(da_b, sample)
+    sizes = read_box_bytes(da_b, sample)
     total = sum(sizes.values())
     for budget in (1, min(sizes.values()) - 1, *sizes.values(), total - 1, total):
-        expected, left = ["ego_vehicle"], budget
+        expected = ["ego_vehicle"]
+        bytes_left = budget
         for agent, size in sizes.items():
-            if size <= left:
+            if size <= bytes_left:
                 expected.append(agent)
-                left -= size
+                bytes_left -= size
+        expected_traffic = (budget - bytes_left, len(expected) - 1)
+
         link = Link(budget=budget, payload="boxes")
-        assert senders(da_b, sample, link) == expected
+        assert list_senders(da_b, sample, link) == expected
         assert list(da_b.message_sizes(sample, link=link, clouds=False)) == expected
-        assert traffic(da_b, sample, "all", link, "boxes") == (budget - left, len(expected) - 1)
-    assert senders(da_b, sample, link) == ["ego_vehicle", *sizes]
+        assert traffic(da_b, sample, "all", link, "boxes") == expected_traffic
+    assert list_senders(da_b, sample, link) == ["ego_vehicle", *sizes]
 
 
 def test_a_message_that_does_not_fit_does_not_keep_a_smaller_one_out(
     da_b: DeepAccident, sample: str
 ) -> None:
-    sizes = box_bytes(da_b, sample)
-    large, small = max(sizes, key=sizes.__getitem__), min(sizes, key=sizes.__getitem__)
-    assert sizes[small] < sizes[large]
-    assert senders(da_b, sample, Link(budget=sizes[small], payload="boxes"), [large, small]) == [
-        small
-    ]
+    sizes = read_box_bytes(da_b, sample)
+    large_agent = max(sizes, key=sizes.__getitem__)
+    small_agent = min(sizes, key=sizes.__getitem__)
+    link = Link(budget=sizes[small_agent], payload="boxes")
+    assert sizes[small_agent] < sizes[large_agent]
+    assert list_senders(da_b, sample, link, [large_agent, small_agent]) == [small_agent]
 
 
-def test_a_budget_is_of_each_frame_and_of_what_arrives(da_b: DeepAccident, sample: str) -> None:
-    one = {"budget": 1500, "payload": 1000}
-    assert senders(da_b, sample, Link(**one), sweeps=2) == ["ego_vehicle", "ego_vehicle_behind"] * 2
-    seeds = [
-        each
-        for each in range(20)
-        if Link(packet_loss=0.5, seed=each).loses(da_b.scenario[0]["token"], BEHIND, 4)
-    ]
-    assert seeds
-    for seed in seeds:
-        arriving = senders(da_b, sample, Link(packet_loss=0.5, seed=seed))
-        assert senders(da_b, sample, Link(packet_loss=0.5, seed=seed, **one)) == arriving[:2]
+def test_a_budget_applies_to_each_frame_and_to_arriving_messages(
+    da_b: DeepAccident, sample: str
+) -> None:
+    one_partner = {"budget": 1500, "payload": 1000}
+    senders = list_senders(da_b, sample, Link(**one_partner), sweeps=2)
+    assert senders == ["ego_vehicle", "ego_vehicle_behind"] * 2
+
+    scenario = da_b.scenario[0]["token"]
+    links = [Link(packet_loss=0.5, seed=seed) for seed in range(20)]
+    losing_links = [link for link in links if link.loses(scenario, EGO_BEHIND, 4)]
+    assert losing_links
+    for link in losing_links:
+        limited_link = replace(link, **one_partner)
+        assert list_senders(da_b, sample, limited_link) == list_senders(da_b, sample, link)[:2]
 
 
-def test_whoever_does_not_fit_is_not_heard(da_b: DeepAccident, sample: str) -> None:
-    alone, limited, everyone = (
-        seen_actors(da_b, sample, agents=agents, link=link)
-        for agents, link in (
-            ("single", None),
-            ("all", Link(budget=1, payload="bev")),
-            ("all", None),
-        )
-    )
-    assert_array_equal(limited.boxes.actor_id, alone.boxes.actor_id)
-    assert len(everyone.boxes) > len(alone.boxes)
+def test_a_partner_that_does_not_fit_is_not_heard(da_b: DeepAccident, sample: str) -> None:
+    link = Link(budget=1, payload="bev")
+    own_actors = seen_actors(da_b, sample, agents="single")
+    limited_actors = seen_actors(da_b, sample, agents="all", link=link)
+    all_actors = seen_actors(da_b, sample, agents="all")
+    assert_array_equal(limited_actors.boxes.actor_id, own_actors.boxes.actor_id)
+    assert len(all_actors.boxes) > len(own_actors.boxes)
 
 
-def test_bytes_of_a_message_are_those_of_its_sizes(da: DeepAccident, da_b: DeepAccident) -> None:
+def test_bytes_of_a_message_agree_with_its_sizes(da: DeepAccident, da_b: DeepAccident) -> None:
     token = da.get_sample(da.scenario[0], "infrastructure", 3)["token"]
     sizes = asdict(da.message_sizes(token, agents="single")["infrastructure"])
-    assert {kind: message_bytes(da, token, kind) for kind in sizes} == sizes  # type: ignore[arg-type]
-    assert [message_bytes(da, token, given) for given in (70, None)] == [70, 0]
-    blind = f"{da_b.scenario[0]['token']}/infrastructure/003"
-    assert_refused((lambda: message_bytes(da_b, blind, "cloud"), MissingFileError, "lidar01"))
-    assert message_bytes(da_b, blind, "boxes") == 24 + 45 * len(da_b.boxes(blind))
+    assert sizes
+    for kind, num_bytes in sizes.items():
+        assert message_bytes(da, token, kind) == num_bytes, kind  # type: ignore[arg-type]
+    assert message_bytes(da, token, 70) == 70
+    assert message_bytes(da, token, None) == 0
+
+    blind_sample = f"{da_b.scenario[0]['token']}/infrastructure/003"
+    assert_raises((lambda: message_bytes(da_b, blind_sample, "cloud"), MissingFileError, "lidar01"))
+    assert message_bytes(da_b, blind_sample, "boxes") == 24 + 45 * len(da_b.boxes(blind_sample))
 
 
 def test_traffic_is_that_of_partners_after_latency_and_loss(
     da_b: DeepAccident, sample: str
 ) -> None:
-    sizes, early = box_bytes(da_b, sample), box_bytes(da_b, sample.replace("/004", "/002"))
-    assert traffic(da_b, sample, "all", None, "boxes") == (sum(sizes.values()), 4)
-    assert traffic(da_b, sample, "all", Link(latency=0.2, pose_noise=0.3), "boxes") == (
-        sum(early.values()),
-        4,
-    )
+    num_bytes = sum(read_box_bytes(da_b, sample).values())
+    earlier_bytes = sum(read_box_bytes(da_b, sample.replace("/004", "/002")).values())
+    late_link = Link(latency=0.2, pose_noise=0.3)
+
+    assert traffic(da_b, sample, "all", None, "boxes") == (num_bytes, 4)
+    assert traffic(da_b, sample, "all", late_link, "boxes") == (earlier_bytes, 4)
     assert traffic(da_b, sample, "all", Link(packet_loss=1), "boxes") == (0, 0)
     assert traffic(da_b, sample, "single", None, "boxes") == (0, 0)
     assert traffic(da_b, sample, ["infrastructure"], None, 70) == (70, 1)
 
 
-def test_budgets_that_are_none() -> None:
-    bytes_ = r"expected a whole number from 1 to 1,125,899,906,842,624 \(bytes"
-    assert_refused(
+def test_budgets_and_payloads_that_are_refused() -> None:
+    expected = r"expected a whole number from 1 to 1,125,899,906,842,624 \(bytes"
+    assert_raises(
         *[
             (
-                partial(Link, budget=wrong, payload="boxes"),
+                partial(Link, budget=budget, payload="boxes"),
                 ConfigError,
-                f"budget: {bytes_} a frame\\), found",
+                f"budget: {expected} per frame\\), found",
             )
-            for wrong in (0, -1, 1.5, "many", True, 2**50 + 1)
+            for budget in (0, -1, 1.5, "many", True, 2**50 + 1)
         ],
         *[
             (
-                partial(Link, payload=wrong),
+                partial(Link, payload=payload),
                 ConfigError,
-                f"payload: {bytes_} of every message\\), found",
+                f"payload: {expected} of every message\\), found",
             )
-            for wrong in (0, 2.5, ["boxes"])
+            for payload in (0, 2.5, ["boxes"])
         ],
         (
             lambda: Link(payload="pictures"),

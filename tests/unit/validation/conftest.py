@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture
 def small(release_root: Path, tmp_path: Path) -> Path:
-    """Two channels of one agent."""
+    """Copy a release of one agent with two channels."""
     root = tmp_path / "release"
     of_type = next(release_root.glob("*_accident"))
     for kind in ("calib", "label", "Camera_Front", "lidar01"):

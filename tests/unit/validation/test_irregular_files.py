@@ -1,4 +1,4 @@
-"""What is no regular file is named, and never waited for."""
+"""Files that are not regular are named, and validation never waits for them."""
 
 import os
 from pathlib import Path
@@ -10,30 +10,26 @@ from deepaccident_devkit.validation import validate_release
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes")
-def test_pipes_in_the_place_of_files_are_findings(small: Path) -> None:
-    """Nothing waits for them; a sensor's is told without `deep` too."""
-    places = {
+def test_pipes_instead_of_files_are_findings(small: Path) -> None:
+    """Validation does not wait for them; a sensor's is named without `deep` as well."""
+    codes_by_pattern = {
         "*/*/Camera_Front/*/*_002.jpg": "sensor-irregular",
         "*/*/lidar01/*/*_002.npz": "sensor-irregular",
         "*/*/label/*/*_003.txt": "label-unreadable",
         "*/*/calib/*/*_003.pkl": "calib-unreadable",
     }
-    pipes = {str(next(small.glob(pattern))): code for pattern, code in places.items()}
-    for path in pipes:
+    codes_by_path = {str(next(small.glob(key))): code for key, code in codes_by_pattern.items()}
+    for path in codes_by_path:
         Path(path).unlink()
         os.mkfifo(path)
     os.mkfifo(small / "train.txt")
-    found = [one for one in validate_release(small, workers=1).findings if one.severity == "error"]
-    assert {one.where: one.code for one in found} == {
-        **pipes,
-        str(small / "train.txt"): "split-file-unreadable",
-    }
-    told = {
-        one.what
-        for one in validate_release(small, deep=True, workers=1).findings
-        if one.where in pipes
-    }
-    assert told == {"not a regular file (a named pipe)"}
+
+    findings = validate_release(small, workers=1).findings
+    errors = {finding.where: finding.code for finding in findings if finding.severity == "error"}
+    assert errors == {**codes_by_path, str(small / "train.txt"): "split-file-unreadable"}
+    deep_findings = validate_release(small, deep=True, workers=1).findings
+    messages = {finding.what for finding in deep_findings if finding.where in codes_by_path}
+    assert messages == {"not a regular file (a named pipe)"}
 
 
 @pytest.mark.parametrize(
@@ -53,19 +49,19 @@ def test_links_to_themselves_are_findings(small: Path, pattern: str, code: str) 
     path = next(small.glob(pattern))
     path.rename(small / "aside")
     path.symlink_to(path.name)
-    (found,) = [
-        finding for finding in validate_release(small, workers=1).findings if finding.code == code
-    ]
-    assert found.where.startswith(str(path))
-    assert "Too many levels of symbolic links" in found.what
+    findings = validate_release(small, workers=1).findings
+    [finding] = [finding for finding in findings if finding.code == code]
+
+    assert finding.where.startswith(str(path))
+    assert "Too many levels of symbolic links" in finding.what
 
 
 def test_a_scenario_type_that_is_a_link_to_itself_is_a_note(small: Path) -> None:
-    (small / "type2_subtype1_normal").symlink_to("type2_subtype1_normal")
-    (note,) = [one for one in validate_release(small, workers=1).findings if one.scenario is None]
-    assert (note.code, note.severity, Path(note.where).name) == (
-        "link-leads-nowhere",
-        "note",
-        "type2_subtype1_normal",
-    )
+    link = small / "type2_subtype1_normal"
+    link.symlink_to(link.name)
+    findings = validate_release(small, workers=1).findings
+    [note] = [finding for finding in findings if finding.scenario is None]
+
+    assert (note.code, note.severity) == ("link-leads-nowhere", "note")
+    assert Path(note.where).name == link.name
     assert len(DeepAccident(dataroot=small, workers=1, verbose=False).scenario) == 1

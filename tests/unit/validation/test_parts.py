@@ -1,6 +1,4 @@
-"""Validation on any executor and by several processes: the same report as at once, and nothing is
-done twice.
-"""
+"""Validation on any executor and by several processes gives the same report and repeats no work."""
 
 import os
 import shutil
@@ -19,7 +17,7 @@ from deepaccident_devkit.validation.validate import check_scenario
 
 @pytest.fixture(scope="module")
 def root(release_root_b: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six scenarios, with errors, warnings and notes."""
+    """Make a release of six scenarios with errors, warnings and notes."""
     root = tmp_path_factory.mktemp("validated") / "release"
     shutil.copytree(release_root_b, root, ignore=shutil.ignore_patterns(".deepaccident"))
     first, second, third, *_ = find_release(root).scenarios
@@ -31,41 +29,44 @@ def root(release_root_b: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_an_executor_gives_the_same_report(root: Path, tmp_path: Path) -> None:
-    whole = validate_release(root, workers=1)
-    assert {finding.severity for finding in whole.findings} >= {"error", "warning"}
+    whole_report = validate_release(root, workers=1)
+    assert {finding.severity for finding in whole_report.findings} >= {"error", "warning"}
     with ThreadPoolExecutor(3) as executor:
-        assert validate_release(root, executor=executor) == whole
-        assert validate_release(root, executor=executor, parts=tmp_path / "parts") == whole
+        assert validate_release(root, executor=executor) == whole_report
+        assert validate_release(root, executor=executor, parts=tmp_path / "parts") == whole_report
     assert sum(path.is_file() for path in (tmp_path / "parts" / "kept").rglob("*")) == 6
 
 
 @pytest.fixture
-def looked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The scenarios that are looked at."""
+def checked_scenarios(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Record the tokens of the scenarios that are checked."""
     tokens: list[str] = []
 
-    def noted(scenario: Any, *, deep: bool) -> ScenarioCheck:
+    def record_and_check(scenario: Any, *, deep: bool) -> ScenarioCheck:
         tokens.append(scenario.token)
         return check_scenario(scenario, deep=deep)
 
-    monkeypatch.setattr(module, "check_scenario", noted)
+    monkeypatch.setattr(module, "check_scenario", record_and_check)
     return tokens
 
 
-def test_what_is_done_is_not_done_again(root: Path, tmp_path: Path, looked: list[str]) -> None:
-    some = find_release(root).scenarios[0].token
-    first = validate_release(root, workers=1, parts=tmp_path, scenarios=[some])
-    whole = validate_release(root, workers=1, parts=tmp_path)
-    assert len(looked) == 6
-    assert validate_release(root, workers=1, parts=tmp_path, scenarios=[some]) == first
-    assert len(looked) == 6
-    kept = next(path for path in (tmp_path / "kept").rglob("*") if path.is_file())
-    content = kept.read_bytes()
-    for damaged in (b"", content[:-9], b"[]"):
-        kept.write_bytes(damaged)
-        assert validate_release(root, workers=1, parts=tmp_path) == whole
-        assert kept.read_bytes() == content
-    assert len(looked) == 9
+def test_a_finished_scenario_is_not_checked_again(
+    root: Path, tmp_path: Path, checked_scenarios: list[str]
+) -> None:
+    token = find_release(root).scenarios[0].token
+    part_report = validate_release(root, workers=1, parts=tmp_path, scenarios=[token])
+    whole_report = validate_release(root, workers=1, parts=tmp_path)
+    assert len(checked_scenarios) == 6
+    assert validate_release(root, workers=1, parts=tmp_path, scenarios=[token]) == part_report
+    assert len(checked_scenarios) == 6
+
+    result_path = next(path for path in (tmp_path / "kept").rglob("*") if path.is_file())
+    content = result_path.read_bytes()
+    for damaged_content in (b"", content[:-9], b"[]"):
+        result_path.write_bytes(damaged_content)
+        assert validate_release(root, workers=1, parts=tmp_path) == whole_report
+        assert result_path.read_bytes() == content
+    assert len(checked_scenarios) == 9
 
 
 CHANGES: dict[str, Callable[[Path, pytest.MonkeyPatch], object]] = {
@@ -77,28 +78,35 @@ CHANGES: dict[str, Callable[[Path, pytest.MonkeyPatch], object]] = {
     "image gone": lambda root, _: min(root.glob("**/Camera_Front/*/*")).unlink(),
     "another place": lambda root, _: root.rename(root.with_name("moved")),
 }
-"""Files are changed in place, to the same size: only their own times tell."""
+"""Changes by name; files keep their size, so that only their times differ."""
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_what_was_found_in_other_files_or_ways_is_not_taken(
-    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked: list[str], change: str
+def test_results_of_other_files_or_options_are_not_reused(
+    small: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    checked_scenarios: list[str],
+    change: str,
 ) -> None:
     parts = tmp_path / "parts"
     validate_release(small, workers=1, parts=parts)
-    del looked[:]
-    root = CHANGES[change](small, monkeypatch)
-    validate_release(
-        root if change == "another place" else small, workers=1, parts=parts, deep=change == "deep"
-    )
-    assert looked
+    checked_scenarios.clear()
+    moved = CHANGES[change](small, monkeypatch)
+    root = moved if change == "another place" else small
+    validate_release(root, workers=1, parts=parts, deep=change == "deep")
+
+    assert checked_scenarios
 
 
-def test_a_check_survives_its_file(root: Path, small: Path) -> None:
+def test_a_check_is_the_same_after_it_was_stored(root: Path, small: Path) -> None:
     image = min(small.glob("**/Camera_Front/*/*"))
     image.rename(image.with_name("half \udcff.jpg"))
     for scenario in (*find_release(root).scenarios, *find_release(small).scenarios):
         check = check_scenario(scenario, deep=True)
-        again = ScenarioCheck.of_json(check.to_json().encode())
-        assert (again, list(again.velocity.fits)) == (check, list(check.velocity.fits))
-    assert "\udcff" in check.to_json().encode().decode("unicode_escape")
+        content = check.to_json().encode()
+        restored = ScenarioCheck.of_json(content)
+        assert restored == check
+        assert list(restored.velocity.fits) == list(check.velocity.fits)
+
+    assert "\udcff" in content.decode("unicode_escape")

@@ -1,12 +1,9 @@
-"""The pages, and `make_app`: an explorer as one ASGI application, without access control.
+"""The pages, and `make_app`, which combines them into one ASGI application for an explorer.
 
-Access control is `access.Gate`.
+The application has no access control; `access.Gate` adds it.
 """
 
-from __future__ import annotations
-
 import logging
-from typing import Final
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -22,16 +19,16 @@ from deepaccident_devkit.errors import (
 )
 from deepaccident_devkit.plugins.explore.explorer import Explorer
 from deepaccident_devkit.plugins.explore.pages import models, release, scenario
-from deepaccident_devkit.plugins.explore.pages.responses import page, static_routes
+from deepaccident_devkit.plugins.explore.pages.responses import render_page, static_routes
 
 logger = logging.getLogger(__name__)
-_NOT_FOUND_ERRORS: Final = (TokenError, ChoiceError, FieldError, NotAvailableError)
+_NOT_FOUND_ERRORS = (TokenError, ChoiceError, FieldError, NotAvailableError)
 
 
 def make_app(explorer: Explorer) -> Starlette:
-    """Return the pages of an explorer as an application.
+    """Make an application that serves the pages of an explorer.
 
-    Every address in them is relative, so that they work behind any proxy and below any path.
+    All addresses in the pages are relative, so that they work behind any proxy and below any path.
     """
     app = Starlette(
         routes=[
@@ -45,7 +42,7 @@ def make_app(explorer: Explorer) -> Starlette:
             DeepAccidentError: _answer_devkit_error,
         },
     )
-    app.router.redirect_slashes = False  # its redirects are absolute
+    app.router.redirect_slashes = False  # Its redirects are absolute.
     app.state.explorer = explorer
     return app
 
@@ -57,13 +54,15 @@ async def _answer_http_error(request: Request, error: Exception) -> Response:
     words = "This cannot be done here."
     if status == 404:
         words = "There is no such page."
-    return page(request, "error.html", status=status, title="Not found", words=words)
+    return render_page(request, "error.html", status=status, title="Not found", words=words)
 
 
 async def _answer_devkit_error(request: Request, error: Exception) -> Response:
     """Answer with the devkit's own message about what it cannot read or find."""
-    status, title = 500, "Cannot be shown"
+    status = 500
+    title = "Cannot be shown"
     if isinstance(error, _NOT_FOUND_ERRORS):
-        status, title = 404, "Not here"
+        status = 404
+        title = "Not here"
     logger.debug("%s", request.url.path, exc_info=error)
-    return page(request, "error.html", status=status, title=title, words=str(error))
+    return render_page(request, "error.html", status=status, title=title, words=str(error))

@@ -1,16 +1,15 @@
 """Answers: pages from templates, pictures, styles and scripts, and their caching.
 
-Styles and scripts have addresses that change with their content, so that browsers may keep them.
+The addresses of styles and scripts change with their content, so that browsers may keep them.
 """
 
-from __future__ import annotations
-
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 from urllib.parse import quote, urlencode
 
 from markupsafe import Markup
@@ -26,35 +25,38 @@ from deepaccident_devkit.render.styles import page_style
 from deepaccident_devkit.support.pages import part, path_in_address, rendered
 from deepaccident_devkit.support.scripts import bundled
 
-# A browser may cache pictures for some minutes, since files of a release seldom change.
+# Browsers may cache pictures for some minutes, since files of a release seldom change.
 PICTURE_CACHING: Final = "private, max-age=600"
-_ASSET_CACHING: Final = "private, max-age=31536000, immutable"
-_MAX_PAGE: Final = 1_000_000
-# Scripts that pages load; they import the other scripts beside them.
-_SCRIPTS: Final = ("copy", "keys", "list", "moment", "parts", "twins", "waiting")
-_KINDS: Final = {"css": "text/css", "js": "text/javascript"}
+_ASSET_CACHING = "private, max-age=31536000, immutable"
+# Largest number of digits of the number of a page; a longer number is ignored.
+_MAX_PAGE_DIGITS = 6
+# Scripts that pages load; they import the other scripts in the same folder.
+_SCRIPTS = ("copy", "keys", "list", "moment", "parts", "twins", "waiting")
+# Variables of a template by their names.
+Variables: TypeAlias = "dict[str, Any]"
+_KINDS = {"css": "text/css", "js": "text/javascript"}
 
 
-def explorer_of(request: Request) -> Explorer:
+def get_explorer(request: Request) -> Explorer:
     """Return the explorer that serves a request."""
     explorer: Explorer = request.app.state.explorer
     return explorer
 
 
-def root_of(path: str) -> str:
-    """Return the relative address of the first page from a path: `../../` from `/scenario/a`."""
+def find_root(path: str) -> str:
+    """Return the relative address of the first page: `../../` for the path `/scenario/a`."""
     return "../" * (path.count("/") - 1) or "./"
 
 
-def page(request: Request, template: str, *, status: int = 200, **context: Any) -> Response:
-    """Return a page from a template."""
-    root = root_of(request.scope["path"])
-    text = rendered_page(explorer_of(request), template, root, **context)
+def render_page(request: Request, template: str, *, status: int = 200, **context: Any) -> Response:
+    """Return a page that is made from a template."""
+    root = find_root(request.scope["path"])
+    text = render_template(get_explorer(request), template, root, **context)
     return HTMLResponse(text, status_code=status)
 
 
-def rendered_page(explorer: Explorer, template: str, root: str, **context: Any) -> str:
-    """Return a filled template as text; all texts are escaped.
+def render_template(explorer: Explorer, template: str, root: str, **context: Any) -> str:
+    """Return a filled template as text, in which all values are escaped.
 
     Args:
         explorer: The explorer that serves the page.
@@ -62,23 +64,23 @@ def rendered_page(explorer: Explorer, template: str, root: str, **context: Any) 
         root: Relative address of the first page.
         **context: Further variables of the template.
     """
-    variables: dict[str, Any] = {
-        "asset": asset,
-        "scenario_at": scenario_address,
-        "thumbnail_at": thumbnail_address,
+    variables: Variables = {
+        "asset": format_asset_address,
+        "scenario_at": format_scenario_address,
+        "thumbnail_at": format_thumbnail_address,
         "named": lambda token: scenario_words(explorer.dataset.scenario.get(token)),
         "root": root,
         "models": [*explorer.models],
         "static": False,
-        "frame_number": frame_button,
+        "frame_number": make_frame_button,
     }
     return rendered(template, **variables, **context)
 
 
-async def with_slash(request: Request) -> Response:
-    """Redirect to the address with a slash at its end.
+async def add_slash(request: Request) -> Response:
+    """Redirect to the address with a slash at the end.
 
-    A folder's address ends in a slash, so that the addresses in its page are below it.
+    The address of a folder ends in a slash, so that the addresses in its page are below it.
     """
     query = ""
     if request.url.query:
@@ -87,32 +89,32 @@ async def with_slash(request: Request) -> Response:
     return RedirectResponse(f"./{name}/{query}", status_code=307)
 
 
-def picture(content: bytes, kind: str) -> Response:
-    """Return a picture as an answer; its kind is `jpeg` or `png`."""
+def send_picture(content: bytes, kind: str) -> Response:
+    """Answer with a picture; `kind` is `jpeg` or `png`."""
     return Response(content, media_type=f"image/{kind}", headers={"Cache-Control": PICTURE_CACHING})
 
 
-def scenario_address(root: str, token: str) -> str:
+def format_scenario_address(root: str, token: str) -> str:
     """Return the relative address of a scenario's page."""
     return f"{root}scenario/{path_in_address(token)}/"
 
 
-def thumbnail_address(root: str, token: str) -> str:
+def format_thumbnail_address(root: str, token: str) -> str:
     """Return the relative address of a scenario's thumbnail."""
     return f"{root}thumbnail/{path_in_address(token)}.jpg"
 
 
-def frame_button(number: int) -> Markup:
+def make_frame_button(number: int) -> Markup:
     """Return a button that moves the page's replay to a frame."""
     return Markup('<button type="button" data-frame="{0}">{0}</button>').format(number)
 
 
 def static_routes() -> list[Route]:
     """Return the route of styles and scripts."""
-    return [Route("/static/{digest}/{name}", _answer)]
+    return [Route("/static/{digest}/{name}", _show_asset)]
 
 
-def asset(root: str, name: str) -> str:
+def format_asset_address(root: str, name: str) -> str:
     """Return the relative address of a style or script; `root` leads to the first page."""
     digest = hashlib.blake2b(assets()[name].encode(), digest_size=6).hexdigest()
     return f"{root}static/{digest}/{name}"
@@ -120,7 +122,7 @@ def asset(root: str, name: str) -> str:
 
 @cache
 def assets() -> dict[str, str]:
-    """Return the styles and scripts: name → text."""
+    """Return the texts of the styles and scripts, by name."""
     folder = files("deepaccident_devkit.plugins.explore") / "static"
 
     def read(name: str) -> str:
@@ -136,7 +138,7 @@ def assets() -> dict[str, str]:
     }
 
 
-async def _answer(request: Request) -> Response:
+async def _show_asset(request: Request) -> Response:
     name = request.path_params["name"]
     if name not in assets():
         raise HTTPException(404)
@@ -146,15 +148,15 @@ async def _answer(request: Request) -> Response:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ListPage:
-    """A page of a long list.
+    """One page of a long list.
 
     Attributes:
-        entries: Entries of this page.
-        count: Number of entries of all pages.
+        entries: Entries on this page.
+        count: Number of entries on all pages.
         number: Number of this page, from 1.
         pages: Number of the last page.
-        before: Parameters of the address of the previous page; empty if this is the first one.
-        after: Parameters of the address of the next page; empty if this is the last one.
+        before: Parameters of the address of the previous page; empty on the first page.
+        after: Parameters of the address of the next page; empty on the last page.
     """
 
     entries: Sequence[Any]
@@ -165,19 +167,19 @@ class _ListPage:
     after: str
 
 
-def part_of(request: Request, items: Sequence[Any], size: int) -> _ListPage:
-    """Return the page of a list that the address names by `page`, with `size` entries."""
+def select_page(request: Request, items: Sequence[Any], size: int) -> _ListPage:
+    """Return the page of a list that the parameter `page` names, with `size` entries."""
     text = request.query_params.get("page", "")
-    pages = max(1, -(-len(items) // size))
+    num_pages = max(1, math.ceil(len(items) / size))
     number = 1
-    if text.isascii() and text.isdigit() and len(text) < len(str(_MAX_PAGE)):
+    if text.isascii() and text.isdigit() and len(text) <= _MAX_PAGE_DIGITS:
         number = int(text)
-    number = min(max(number, 1), pages)
+    number = min(max(number, 1), num_pages)
     parameters = request.query_params.multi_items()
     other_parameters = [(name, value) for name, value in parameters if name != "page"]
 
-    def address(page_number: int) -> str:
-        if not 1 <= page_number <= pages:
+    def format_address(page_number: int) -> str:
+        if not 1 <= page_number <= num_pages:
             return ""
         return f"?{urlencode([*other_parameters, ('page', str(page_number))])}"
 
@@ -185,7 +187,7 @@ def part_of(request: Request, items: Sequence[Any], size: int) -> _ListPage:
         entries=items[(number - 1) * size : number * size],
         count=len(items),
         number=number,
-        pages=pages,
-        before=address(number - 1),
-        after=address(number + 1),
+        pages=num_pages,
+        before=format_address(number - 1),
+        after=format_address(number + 1),
     )

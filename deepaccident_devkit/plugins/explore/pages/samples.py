@@ -1,10 +1,11 @@
-"""A model's samples: of a group or a scenario, the worst first, and each with its ground truth."""
+"""A model's samples: lists of them, the worst first, and each sample with its ground truth."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 from urllib.parse import urlencode
 
@@ -23,15 +24,26 @@ from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader, agent_of, scenario_of
 from deepaccident_devkit.plugins.explore.background import Job
 from deepaccident_devkit.plugins.explore.choices import MAX_WORD_LENGTH
-from deepaccident_devkit.plugins.explore.evaluations import finite, other_values, verdict_text
+from deepaccident_devkit.plugins.explore.evaluations import (
+    list_other_values,
+    read_finite,
+    verdict_text,
+)
 from deepaccident_devkit.plugins.explore.explorer import Explorer
-from deepaccident_devkit.plugins.explore.models import Model, sample_values_job
-from deepaccident_devkit.plugins.explore.pages.responses import explorer_of, page, part_of, picture
-from deepaccident_devkit.plugins.explore.pages.scenario import sample_of
+from deepaccident_devkit.plugins.explore.models import Model, request_sample_values
+from deepaccident_devkit.plugins.explore.pages.responses import (
+    Variables,
+    get_explorer,
+    render_page,
+    select_page,
+    send_picture,
+)
+from deepaccident_devkit.plugins.explore.pages.scenario import read_sample_token
 from deepaccident_devkit.plugins.explore.scenarios import UNKNOWN_VALUE
 from deepaccident_devkit.render.figures import detached_figure
 from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
 from deepaccident_devkit.render.outcomes.evaluation import FIGURE_SIZES
+from deepaccident_devkit.support.human_names import metric_name
 from deepaccident_devkit.support.pages import path_in_address
 from deepaccident_devkit.support.text import natural_order
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -40,7 +52,7 @@ if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
 
 _SampleOrder = Literal["worst", "best", "time"]
-# Order → its name for readers.
+# Name for readers of each order.
 ORDERS: Final[Mapping[_SampleOrder, str]] = {
     "worst": "worst first",
     "best": "best first",
@@ -48,15 +60,15 @@ ORDERS: Final[Mapping[_SampleOrder, str]] = {
 }
 _PictureKind = Literal["above", "cameras"]
 _PictureSize = Literal["whole", "half"]
-# Width and height in inches; half is for two pictures side by side. A whole picture from above has
-# its task's own size.
-_FIGURE_SIZES: Final[Mapping[tuple[_PictureKind, _PictureSize], tuple[float, float]]] = {
+# Width and height of pictures in inches; half is for two pictures side by side. A whole picture
+# from above has the size of its task.
+_FIGURE_SIZES: Mapping[tuple[_PictureKind, _PictureSize], tuple[float, float]] = {
     ("above", "half"): (7.7, 4.6),
     ("cameras", "whole"): (15.2, 7.4),
     ("cameras", "half"): (7.7, 4.7),
 }
-# Seconds that the pictures of explicit accidents look ahead.
-_ACCIDENT_HORIZON_S: Final = 2.0
+# How far ahead pictures of explicit accidents look.
+_ACCIDENT_HORIZON_S = 2.0
 SAMPLE = "{type}/{name}/{agent}/{frame:int}"
 # Number of samples on a page of the list.
 SAMPLES_PER_PAGE: Final = 60
@@ -64,14 +76,14 @@ SAMPLES_PER_PAGE: Final = 60
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleChoices:
-    """What a reader chose of a model's samples.
+    """A reader's choices among a model's samples.
 
     Attributes:
-        by: An attribute; empty for all samples.
-        value: Value of the attribute, `unknown` where it is not known.
+        by: Name of an attribute; empty for all samples.
+        value: Value of the attribute, `unknown` if it is not known.
         scenario: Token of a scenario; empty for all.
-        order: Order of the list; None for the default: the worst first, or in time where samples
-            have no numbers.
+        order: Order of the list; None for the default, which is the worst first, or in time if
+            samples have no numbers.
     """
 
     by: str = ""
@@ -81,7 +93,7 @@ class SampleChoices:
 
     @classmethod
     def of(cls, parameters: Mapping[str, str]) -> SampleChoices:
-        """Return the choices of the parameters of an address.
+        """Return the choices in the parameters of an address.
 
         Raises ChoiceError if there is no such attribute.
         """
@@ -95,9 +107,9 @@ class SampleChoices:
         )
 
     def address(self, *, ahead: int = 0, **changes: Any) -> str:
-        """Return the parameters of the address: `?by=agent&value=ego_vehicle`.
+        """Return these choices as the parameters of an address: `?by=agent&value=ego_vehicle`.
 
-        Keyword arguments change some of the choices; `ahead` is a frame ahead.
+        Keyword arguments change some of the choices; `ahead` is a number of frames ahead.
         """
         choices = replace(self, **changes)
         pairs: list[tuple[str, str]] = []
@@ -114,7 +126,7 @@ class SampleChoices:
         return ""
 
     def words(self) -> str:
-        """Return the choices in words: `time to impact 1 s`; empty for all samples."""
+        """Return the choices in words, such as `time to impact 1 s`; empty for all samples."""
         words = []
         if self.by:
             words.append(f"{self.by.replace('_', ' ')} {self.value}")
@@ -125,15 +137,15 @@ class SampleChoices:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleList:
-    """The samples that match choices.
+    """The samples that match a reader's choices.
 
     Attributes:
         tokens: Tokens, in order.
         order: Order of the samples.
-        ranked: Whether they can be in another order than in time.
-        groups: Value of the chosen attribute → number of samples; empty without an attribute, and
-            until they are known.
-        unknown: Number of samples that are not in this release, so that their group is unknown.
+        ranked: Whether they can be sorted by their numbers instead of by time.
+        groups: Number of samples for each value of the chosen attribute; empty without an
+            attribute, and until the attributes are known.
+        unknown: Number of samples with an unknown group, since they are not in this release.
         waits: Titles of jobs that are not done.
         faults: Sentences on failed jobs.
     """
@@ -148,34 +160,34 @@ class SampleList:
 
 
 def list_samples(explorer: Explorer, model: Model, choices: SampleChoices) -> SampleList:
-    """Return the samples of a model that match choices."""
+    """Return the samples of a model that match a reader's choices."""
     tokens = list(model.tokens)
     attributes = None
     if choices.by:
-        attributes = attributes_job(explorer, model)
+        attributes = request_attributes(explorer, model)
     ranks = None
     if model.bundle is not None:
-        ranks = sample_values_job(explorer.jobs, model)
+        ranks = request_sample_values(explorer.jobs, model)
     jobs = [job for job in (attributes, ranks) if job is not None]
-    # Listed before the results are read, so that a job that ends meanwhile is not missed.
+    # They are listed before the results are read, so that no job that ends meanwhile is missed.
     waiting = [job for job in jobs if not job.is_done]
     groups: dict[str, int] = {}
     num_unknown = 0
     if attributes is not None:
-        by_token: Mapping[str, SampleAttributes] | None = attributes.result
-        values = {
-            token: sample.value(choices.by) or UNKNOWN_VALUE
-            for token, sample in (by_token or {}).items()
-        }
+        values = {}
+        if attributes.result is not None:
+            for token, sample in attributes.result.items():
+                values[token] = sample.value(choices.by) or UNKNOWN_VALUE
+            num_unknown = len(tokens) - len(values)
         counts = Counter(values.values())
         groups = {value: counts[value] for value in sorted(counts, key=natural_order)}
-        if by_token is not None:
-            num_unknown = len(tokens) - len(values)
         tokens = [token for token in tokens if values.get(token) == choices.value]
     if choices.scenario:
         tokens = [token for token in tokens if scenario_of(token) == choices.scenario]
-    ranked, numbers = _ranking(ranks)
-    order: _SampleOrder = choices.order or "worst" if ranked else "time"
+    ranked, numbers = _read_ranking(ranks)
+    order: _SampleOrder = "time"
+    if ranked:
+        order = choices.order or "worst"
     return SampleList(
         tokens=tuple(_order_samples(tokens, order, numbers)),
         order=order,
@@ -187,10 +199,10 @@ def list_samples(explorer: Explorer, model: Model, choices: SampleChoices) -> Sa
     )
 
 
-def _ranking(ranks: Job | None) -> tuple[bool, Mapping[str, float | None]]:
-    """Return whether samples can be ranked, and their main numbers as far as they are computed.
+def _read_ranking(ranks: Job | None) -> tuple[bool, Mapping[str, float | None]]:
+    """Return whether samples can be ranked, and the main numbers that are already computed.
 
-    Warnings are judged over recordings: single samples have no numbers.
+    Single samples have no numbers if the task is warning, which is judged over whole recordings.
     """
     if ranks is None:
         return False, {}
@@ -203,22 +215,25 @@ def _ranking(ranks: Job | None) -> tuple[bool, Mapping[str, float | None]]:
 def _order_samples(
     tokens: Iterable[str], order: _SampleOrder, values: Mapping[str, float | None]
 ) -> list[str]:
-    """Return tokens by the main number, samples without one last.
+    """Sort tokens by their main numbers, with samples without one at the end.
 
-    They are in time as long as the numbers are unknown.
+    Until the numbers are known, tokens are sorted by time.
     """
     in_time = sorted(tokens)
     if order == "time":
         return in_time
-    present = set(in_time)
-    ranked = [token for token, value in values.items() if value is not None and token in present]
-    ranked_set = set(ranked)
+    unranked = dict.fromkeys(in_time)
+    ranked = []
+    for token, value in values.items():
+        if value is not None and token in unranked:
+            ranked.append(token)
+            del unranked[token]
     if order == "best":
         ranked.reverse()
-    return [*ranked, *(token for token in in_time if token not in ranked_set)]
+    return [*ranked, *unranked]
 
 
-def attributes_job(explorer: Explorer, model: Model) -> Job:
+def request_attributes(explorer: Explorer, model: Model) -> Job:
     """Return the job that computes the attributes of a model's samples in the release."""
     dataset = explorer.dataset
 
@@ -241,12 +256,12 @@ def is_sample(dataset: Dataset, token: str) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PictureChoice:
-    """A picture of a sample.
+    """The choice of a picture of a sample.
 
     Attributes:
-        kind: From above or in the cameras.
+        kind: View: from above, or in the cameras.
         size: Size of the picture.
-        ahead: Frames ahead, for motion in cameras; 0 for the present.
+        ahead: Number of frames ahead, for motion in cameras; 0 for the current frame.
     """
 
     kind: _PictureKind
@@ -254,60 +269,66 @@ class _PictureChoice:
     ahead: int = 0
 
 
-def why_not(explorer: Explorer, model: Model, token: str) -> str:
-    """Return why there is no picture of a sample, in a sentence; empty if there is one."""
+def explain_missing_picture(explorer: Explorer, model: Model, token: str) -> str:
+    """Explain in a sentence why a sample has no picture; empty if it has one."""
     if not is_sample(explorer.dataset, token):
         return "This sample is not in this release."
     if model.results is None:
         return f"The predictions of {model.name} were not given."
     if not model.has(token):
-        return f"{model.name} predicts nothing for this sample."
-    if _picture_task(model) not in FIGURE_SIZES:
+        return f"{model.name} has no prediction for this sample."
+    if _choose_picture_task(model) not in FIGURE_SIZES:
         return f"There are no pictures of {model.setup.task}."
     try:
         SampleLoader(explorer.dataset, model.results, model.setup)
     except EvaluationError as error:
         return str(error)
-    return _why_no_truth(explorer, token, needs_meta=_picture_task(model) == "accident")
+    needs_meta = _choose_picture_task(model) == "accident"
+    return _explain_missing_truth(explorer, token, needs_meta=needs_meta)
 
 
-def _why_no_truth(explorer: Explorer, token: str, *, needs_meta: bool) -> str:
-    if not explorer.dataset.get("sample", token)["labelled"]:
-        return "This sample has no label, so that there is no truth to compare with."
-    if needs_meta and explorer.dataset.get("scenario", scenario_of(token))["weather"] is None:
+def _explain_missing_truth(explorer: Explorer, token: str, *, needs_meta: bool) -> str:
+    dataset = explorer.dataset
+    if not dataset.get("sample", token)["labelled"]:
+        return "This sample has no label, so there is no truth to compare with."
+    has_meta = dataset.get("scenario", scenario_of(token))["weather"] is not None
+    if needs_meta and not has_meta:
         return "This scenario has no meta file, which names the colliding pair."
     return ""
 
 
-def rules_words(model: Model) -> str:
-    """Return how the pictures deviate from the bundle's own rules; empty if they do not."""
+def describe_rules(model: Model) -> str:
+    """Explain how pictures deviate from the bundle's rules; empty if they do not."""
     if model.setup.task == "warning":
         return "Warnings are judged over whole recordings; these pictures judge single accidents."
-    if _picture_task(model) == "accident" and model.results is not None:
+    if _choose_picture_task(model) == "accident" and model.results is not None:
         form = model.results.form
-        ahead = _ACCIDENT_HORIZON_S if form is None else (form.frames - 1) * form.step
+        ahead = _ACCIDENT_HORIZON_S
+        if form is not None:
+            ahead = (form.frames - 1) * form.step
         horizon = model.setup.horizon
         if abs(ahead - horizon) > FRAME_PERIOD / 2:
-            return f"These pictures look {ahead:g} s ahead, the evaluation {horizon:g} s."
+            return f"These pictures look {ahead:g} s ahead; the evaluation looks {horizon:g} s."
     return ""
 
 
-def _sample_picture(explorer: Explorer, model: Model, token: str, choice: _PictureChoice) -> bytes:
-    """Return a picture as PNG.
+def _draw_sample(explorer: Explorer, model: Model, token: str, choice: _PictureChoice) -> bytes:
+    """Draw a picture of a sample as PNG.
 
-    Raises NotAvailableError with the words of `why_not`, or ChoiceError if there is no such frame.
+    Raises NotAvailableError with the words of `explain_missing_picture`, or ChoiceError if there is
+    no such frame.
     """
-    reason = why_not(explorer, model, token)
+    reason = explain_missing_picture(explorer, model, token)
     if reason:
         raise NotAvailableError(f"{token}: {reason}")
     key = ("predicted", model.name, token, choice)
-    return explorer.drawn(key, lambda: _render_picture(explorer, model, token, choice))
+    return explorer.drawn(key, partial(_render_picture, explorer, model, token, choice))
 
 
-def frames_ahead(explorer: Explorer, model: Model, token: str) -> list[float]:
-    """Return the seconds ahead of the recorded frames at which motion is evaluated.
+def list_frames_ahead(explorer: Explorer, model: Model, token: str) -> list[float]:
+    """Return the times of the recorded frames at which motion is evaluated, in seconds ahead.
 
-    Empty for other tasks.
+    The list is empty for other tasks.
     """
     form = None
     if model.results is not None:
@@ -320,7 +341,7 @@ def frames_ahead(explorer: Explorer, model: Model, token: str) -> list[float]:
     return [number * form.step for number in range(count)]
 
 
-def _picture_task(model: Model) -> str:
+def _choose_picture_task(model: Model) -> str:
     if model.setup.task == "warning":
         return "accident"
     return model.setup.task
@@ -331,7 +352,8 @@ def _render_picture(explorer: Explorer, model: Model, token: str, choice: _Pictu
     if results is None:
         raise NotAvailableError(f"{model.name}: its predictions were not given")
     loader = SampleLoader(explorer.dataset, results, model.setup)
-    prediction, task = loader.prediction(token), _picture_task(model)
+    prediction = loader.prediction(token)
+    task = _choose_picture_task(model)
     protocol = None if model.setup.task == "warning" else model.setup.rules
     arguments: dict[str, Any] = {"task": task, "protocol": protocol}
     if not isinstance(prediction, DetectedBoxes):
@@ -344,9 +366,10 @@ def _render_picture(explorer: Explorer, model: Model, token: str, choice: _Pictu
     return render_outcome_in_cameras(explorer.dataset, token, prediction, **arguments)
 
 
-def model_of(request: Request, name: str = "model") -> Model:
-    """Return the model that a part of an address names; raise NotAvailableError."""
-    model_name, models = request.path_params[name], explorer_of(request).models
+def find_model(request: Request, name: str = "model") -> Model:
+    """Return the model that an address names; raise NotAvailableError if there is none such."""
+    model_name = request.path_params[name]
+    models = get_explorer(request).models
     if model_name not in models:
         raise NotAvailableError(
             f"there is no model {model_name!r}; those that were given: "
@@ -356,20 +379,20 @@ def model_of(request: Request, name: str = "model") -> Model:
 
 
 def sample_path(token: str) -> str:
-    """Return a sample's path in an address: `type/scenario/agent/12`."""
+    """Return the path of a sample in an address, such as `type/scenario/agent/12`."""
     scenario, _, frame = token.rpartition("/")
     if frame.isdecimal() and frame.isascii():
         return path_in_address(f"{scenario}/{int(frame)}")
     return path_in_address(token)
 
 
-def known_sample(request: Request, *models: Model) -> str:
-    """Return the sample that an address names.
+def find_sample(request: Request, *models: Model) -> str:
+    """Return the token of the sample that an address names.
 
     Raises TokenError if neither the release nor a model has it.
     """
-    token = sample_of(request)
-    if is_sample(explorer_of(request).dataset, token):
+    token = read_sample_token(request)
+    if is_sample(get_explorer(request).dataset, token):
         return token
     if not any(token in model.tokens for model in models):
         names = ", ".join(model.name for model in models)
@@ -377,8 +400,8 @@ def known_sample(request: Request, *models: Model) -> str:
     return token
 
 
-def neighbours_in_time(tokens: Iterable[str], token: str) -> tuple[str | None, str | None]:
-    """Return the samples of the same agent before and after a sample."""
+def find_neighbours(tokens: Iterable[str], token: str) -> tuple[str | None, str | None]:
+    """Return the samples of the same agent before and after a sample; None if there is none."""
     recording = token.rpartition("/")[0] + "/"
     samples = [sample for sample in tokens if sample.startswith(recording)]
     before = max((sample for sample in samples if sample < token), default=None)
@@ -386,12 +409,12 @@ def neighbours_in_time(tokens: Iterable[str], token: str) -> tuple[str | None, s
     return before, after
 
 
-def titles(jobs: Iterable[Job]) -> list[str]:
+def list_titles(jobs: Iterable[Job]) -> list[str]:
     """Return the titles of the jobs that are not done."""
     return [job.title for job in jobs if not job.is_done]
 
 
-def models_of_task(explorer: Explorer, task: str) -> list[Model]:
+def find_models(explorer: Explorer, task: str) -> list[Model]:
     """Return the evaluated models of a task."""
     return [
         model
@@ -403,24 +426,25 @@ def models_of_task(explorer: Explorer, task: str) -> list[Model]:
 def routes() -> list[Route]:
     """Return the routes of the pages.
 
-    The addresses of samples take the choices of the list, so that the position in it is known.
+    The address of a sample includes the choices of the list, so that its position there is known.
     """
     return [
-        Route("/model/{model}/samples", _samples),
-        Route(f"/model/{{model}}/sample/{SAMPLE}", _sample),
-        Route(f"/model/{{model}}/sample/{SAMPLE}/{{kind}}.png", _picture),
+        Route("/model/{model}/samples", _show_samples),
+        Route(f"/model/{{model}}/sample/{SAMPLE}", _show_sample),
+        Route(f"/model/{{model}}/sample/{SAMPLE}/{{kind}}.png", _show_picture),
     ]
 
 
-def rows_of(explorer: Explorer, model: Model, tokens: Iterable[str]) -> list[dict[str, Any]]:
-    """Return what lists show of samples."""
+def make_rows(explorer: Explorer, model: Model, tokens: Iterable[str]) -> list[Variables]:
+    """Return what lists show about each sample."""
     scores = model.scores.samples if model.scores is not None else {}
     rows = []
     for token in tokens:
         row = model.rows.get(token)
-        time_to_impact, verdict = None, ""
+        time_to_impact = None
+        verdict = ""
         if row is not None:
-            time_to_impact = finite(row.get("time_to_impact"))
+            time_to_impact = read_finite(row.get("time_to_impact"))
             verdict = verdict_text(model.setup.task, row)
         rows.append(
             {
@@ -438,15 +462,16 @@ def rows_of(explorer: Explorer, model: Model, tokens: Iterable[str]) -> list[dic
     return rows
 
 
-def _samples(request: Request) -> Response:
-    explorer, model = explorer_of(request), model_of(request)
+def _show_samples(request: Request) -> Response:
+    explorer = get_explorer(request)
+    model = find_model(request)
     choices = SampleChoices.of(request.query_params)
     samples = list_samples(explorer, model, choices)
-    part = part_of(request, samples.tokens, SAMPLES_PER_PAGE)
+    part = select_page(request, samples.tokens, SAMPLES_PER_PAGE)
     number = ""
     if model.scores is not None and samples.ranked:
-        number = model.scores.name
-    return page(
+        number = metric_name(model.scores.name)
+    return render_page(
         request,
         "samples.html",
         model=model,
@@ -454,48 +479,53 @@ def _samples(request: Request) -> Response:
         found=samples,
         orders=ORDERS,
         part=part,
-        rows=rows_of(explorer, model, part.entries),
+        rows=make_rows(explorer, model, part.entries),
         waits=[*samples.waits],
         number=number,
     )
 
 
-def _sample(request: Request) -> Response:
-    explorer, model = explorer_of(request), model_of(request)
-    token = known_sample(request, model)
+def _show_sample(request: Request) -> Response:
+    explorer = get_explorer(request)
+    model = find_model(request)
+    token = find_sample(request, model)
     choices = SampleChoices.of(request.query_params)
-    before, after = neighbours_in_time(model.tokens, token)
+    before, after = find_neighbours(model.tokens, token)
     samples = list_samples(explorer, model, choices)
-    return page(
+    return render_page(
         request,
         "sample.html",
-        **sample_context(explorer, model, token),
+        **make_sample_context(explorer, model, token),
         before=before,
         after=after,
         choices=choices,
-        place=list_position(samples.tokens, token),
+        place=find_position(samples.tokens, token),
         order=ORDERS[samples.order],
-        ahead=requested_frame(request),
+        ahead=read_frame_ahead(request),
         waits=[*samples.waits],
-        aheads=frames_ahead(explorer, model, token),
+        aheads=list_frames_ahead(explorer, model, token),
         sample_path=sample_path,
     )
 
 
-def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, Any]:
-    """Return what is shown of a model at a sample."""
+def make_sample_context(explorer: Explorer, model: Model, token: str) -> Variables:
+    """Return what the page of a sample shows about one model."""
     row = model.rows.get(token)
     verdict = ""
     values: dict[str, str] = {}
     if row is not None:
         verdict = verdict_text(model.setup.task, row, in_full=True)
-        values = other_values(row)
-    number, scores = "", model.scores
+        values = list_other_values(row)
+    number = ""
+    scores = model.scores
     if scores is not None and token in scores.samples:
         score = scores.samples[token]
         if score.value is not None:
-            number = f"{scores.name} {score.text}"
-    _, figure_height = FIGURE_SIZES.get(_picture_task(model), (0.0, 0.0))
+            number = f"{metric_name(scores.name)} {score.text}"
+    missing_path = ""
+    if model.results is None and model.bundle is not None:
+        missing_path = str(model.bundle.summary["results"]["path"])
+    _, figure_height = FIGURE_SIZES.get(_choose_picture_task(model), (0.0, 0.0))
     return {
         "model": model,
         "token": token,
@@ -508,24 +538,17 @@ def sample_context(explorer: Explorer, model: Model, token: str) -> dict[str, An
         "verdict": verdict,
         "values": values,
         "number": number,
-        "why_not": why_not(explorer, model, token),
-        "rules": rules_words(model),
+        "why_not": explain_missing_picture(explorer, model, token),
+        "rules": describe_rules(model),
         "tall": round(80 * figure_height),
-        "remedy": _remedy(model),
+        "remedy": missing_path,
     }
 
 
-def _remedy(model: Model) -> str:
-    """Return the path of the results of a bundle without a copy; empty if there are results."""
-    if model.results is not None or model.bundle is None:
-        return ""
-    return str(model.bundle.summary["results"]["path"])
+def find_position(tokens: Sequence[str], token: str) -> Variables | None:
+    """Return the position of a sample in a list; None if the sample is not in the list.
 
-
-def list_position(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
-    """Return where a sample is in a list; None if it is not in it.
-
-    This is its number, the length of the list, and the samples before and after it.
+    It consists of the sample's number, the list's length, and the samples before and after it.
     """
     if token not in tokens:
         return None
@@ -538,21 +561,23 @@ def list_position(tokens: Sequence[str], token: str) -> dict[str, Any] | None:
     }
 
 
-def _picture(request: Request) -> Response:
-    explorer, model, kind = explorer_of(request), model_of(request), request.path_params["kind"]
+def _show_picture(request: Request) -> Response:
+    explorer = get_explorer(request)
+    model = find_model(request)
+    kind = request.path_params["kind"]
     if kind not in get_args(_PictureKind):
         raise HTTPException(404)
     size: _PictureSize = "half" if request.query_params.get("size") == "half" else "whole"
     ahead = 0
     if kind == "cameras":
-        ahead = requested_frame(request)
+        ahead = read_frame_ahead(request)
     choice = _PictureChoice(kind=kind, size=size, ahead=ahead)
-    token = known_sample(request, model)
-    return picture(_sample_picture(explorer, model, token, choice), "png")
+    token = find_sample(request, model)
+    return send_picture(_draw_sample(explorer, model, token, choice), "png")
 
 
-def requested_frame(request: Request) -> int:
-    """Return the frame ahead that cameras show; raise HTTPException."""
+def read_frame_ahead(request: Request) -> int:
+    """Read the number of frames ahead from an address; raise HTTPException if it is invalid."""
     text = request.query_params.get("ahead", "0")
     if not (text.isascii() and text.isdecimal() and len(text) < 3):
         raise HTTPException(404)

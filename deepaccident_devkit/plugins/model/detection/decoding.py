@@ -1,6 +1,4 @@
-"""Decoding of the head's maps to boxes, with suppression of boxes of the same object."""
-
-from __future__ import annotations
+"""Decoding of the head's maps into boxes, and suppression of duplicate boxes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,9 +26,9 @@ from deepaccident_devkit.support.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
-    check_least,
+    check_minima,
 )
-from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.text import counted, settle_choices
 
 Method = Literal["rotated", "circle"]
 # Columns x, y, l, w, yaw of boxes x y z l w h yaw vx vy.
@@ -39,16 +37,16 @@ _FOOTPRINT_COLUMNS = [0, 1, 3, 4, 6]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NmsConfig:
-    """Suppression within one task.
+    """Rules for non-maximum suppression within one task.
 
     Attributes:
         method: `rotated` compares footprints by intersection over union, `circle` the distances of
             centres.
         threshold: A worse box is suppressed if its IoU with a retained box is larger, or for
             `circle` if the distance of their centres in metres is at most this.
-        scale: Factors of lengths and widths before `rotated` compares them: one number, or one a
-            slot of the task.
-        keep: Maximum number of boxes of a sample and task.
+        scale: Factors of lengths and widths before `rotated` compares them: one number, or one for
+            each slot of the task.
+        keep: Maximum number of boxes per sample and task.
     """
 
     method: Method = "rotated"
@@ -57,12 +55,12 @@ class NmsConfig:
     keep: int = 83
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError or ChoiceError."""
+        """Check the values; raise ConfigError or ChoiceError if one is not valid."""
         settle_choices(self, {"method": get_args(Method)})
-        check_least(self, threshold=0, keep=1)
+        check_minima(self, threshold=0, keep=1)
         if not self.scale or not min(self.scale) > 0:
             raise ConfigError(
-                f"scale: expected one number above 0, or one a slot, found {self.scale!r}"
+                f"scale: expected one number above 0, or one per slot, found {self.scale!r}"
             )
 
 
@@ -74,20 +72,20 @@ RELEASED_NMS: tuple[NmsConfig, ...] = (
     NmsConfig(scale=(1.0, 1.0)),
     NmsConfig(scale=(4.5, 9.0), threshold=0.5),
 )
-"""The released settings, one a task.
+"""The released settings, one for each task.
 
-They were chosen for nuScenes' classes. No golden numbers test the `rotated` ones, because the
-released code only runs on CUDA.
+They were chosen for nuScenes' classes. The `rotated` settings are not tested against golden
+numbers, because the released code runs only on CUDA.
 """
 
 
 def suppress(
     boxes: AnyArray, scores: AnyArray, slots: AnyArray, config: NmsConfig | None = None
 ) -> IntArray:
-    """Return the rows of the retained boxes, the best first.
+    """Return the rows of the retained boxes, highest-scoring first.
 
     Boxes of equal scores are ordered by their values, so the result does not depend on their order.
-    Slots do not protect each other: a truck suppresses a van of the same task, as in the release.
+    Suppression ignores slots: a truck suppresses a van of the same task, as in the release.
 
     Args:
         boxes: x y z l w h yaw vx vy in any common frame, metres and radians, shape (N, 9).
@@ -96,48 +94,54 @@ def suppress(
         config: Rules; None for ours.
     """
     config = config or NmsConfig()
-    order = np.lexsort((*np.asarray(boxes).T[::-1], slots, -np.asarray(scores)))
+    order = np.lexsort((*boxes.T[::-1], slots, -scores))
     best_first = np.asarray(boxes, dtype=np.float64)[order]
     if config.method == "circle":
         is_overlapping = _are_near(best_first[:, :2], config.threshold)
     else:
         footprints = best_first[:, _FOOTPRINT_COLUMNS]
         scale = np.array(config.scale)
-        footprints[:, 2:4] *= scale if len(scale) == 1 else scale[slots[order], None]
+        if len(scale) > 1:
+            scale = scale[slots[order], None]
+        footprints[:, 2:4] *= scale
         is_overlapping = rotated_iou(footprints, footprints) > config.threshold
-    return order[_retained_rows(is_overlapping, config.keep)]
+    rows = _suppress_rows(is_overlapping, config.keep)
+    return order[rows]
 
 
 def rotated_iou(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the intersection over union of N and M rectangles on the ground, (N, M) in [0, 1].
 
-    It is 0 for two rectangles without area.
+    The result is 0 for two rectangles without area.
 
     Args:
         first: x, y, length, width, yaw: metres and radians, shape (N, 5).
         second: Other rectangles in the same frame, shape (M, 5).
     """
     intersections = intersection_areas(first, second)
-    areas, other_areas = first[:, 2] * first[:, 3], second[:, 2] * second[:, 3]
+    areas = first[:, 2] * first[:, 3]
+    other_areas = second[:, 2] * second[:, 3]
     unions = areas[:, None] + other_areas - intersections
-    return np.divide(intersections, unions, out=np.zeros_like(intersections), where=unions > 0)
+    ratios = np.zeros_like(intersections)
+    return np.divide(intersections, unions, out=ratios, where=unions > 0)
 
 
 def _are_near(centers: FloatArray, radius: float) -> BoolArray:
-    """Return whether the centres (N, 2) of two boxes are within a radius, (N, N)."""
+    """Return whether the centres (N, 2) of each pair of boxes are within a radius, (N, N)."""
     offsets = centers[:, None] - centers
-    return np.asarray(np.einsum("nmi,nmi->nm", offsets, offsets) <= radius**2)
+    squared_distances = np.einsum("nmi,nmi->nm", offsets, offsets)
+    return np.asarray(squared_distances <= radius**2)
 
 
-def _retained_rows(is_overlapping: BoolArray, max_count: int) -> IntArray:
+def _suppress_rows(is_overlapping: BoolArray, max_count: int) -> IntArray:
     """Return the retained rows of boxes that are sorted by score, best first."""
     is_suppressed = np.zeros(len(is_overlapping), dtype=bool)
     rows: list[int] = []
     for row, overlaps in enumerate(is_overlapping):
+        if len(rows) == max_count:
+            break
         if not is_suppressed[row]:
             rows.append(row)
-            if len(rows) == max_count:
-                break
             is_suppressed |= overlaps
     return np.array(rows, dtype=np.int64)
 
@@ -147,9 +151,8 @@ class DecodingConfig:
     """Rules for reading boxes from the maps.
 
     Attributes:
-        candidates: Number of cells with the best scores that are examined, for each sample and
-            task.
-        score_threshold: Scores must exceed it.
+        candidates: Number of highest-scoring cells that are examined for each sample and task.
+        score_threshold: Score that a box must exceed.
         center_range: Lowest x, y, z and highest x, y, z of the centres, metres, ego frame.
         nms: Suppression of each task, or one for all tasks.
     """
@@ -167,15 +170,17 @@ class DecodingConfig:
     nms: tuple[NmsConfig, ...] = (NmsConfig(),)
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
-        check_least(self, candidates=1)
-        lows, highs = self.center_range[:3], self.center_range[3:]
+        """Check the values; raise ConfigError if one is not valid."""
+        check_minima(self, candidates=1)
+        lows = self.center_range[:3]
+        highs = self.center_range[3:]
         if not all(low < high for low, high in zip(lows, highs, strict=True)):
             raise ConfigError(
-                f"center_range: expected least x, y, z, then greatest, found {self.center_range!r}"
+                "center_range: expected the lowest x, y, z, then the highest, found "
+                f"{self.center_range!r}"
             )
         if not self.nms:
-            raise ConfigError("nms: expected one NmsConfig, or one a task, found none")
+            raise ConfigError("nms: expected one NmsConfig, or one per task, found none")
 
 
 class Candidates(NamedTuple):
@@ -216,7 +221,7 @@ def decode_candidates(
 ) -> Candidates:
     """Return the best cells of a task as boxes, before suppression.
 
-    It is the released CenterPointBBoxCoder.
+    This is the released CenterPointBBoxCoder.
 
     Args:
         maps: Maps of the task.
@@ -228,16 +233,19 @@ def decode_candidates(
     probabilities = precise(maps.heatmap).sigmoid().flatten(1)
     count = min(config.candidates, probabilities.shape[1])
     scores, best = probabilities.topk(count, dim=1)
-    slots, cell = best // (rows * columns), best % (rows * columns)
+    slots = best // (rows * columns)
+    cell = best % (rows * columns)
     code = gather_cells(precise(maps.code), cell)
     offset, z, size, rotation, velocity = code.split(list(CODE_CHANNELS.values()), dim=2)
-    position = torch.stack([cell % columns, cell // columns], dim=2) + offset
-    cell_size = position.new_tensor([head.x[2], head.y[2]])
-    center = position * cell_size + position.new_tensor([head.x[0], head.y[0]])
-    yaw = torch.atan2(rotation[:, :, :1], rotation[:, :, 1:])
-    boxes = torch.cat([center, z, size.exp(), yaw, velocity], dim=2)
+    lower_corner = torch.stack([cell % columns, cell // columns], dim=2)
+    origin, _, cell_size = offset.new_tensor([head.x, head.y]).T
+    center_xy = (lower_corner + offset) * cell_size + origin
+    sine, cosine = rotation.split(1, dim=2)
+    yaw = torch.atan2(sine, cosine)
+    boxes = torch.cat([center_xy, z, size.exp(), yaw, velocity], dim=2)
     low, high = boxes.new_tensor(config.center_range).view(2, 3)
-    in_range = ((boxes[:, :, :3] >= low) & (boxes[:, :, :3] <= high)).all(dim=2)
+    centers = boxes[:, :, :3]
+    in_range = ((centers >= low) & (centers <= high)).all(dim=2)
     is_finite = boxes.isfinite().all(dim=2)
     valid = (scores > config.score_threshold) & in_range & is_finite
     return Candidates(boxes, scores, slots, valid)
@@ -248,7 +256,7 @@ def decode_detections(
 ) -> list[Detections]:
     """Return the boxes of each of B samples, after suppression within each task.
 
-    Boxes of slots without a category first suppress others of their task, and are then left out.
+    Boxes of slots without a category suppress others of their task before they are left out.
 
     Args:
         maps: Maps of each task, from the head.
@@ -257,17 +265,18 @@ def decode_detections(
             released tasks.
 
     Raises:
-        ConfigError: Another number of `nms` than tasks, or of its scales than slots.
+        ConfigError: `nms` has neither one entry nor one per task, or a scale does not match the
+            task's slots.
     """
     config = config or DecodingConfig()
-    suppressions = _nms_of_tasks(config.nms, head.class_slots)
-    parts_of_samples: list[list[Detections]] = [[] for _ in range(len(maps[0].heatmap))]
-    for task_maps, slots, nms in zip(maps, head.class_slots, suppressions, strict=True):
+    task_nms = _assign_nms(config.nms, head.class_slots)
+    detections_by_sample: list[list[Detections]] = [[] for _ in maps[0].heatmap]
+    for task_maps, slots, nms in zip(maps, head.class_slots, task_nms, strict=True):
         candidates = decode_candidates(task_maps, head, config)
-        for sample, parts in enumerate(parts_of_samples):
-            sample_candidates = Candidates(*(tensor[sample] for tensor in candidates))
-            parts.append(_retained_detections(sample_candidates, slots, nms))
-    return [_joined(parts) for parts in parts_of_samples]
+        sample_tensors = zip(*candidates, strict=True)
+        for tensors, detections in zip(sample_tensors, detections_by_sample, strict=True):
+            detections.append(_suppress_candidates(Candidates(*tensors), slots, nms))
+    return [_join_detections(detections) for detections in detections_by_sample]
 
 
 def detected_boxes(detections: Detections, world_from_ego: SE3 | ArrayLike) -> DetectedBoxes:
@@ -276,61 +285,72 @@ def detected_boxes(detections: Detections, world_from_ego: SE3 | ArrayLike) -> D
     Args:
         detections: Right-handed boxes; boxes of a model that works in left-handed axes must be
             mirrored first.
-        world_from_ego: Pose of the sample's agent; (4, 4) if it is no SE3.
+        world_from_ego: Pose of the sample's agent, an SE3 or a matrix (4, 4).
 
     Raises:
-        GeometryError: The pose is no rigid transform.
+        GeometryError: The pose is not a rigid transform.
     """
-    pose = world_from_ego if isinstance(world_from_ego, SE3) else SE3(world_from_ego)  # type: ignore[arg-type]
+    if not isinstance(world_from_ego, SE3):
+        world_from_ego = SE3(world_from_ego)  # type: ignore[arg-type]
     boxes = detections.boxes.detach().cpu().double().numpy()
+    scores = detections.scores.detach().cpu().double().numpy()
     ego_boxes = DetectedBoxes.from_arrays(
         boxes[:, :3],
         boxes[:, 3:6],
         boxes[:, 6],
-        detections.scores.detach().cpu().double().numpy(),
+        scores,
         category=detections.categories.cpu().numpy(),
         velocity=boxes[:, 7:],
         frame="ego",
     )
-    return ego_boxes.transform(pose, "world")
+    return ego_boxes.transform(world_from_ego, "world")
 
 
-def _nms_of_tasks(nms: tuple[NmsConfig, ...], class_slots: ClassSlots) -> tuple[NmsConfig, ...]:
-    """Return the suppression of each task; raises ConfigError if numbers do not fit."""
-    configs = nms * len(class_slots) if len(nms) == 1 else nms
+def _assign_nms(nms: tuple[NmsConfig, ...], class_slots: ClassSlots) -> tuple[NmsConfig, ...]:
+    """Return each task's suppression rules; raise ConfigError if their number does not fit."""
+    configs = nms
+    if len(nms) == 1:
+        configs = nms * len(class_slots)
     if len(configs) != len(class_slots):
         raise ConfigError(
-            f"nms: expected one NmsConfig, or {len(class_slots)}, one a task; found {len(nms)}"
+            f"nms: expected one NmsConfig, or {len(class_slots)} (one per task), found {len(nms)}"
         )
     for task, (config, slots) in enumerate(zip(configs, class_slots, strict=True)):
         if len(config.scale) not in (1, len(slots)):
             raise ConfigError(
-                f"nms: task {task} has {len(slots)} slots, found {len(config.scale)} scales; give "
-                "one, or one a slot"
+                f"nms: task {task} has {counted(len(slots), 'slot')}, but "
+                f"{counted(len(config.scale), 'scale')}; give one scale, or one per slot"
             )
     return configs
 
 
-def _retained_detections(
+def _suppress_candidates(
     candidates: Candidates, slots: tuple[int | None, ...], nms: NmsConfig
 ) -> Detections:
     """Return the retained boxes of one sample's candidates of one task."""
     valid = candidates.valid
-    boxes, scores, slot = candidates.boxes[valid], candidates.scores[valid], candidates.slots[valid]
-    box_array, score_array, slot_array = (
-        tensor.detach().cpu().numpy() for tensor in (boxes, scores, slot)
-    )
-    rows = torch.from_numpy(suppress(box_array, score_array, slot_array, nms)).to(boxes.device)
-    category_numbers = [-1 if number is None else number for number in slots]
-    categories = torch.tensor(category_numbers, device=boxes.device)
-    rows = rows[categories[slot[rows]] >= 0]
-    return Detections(boxes=boxes[rows], scores=scores[rows], categories=categories[slot[rows]])
+    boxes = candidates.boxes[valid]
+    scores = candidates.scores[valid]
+    slot = candidates.slots[valid]
+    box_array = boxes.detach().cpu().numpy()
+    score_array = scores.detach().cpu().numpy()
+    slot_array = slot.cpu().numpy()
+    retained_rows = suppress(box_array, score_array, slot_array, nms)
+    rows = torch.from_numpy(retained_rows).to(boxes.device)
+    slot_categories = []
+    for category in slots:
+        slot_categories.append(-1 if category is None else category)
+    category_by_slot = torch.tensor(slot_categories, device=boxes.device)
+    categories = category_by_slot[slot[rows]]
+    has_category = categories >= 0
+    rows = rows[has_category]
+    return Detections(boxes=boxes[rows], scores=scores[rows], categories=categories[has_category])
 
 
-def _joined(parts: Sequence[Detections]) -> Detections:
+def _join_detections(task_detections: Sequence[Detections]) -> Detections:
     """Return the boxes of all tasks, the best first."""
-    boxes = torch.cat([part.boxes for part in parts])
-    scores = torch.cat([part.scores for part in parts])
-    categories = torch.cat([part.categories for part in parts])
+    boxes = torch.cat([detections.boxes for detections in task_detections])
+    scores = torch.cat([detections.scores for detections in task_detections])
+    categories = torch.cat([detections.categories for detections in task_detections])
     order = scores.argsort(descending=True, stable=True)
     return Detections(boxes=boxes[order], scores=scores[order], categories=categories[order])

@@ -1,7 +1,5 @@
 """The detection head: maps of box centres and box codes from BEV features (CenterPoint)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
@@ -12,7 +10,7 @@ from torch.nn import functional
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Axis
-from deepaccident_devkit.support.arrays import check_least
+from deepaccident_devkit.support.arrays import check_minima
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES
 
@@ -47,8 +45,8 @@ class DetectionConfig:
             without a slot are background.
         x: Start, end and cell size of the output's columns, metres, ego frame.
         y: Start, end and cell size of the output's rows, metres, ego frame.
-        branches: `separate` for the released two convolutions a quantity, `joint` for one 1×1
-            convolution a task.
+        branches: `separate` for the released two convolutions for each quantity, `joint` for one
+            1×1 convolution for each task.
         upsample: Factor between the rows and columns of the output and of the features.
         heatmap_bias: Initial bias of the heatmap channels; −2.19 makes every cell a centre with
             probability 0.1.
@@ -64,16 +62,17 @@ class DetectionConfig:
     heatmap_bias: float = -2.19
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError or ChoiceError."""
+        """Check the values; raise ConfigError or ChoiceError if one is not valid."""
         settle_choices(self, {"branches": get_args(Branches)})
         BevGrid(x=self.x, y=self.y)  # checks both axes
-        check_least(self, in_channels=1, shared_channels=1, upsample=1)
+        check_minima(self, in_channels=1, shared_channels=1, upsample=1)
         _check_slots(self.class_slots)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows (y) and columns (x) of the output."""
-        return BevGrid(x=self.x, y=self.y).shape
+        grid = BevGrid(x=self.x, y=self.y)
+        return grid.shape
 
 
 class TaskMaps(NamedTuple):
@@ -82,12 +81,12 @@ class TaskMaps(NamedTuple):
     Rows are ordered by ascending y, columns by ascending x.
 
     Attributes:
-        reg: Centre from the cell's lower corner: x, y, in cells, shape (B, 2, H, W).
+        reg: x and y of the centre from the cell's lower corner, in cells, shape (B, 2, H, W).
         height: z of the centre, metres, shape (B, 1, H, W).
         dim: Logarithms of length, width, height in metres, shape (B, 3, H, W).
-        rot: Sine and cosine of the yaw, with any common factor, shape (B, 2, H, W).
+        rot: Sine and cosine of the yaw, up to a common positive factor, shape (B, 2, H, W).
         vel: vx, vy, m/s, shape (B, 2, H, W).
-        heatmap: Logits of a centre of each slot, shape (B, slots, H, W).
+        heatmap: Logits of each slot's centres, shape (B, slots, H, W).
     """
 
     reg: Tensor
@@ -99,12 +98,12 @@ class TaskMaps(NamedTuple):
 
     @property
     def code(self) -> Tensor:
-        """The box code, (B, 10, H, W): all maps except the heatmap."""
+        """The box code: all maps except the heatmap, (B, 10, H, W)."""
         return torch.cat(self[:-1], dim=1)
 
 
 class ConvBlock(nn.Module):
-    """Convolution 3×3 without bias, batch normalisation, ReLU; same height and width."""
+    """A 3×3 convolution without bias, a batch norm and a ReLU; height and width stay the same."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -117,7 +116,7 @@ class ConvBlock(nn.Module):
 
 
 class SeparateHead(nn.Module):
-    """One task's released branches: a `ConvBlock` and a convolution 3×3 for each quantity."""
+    """One task's released branches: a `ConvBlock` and a 3×3 convolution for each quantity."""
 
     def __init__(self, channels: int, slots: int, heatmap_bias: float) -> None:
         super().__init__()
@@ -129,7 +128,11 @@ class SeparateHead(nn.Module):
 
     def forward(self, features: Tensor) -> TaskMaps:
         """Return the maps of features (B, channels, H, W), with the same cells."""
-        return TaskMaps(*(self.get_submodule(name)(features) for name in TaskMaps._fields))
+        maps = []
+        for name in TaskMaps._fields:
+            branch = self.get_submodule(name)
+            maps.append(branch(features))
+        return TaskMaps(*maps)
 
 
 class JointHead(nn.Module):
@@ -144,7 +147,8 @@ class JointHead(nn.Module):
 
     def forward(self, features: Tensor) -> TaskMaps:
         """Return the maps of features (B, channels, H, W), with the same cells."""
-        return TaskMaps(*self.maps(features).split(self._sizes, dim=1))
+        stacked_maps = self.maps(features)
+        return TaskMaps(*stacked_maps.split(self._sizes, dim=1))
 
 
 class CenterHead(nn.Module):
@@ -159,9 +163,9 @@ class CenterHead(nn.Module):
         super().__init__()
         self.config = config
         self.shared_conv = ConvBlock(config.in_channels, config.shared_channels)
-        kind = SeparateHead if config.branches == "separate" else JointHead
+        head_class = SeparateHead if config.branches == "separate" else JointHead
         self.task_heads = nn.ModuleList(
-            kind(config.shared_channels, len(slots), config.heatmap_bias)
+            head_class(config.shared_channels, len(slots), config.heatmap_bias)
             for slots in config.class_slots
         )
 
@@ -173,34 +177,38 @@ class CenterHead(nn.Module):
                 rows, columns).
 
         Raises:
-            ConfigError: Features of another height or width.
+            ConfigError: The features have another height or width.
         """
         config = self.config
         rows, columns = config.shape
-        upsampled = tuple(size * config.upsample for size in features.shape[-2:])
-        if upsampled != (rows, columns):
+        upsampled_rows = features.shape[-2] * config.upsample
+        upsampled_columns = features.shape[-1] * config.upsample
+        if (upsampled_rows, upsampled_columns) != (rows, columns):
             raise ConfigError(
-                f"features: {upsampled[0]} × {upsampled[1]} cells after upsampling by "
+                f"features: {upsampled_rows} × {upsampled_columns} cells after upsampling by "
                 f"{config.upsample}, expected {rows} × {columns} of x={config.x}, y={config.y}; "
                 "change x and y, or upsample"
             )
         shared = self.shared_conv(features)
         if config.upsample > 1:
             shared = functional.interpolate(
-                shared, size=(rows, columns), mode="bilinear", align_corners=False
+                shared, config.shape, mode="bilinear", align_corners=False
             )
         return [head(shared) for head in self.task_heads]
 
 
 def _check_slots(class_slots: ClassSlots) -> None:
-    """Check the slots of all tasks; raises ConfigError."""
+    """Check the slots of all tasks; raise ConfigError if one is not valid."""
     if not class_slots or not all(class_slots):
-        raise ConfigError(f"class_slots: expected tasks of one slot or more, found {class_slots!r}")
+        raise ConfigError(
+            f"class_slots: expected tasks with one slot or more, found {class_slots!r}"
+        )
     categories = []
     for slots in class_slots:
         categories += [category for category in slots if category is not None]
     is_repeated = len(set(categories)) < len(categories)
-    if is_repeated or not set(categories) <= set(range(len(CATEGORIES))):
+    is_known = set(categories) <= set(range(len(CATEGORIES)))
+    if is_repeated or not is_known:
         raise ConfigError(
             f"class_slots: expected each category 0 to {len(CATEGORIES) - 1} at most once, and "
             f"None for slots that nothing trains; found {class_slots!r}"

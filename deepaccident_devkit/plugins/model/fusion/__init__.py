@@ -1,12 +1,13 @@
 """Fusion of several agents' BEV maps.
 
-`fusion` builds the module of a config; all modules have the interface `Fusion`. `PoolFusion` is a
-mean or maximum, `ReleasedFusion` the released code's fusion; `DiscoNetFusion`, `CobevtFusion` and
-`V2XViTFusion` are written from their own papers, because the released code has none of them.
+`fusion` builds the module that a config describes; all modules have the interface `Fusion`.
+`PoolFusion` is a mean or maximum, and `ReleasedFusion` the fusion in the released code.
+`DiscoNetFusion`, `CobevtFusion` and `V2XViTFusion` are implemented from their papers, because they
+are not in the released code.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.fusion.simple import (
@@ -31,7 +32,7 @@ from deepaccident_devkit.plugins.model.fusion.transformers import (
 FusionConfig: TypeAlias = (
     PoolFusionConfig | ReleasedFusionConfig | DiscoNetConfig | CobevtConfig | V2XViTConfig
 )
-_MODULES: Final[Mapping[type, Callable[[Any], Fusion]]] = {
+_MODULES: Mapping[type, Callable[[Any], Fusion]] = {
     PoolFusionConfig: PoolFusion,
     ReleasedFusionConfig: ReleasedFusion,
     DiscoNetConfig: DiscoNetFusion,
@@ -41,9 +42,9 @@ _MODULES: Final[Mapping[type, Callable[[Any], Fusion]]] = {
 
 
 def fusion(config: FusionConfig) -> Fusion:
-    """Return the fusion module that a config describes, with fresh weights.
+    """Build the fusion module that a config describes, with random initial weights.
 
-    Raises ConfigError for another object.
+    Raise ConfigError if the object is not a fusion's config.
     """
     if type(config) not in _MODULES:
         raise ConfigError(f"fusion: expected the config of a fusion module, found {config!r}")

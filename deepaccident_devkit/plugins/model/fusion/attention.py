@@ -1,6 +1,4 @@
-"""Attention over agents and windows of maps: the parts of CoBEVT and V2X-ViT."""
-
-from __future__ import annotations
+"""Attention over agents and over windows of maps: the building blocks of CoBEVT and V2X-ViT."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,20 +11,20 @@ from torch.nn import functional
 from deepaccident_devkit.plugins.model.images.swin import relative_positions
 
 # Kinds of agents: vehicle 0, infrastructure 1.
-_KIND_COUNT = 2
+_NUM_AGENT_KINDS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Windows:
-    """The division of maps into windows.
+    """A division of maps into windows.
 
     If the size does not divide H or W, rows are added after the last row and columns after the last
     column; the mask marks them.
 
     Attributes:
         size: Rows and columns of a window.
-        strided: Whether a window has cells that are spread evenly over the complete map (CoBEVT's
-            grid) instead of neighbours.
+        strided: Whether a window consists of cells spread evenly over the complete map (CoBEVT's
+            grid) instead of neighbouring cells.
     """
 
     size: int
@@ -35,19 +33,22 @@ class Windows:
     def split(self, x: Tensor) -> Tensor:
         """Split maps (B, A, H, W, C) into tokens (B · windows, A · size², C).
 
-        Tokens are ordered by agent, row and column; added cells are 0.
+        Tokens are ordered by agent, row and column. The features of added cells are 0.
         """
         size = self.size
-        padded = functional.pad(x, (0, 0, 0, -x.shape[3] % size, 0, -x.shape[2] % size))
+        added_rows = -x.shape[2] % size
+        added_columns = -x.shape[3] % size
+        padded = functional.pad(x, (0, 0, 0, added_columns, 0, added_rows))
         batch, agents, height, width, channels = padded.shape
-        rows, columns = height // size, width // size
+        rows = height // size
+        columns = width // size
         if self.strided:
-            parts = padded.view(batch, agents, size, rows, size, columns, channels)
-            parts = parts.permute(0, 3, 5, 1, 2, 4, 6)
+            windows = padded.view(batch, agents, size, rows, size, columns, channels)
+            windows = windows.permute(0, 3, 5, 1, 2, 4, 6)
         else:
-            parts = padded.view(batch, agents, rows, size, columns, size, channels)
-            parts = parts.permute(0, 2, 4, 1, 3, 5, 6)
-        return parts.reshape(batch * rows * columns, agents * size * size, channels)
+            windows = padded.view(batch, agents, rows, size, columns, size, channels)
+            windows = windows.permute(0, 2, 4, 1, 3, 5, 6)
+        return windows.reshape(batch * rows * columns, agents * size * size, channels)
 
     def join(self, tokens: Tensor, shape: torch.Size) -> Tensor:
         """Join tokens (B · windows, A · size², C) to maps (B, A, H, W, C).
@@ -56,10 +57,14 @@ class Windows:
         """
         batch, agents, height, width = shape
         size = self.size
-        rows, columns = -(-height // size), -(-width // size)
-        parts = tokens.view(batch, rows, columns, agents, size, size, -1)
-        order = (0, 3, 4, 1, 5, 2, 6) if self.strided else (0, 3, 1, 4, 2, 5, 6)
-        maps = parts.permute(order).reshape(batch, agents, rows * size, columns * size, -1)
+        rows = -(-height // size)
+        columns = -(-width // size)
+        windows = tokens.view(batch, rows, columns, agents, size, size, -1)
+        if self.strided:
+            maps = windows.permute(0, 3, 4, 1, 5, 2, 6)
+        else:
+            maps = windows.permute(0, 3, 1, 4, 2, 5, 6)
+        maps = maps.reshape(batch, agents, rows * size, columns * size, -1)
         return maps[:, :, :height, :width]
 
     def split_mask(self, mask: Tensor) -> Tensor:
@@ -69,7 +74,7 @@ class Windows:
 
 
 class PreNorm(nn.Module):
-    """x + layer(LayerNorm(x))."""
+    """A layer with a layer norm before it, added to its input: x + layer(LayerNorm(x))."""
 
     def __init__(self, channels: int, layer: nn.Module) -> None:
         super().__init__()
@@ -77,12 +82,13 @@ class PreNorm(nn.Module):
         self.layer = layer
 
     def forward(self, x: Tensor, *arguments: Any) -> Tensor:
-        """Transform (…, C) to (…, C); the other arguments are passed to the layer."""
-        return x + self.layer(self.norm(x), *arguments)
+        """Transform (…, C) to (…, C); other arguments are passed on to the layer."""
+        normalised = self.norm(x)
+        return x + self.layer(normalised, *arguments)
 
 
 class FeedForward(nn.Module):
-    """Linear, GELU, linear, each with dropout."""
+    """A linear layer, a GELU and a second linear layer; dropout follows each linear layer."""
 
     def __init__(self, channels: int, hidden: int, dropout: float) -> None:
         super().__init__()
@@ -100,19 +106,21 @@ class FeedForward(nn.Module):
 
 
 def attention(qkv: Tensor, heads: int, bias: Tensor, keys: Tensor | None) -> Tensor:
-    """Attend within M sets of L tokens, (M, L, 3 · C); return (M, L, C).
+    """Apply attention within M sets of L tokens, (M, L, 3 · C); return (M, L, C).
 
-    Queries, keys and values have the heads' channels one after the other. The bias (heads or 1, L,
-    L), [query, key], is added to the scaled products. `keys` (M, L) bool are the tokens that can be
-    attended to, at least one a set; None for all.
+    In queries, keys and values, the channels of one head follow another head's. The bias (heads
+    or 1, L, L), [query, key], is added to the scaled products. `keys` (M, L) bool marks the tokens
+    that can be attended to, at least one in each set; None for all.
     """
     query, key, value = qkv.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4)
-    score = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
+    scaled_query = query * query.shape[-1] ** -0.5
+    score = scaled_query @ key.transpose(-1, -2)
     # In place, here and in the next lines: scores are by far the largest tensors of a module.
     score += bias
     if keys is not None:
         score.masked_fill_(~keys[:, None, None, :], -torch.inf)
-    return (score.softmax(-1).to(value.dtype) @ value).transpose(1, 2).flatten(2)
+    attended = score.softmax(-1).to(value.dtype) @ value
+    return attended.transpose(1, 2).flatten(2)
 
 
 class LinearByKind(nn.Module):
@@ -121,14 +129,16 @@ class LinearByKind(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         bound = channels**-0.5
-        self.weight = nn.Parameter(
-            torch.empty(_KIND_COUNT, channels, channels).uniform_(-bound, bound)
-        )
-        self.bias = nn.Parameter(torch.empty(_KIND_COUNT, channels).uniform_(-bound, bound))
+        weight = torch.empty(_NUM_AGENT_KINDS, channels, channels)
+        bias = torch.empty(_NUM_AGENT_KINDS, channels)
+        self.weight = nn.Parameter(weight.uniform_(-bound, bound))
+        self.bias = nn.Parameter(bias.uniform_(-bound, bound))
 
-    def forward(self, x: Tensor, kind: Tensor) -> Tensor:
+    def forward(self, x: Tensor, agent_kind: Tensor) -> Tensor:
         """Transform (B, A, M, C), with kinds (B, A), to (B, A, M, C)."""
-        return x @ self.weight[kind].transpose(-1, -2) + self.bias[kind][:, :, None]
+        weight = self.weight[agent_kind].transpose(-1, -2)
+        bias = self.bias[agent_kind][:, :, None]
+        return x @ weight + bias
 
 
 class AgentAttention(nn.Module):
@@ -142,48 +152,58 @@ class AgentAttention(nn.Module):
         super().__init__()
         self.heads = heads
         size = channels // heads
-        self.query, self.key, self.value, self.out = (LinearByKind(channels) for _ in range(4))
-        self.relation_att = nn.Parameter(torch.empty(_KIND_COUNT * _KIND_COUNT, heads, size, size))
-        self.relation_msg = nn.Parameter(torch.empty(_KIND_COUNT * _KIND_COUNT, heads, size, size))
+        self.query = LinearByKind(channels)
+        self.key = LinearByKind(channels)
+        self.value = LinearByKind(channels)
+        self.out = LinearByKind(channels)
+        shape = (_NUM_AGENT_KINDS * _NUM_AGENT_KINDS, heads, size, size)
+        self.relation_att = nn.Parameter(torch.empty(shape))
+        self.relation_msg = nn.Parameter(torch.empty(shape))
+        bound = (3 / size) ** 0.5
         for relation in (self.relation_att, self.relation_msg):
-            nn.init.uniform_(relation, -((3 / size) ** 0.5), (3 / size) ** 0.5)
+            nn.init.uniform_(relation, -bound, bound)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor) -> Tensor:
-        """Attend in maps (B, A, H, W, C); return the same shape.
+        """Apply attention to maps (B, A, H, W, C); return the same shape.
 
         The mask has shape (B, A, H, W), the kinds (B, A).
         """
-        kind = agent_is_infra.long()
+        agent_kind = agent_is_infra.long()
         cells = x.flatten(2, 3)
-        query, key, value = (
-            self._by_head(layer(cells, kind)) for layer in (self.query, self.key, self.value)
-        )
+        query = self._split_heads(self.query(cells, agent_kind))
+        key = self._split_heads(self.key(cells, agent_kind))
+        value = self._split_heads(self.value(cells, agent_kind))
         scale = query.shape[-1] ** -0.5
-        scores_by_kind = [
-            self._related(query, self.relation_att, kind, other) * scale @ key.transpose(-1, -2)
-            for other in range(_KIND_COUNT)
-        ]
+        key = key.transpose(-1, -2)
+        scores_by_kind = []
+        for other_kind in range(_NUM_AGENT_KINDS):
+            relation = self.relation_att[_NUM_AGENT_KINDS * agent_kind + other_kind]
+            related_query = _apply_relation(query, relation)
+            scores_by_kind.append(related_query * scale @ key)
         is_infra = agent_is_infra[:, None, None, None, :]
         is_visible = mask.flatten(2).transpose(1, 2)[:, None, :, None, :]
         score = torch.where(is_infra, scores_by_kind[1], scores_by_kind[0])
         score = score.masked_fill(~is_visible, -torch.inf)
         weight = score.softmax(-1).to(value.dtype)
         messages = []
-        for other in range(_KIND_COUNT):
-            values_of_kind = weight * (is_infra == bool(other)) @ value
-            messages.append(self._related(values_of_kind, self.relation_msg, kind, other))
-        merged = (messages[0] + messages[1]).permute(0, 3, 2, 1, 4).flatten(3)
-        return self.dropout(self.out(merged, kind)).view_as(x)
+        for other_kind in range(_NUM_AGENT_KINDS):
+            kind_weight = weight * (is_infra == bool(other_kind))
+            relation = self.relation_msg[_NUM_AGENT_KINDS * agent_kind + other_kind]
+            messages.append(_apply_relation(kind_weight @ value, relation))
+        message = messages[0] + messages[1]
+        merged = message.permute(0, 3, 2, 1, 4).flatten(3)
+        return self.dropout(self.out(merged, agent_kind)).view_as(x)
 
-    def _by_head(self, x: Tensor) -> Tensor:
+    def _split_heads(self, x: Tensor) -> Tensor:
         """Return (B, A, M, C) as (B, heads, M, A, C / heads)."""
-        return x.unflatten(-1, (self.heads, -1)).permute(0, 3, 2, 1, 4)
+        by_head = x.unflatten(-1, (self.heads, -1))
+        return by_head.permute(0, 3, 2, 1, 4)
 
-    @staticmethod
-    def _related(x: Tensor, relation: Tensor, kind: Tensor, other: int) -> Tensor:
-        """Return (B, heads, M, A, d), each agent times the matrix of its kind and another kind."""
-        return torch.einsum("bhmip,bihpq->bhmiq", x, relation[_KIND_COUNT * kind + other])
+
+def _apply_relation(x: Tensor, relation: Tensor) -> Tensor:
+    """Multiply each agent's features by its matrix (B, A, heads, d, d), to (B, heads, M, A, d)."""
+    return torch.einsum("bhmip,bihpq->bhmiq", x, relation)
 
 
 class WindowAttention(nn.Module):
@@ -196,36 +216,37 @@ class WindowAttention(nn.Module):
 
     def __init__(self, channels: int, windows: Windows, heads: int, dropout: float) -> None:
         super().__init__()
-        self.windows, self.heads = windows, heads
+        self.windows = windows
+        self.heads = heads
         self.to_qkv = nn.Linear(channels, 3 * channels, bias=False)
         self.to_out = nn.Sequential(nn.Linear(channels, channels), nn.Dropout(dropout))
         span = 2 * windows.size - 1
         self.pos_embedding = nn.Parameter(torch.randn(span, span))
         # The original's bias is indexed by key − query.
-        self.register_buffer(
-            "positions", relative_positions(windows.size).T.contiguous(), persistent=False
-        )
+        positions = relative_positions(windows.size).T.contiguous()
+        self.register_buffer("positions", positions, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Attend in maps (M, 1, H, W, C); return the same shape.
+        """Apply attention to maps (M, 1, H, W, C); return the same shape.
 
         Cells that are added to fill the windows are not attended to.
         """
+        windows = self.windows
+        map_shape = x.shape[:4]
         keys = None
-        if x.shape[2] % self.windows.size or x.shape[3] % self.windows.size:
-            keys = self.windows.split_mask(
-                torch.ones(x.shape[:4], dtype=torch.bool, device=x.device)
-            )
+        if x.shape[2] % windows.size or x.shape[3] % windows.size:
+            all_cells = torch.ones(map_shape, dtype=torch.bool, device=x.device)
+            keys = windows.split_mask(all_cells)
         bias = self.pos_embedding.flatten()[self.positions][None]
-        attended = attention(self.windows.split(self.to_qkv(x)), self.heads, bias, keys)
-        return self.windows.join(self.to_out(attended), x.shape[:4])
+        qkv = windows.split(self.to_qkv(x))
+        attended = attention(qkv, self.heads, bias, keys)
+        return windows.join(self.to_out(attended), map_shape)
 
 
 class SplitAttention(nn.Module):
-    """Weighted sum of branches.
+    """A weighted sum of branches.
 
-    Each channel has a `softmax` over the branches of weights, which follow from the mean over the
-    map.
+    Each channel's weights are a `softmax` over the branches, computed from the mean over the map.
     """
 
     def __init__(self, channels: int, branches: int) -> None:
@@ -239,10 +260,11 @@ class SplitAttention(nn.Module):
         )
 
     def forward(self, results: list[Tensor]) -> Tensor:
-        """Join maps (M, 1, H, W, C), one for each branch, to one map."""
+        """Merge maps (M, 1, H, W, C), one for each branch, into one map."""
         stacked = torch.stack(results, -2)
-        score = self.weigh(stacked.sum(-2).mean((2, 3), keepdim=True))
-        return (stacked * score.unflatten(-1, (self.branches, -1)).softmax(-2)).sum(-2)
+        means = stacked.sum(-2).mean((2, 3), keepdim=True)
+        score = self.weigh(means).unflatten(-1, (self.branches, -1))
+        return (stacked * score.softmax(-2)).sum(-2)
 
 
 class MultiWindowAttention(nn.Module):
@@ -262,6 +284,7 @@ class MultiWindowAttention(nn.Module):
         self.split_attention = SplitAttention(channels, len(sizes))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Attend in maps (B, A, H, W, C); return the same shape."""
+        """Apply attention to maps (B, A, H, W, C); return the same shape."""
         maps = x.flatten(0, 1)[:, None]
-        return self.split_attention([branch(maps) for branch in self.branches]).view_as(x)
+        results = [branch(maps) for branch in self.branches]
+        return self.split_attention(results).view_as(x)

@@ -1,11 +1,9 @@
-"""The interface of all fusions, and mean, maximum, the released fusion and DiscoNet.
+"""The interface of all fusions; mean and maximum; the released fusion; and DiscoNet.
 
-DiscoNet follows Li et al., Learning Distilled Collaboration Graph (NeurIPS 2021); the sizes of the
-layers are from its version in CoBEVT's code. The DeepAccident paper names it; the released code has
-none. There is no distillation from a teacher that sees all sensors.
+DiscoNet follows Li et al., Learning Distilled Collaboration Graph (NeurIPS 2021); the layer sizes
+are as in CoBEVT's code. The DeepAccident paper lists DiscoNet, but the released code does not
+contain it. There is no distillation from a teacher that sees all sensors.
 """
-
-from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -18,23 +16,23 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.temporal import Bottleneck3d, TemporalBlock
 from deepaccident_devkit.support.text import settle_choices
 
-# Channels that a relative pose takes: a 6-vector, the same in all cells.
+# Channels that a relative pose occupies: a 6-vector, the same in all cells.
 POSE_CHANNELS = 6
-# Of 64, found by eye on one checkpoint of the released code's authors, and without meaning for any
-# other.
+# Out of 64. The authors of the released code chose them by eye for one checkpoint; they have no
+# meaning for any other.
 RELEASED_EGO_CHANNELS: Final = (31, 41, 42, 43, 44, 53, 57, 60)
 
 
 class Fusion(nn.Module, ABC):
-    """Fusion of several agents' BEV maps in the ego's frame into one map of the ego.
+    """Fusion of several agents' BEV maps, all in the ego's frame, into one map for the ego.
 
-    In cells without a visible partner every module returns exactly the result of the ego without
-    partners, and does not depend on the partners' order, except with options that document it.
-    Hidden cells have no effect, not even in training.
+    In cells without a visible partner, the result is exactly as for the ego without partners. The
+    partners' order does not matter. Hidden cells have no effect, not even in training. Options that
+    break one of these rules say so.
 
     Attributes:
-        hides_outside: Whether masks should also hide the cells outside a partner's own map, in
-            addition to missing agents.
+        hides_outside: Whether masks should hide the cells outside a partner's map, in addition to
+            missing agents.
     """
 
     hides_outside: ClassVar[bool] = True
@@ -49,14 +47,15 @@ class Fusion(nn.Module, ABC):
             mask: Cells that each agent covers (`warps.agents_mask`), (B, A, H, W) bool; the ego
                 covers all cells.
             agent_is_infra: Whether each agent is infrastructure instead of a vehicle, (B, A) bool.
-            delay: Steps by which each agent's map is older than the ego's, (B, A) int; not
-                negative.
+            delay: Number of steps by which each agent's map is older than the ego's, (B, A) int;
+                not negative.
         """
 
 
 def visible(x: Tensor, mask: Tensor) -> Tensor:
-    """Return maps (B, A, C, H, W) with 0 in cells that the mask (B, A, H, W) hides."""
-    return x.masked_fill(~mask[:, :, None], 0)
+    """Set the cells of maps (B, A, C, H, W) that the mask (B, A, H, W) hides to 0."""
+    is_hidden = ~mask[:, :, None]
+    return x.masked_fill(is_hidden, 0)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
@@ -65,12 +64,13 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     The mask has shape (B, A, H, W).
     """
     agent_counts = mask.sum(1)[:, None]
-    return visible(x, mask).sum(1) / agent_counts.to(x.dtype)
+    sums = visible(x, mask).sum(1)
+    return sums / agent_counts.to(x.dtype)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agent3DConfig:
-    """The unused layers of the released code.
+    """Sizes of the released code's unused layers.
 
     Attributes:
         channels: Number C of channels.
@@ -83,7 +83,7 @@ class Agent3DConfig:
     bottlenecks: int = 2
 
     def __post_init__(self) -> None:
-        """Check the number of agents; raises ConfigError."""
+        """Check the number of agents; raise ConfigError if there is no partner."""
         if self.agents < 2:
             raise ConfigError(
                 f"agents: expected at least 2, found {self.agents}; one agent has nothing to fuse"
@@ -93,17 +93,19 @@ class Agent3DConfig:
 class Agent3D(nn.Module):
     """A − 1 blocks over the sequence of agents, then one 3×3 convolution over all their channels.
 
-    State-dict keys are the released ones (`v2x_fusion.` and these). The order of the partners
-    matters, and nothing that was trained through these layers was published.
+    State-dict keys are the released ones, without the prefix `v2x_fusion.`. The order of the
+    partners matters. No published weights were trained with these layers in use.
     """
 
     def __init__(self, config: Agent3DConfig) -> None:
         super().__init__()
         width = config.channels
         layers: list[nn.Module] = []
-        for block in range(config.agents - 1):
-            layers.append(TemporalBlock(width + POSE_CHANNELS if block == 0 else width, width))
+        in_channels = width + POSE_CHANNELS
+        for _ in range(config.agents - 1):
+            layers.append(TemporalBlock(in_channels, width))
             layers.extend(Bottleneck3d(width) for _ in range(config.bottlenecks))
+            in_channels = width
         self.model = nn.Sequential(*layers)
         self.compression = nn.Sequential(
             nn.Conv2d(config.agents * width, width, 3, padding=1, bias=False),
@@ -118,20 +120,22 @@ class Agent3D(nn.Module):
             x: Maps, shape (B, A, C, H, W); slot 0 is the ego.
             relative_pose: 6-vectors `ego_from_agent`, shape (B, A, 6); slot 0 is not used.
         """
-        return self.compression(self.over_agents(x, relative_pose).flatten(1, 2))
+        maps = self.over_agents(x, relative_pose)
+        return self.compression(maps.flatten(1, 2))
 
     def over_agents(self, x: Tensor, relative_pose: Tensor) -> Tensor:
         """Return the maps (B, A, C, H, W) after the 3D convolutions; arguments as in `forward`."""
-        ego_pose = torch.zeros_like(relative_pose[:, :1])
-        poses = torch.cat([ego_pose, relative_pose[:, 1:]], 1).to(x.dtype)
-        pose_maps = poses[..., None, None].expand(-1, -1, -1, *x.shape[-2:])
+        poses = relative_pose.to(x.dtype, copy=True)
+        poses[:, 0] = 0
+        rows, columns = x.shape[-2:]
+        pose_maps = poses[..., None, None].expand(-1, -1, -1, rows, columns)
         maps = torch.cat([x, pose_maps], 2)
         return self.model(maps.transpose(1, 2)).transpose(1, 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoolFusionConfig:
-    """The mean, or the maximum (F-Cooper), over the agents that the mask shows.
+    """The choice between the mean and the maximum (F-Cooper) over the agents that the mask shows.
 
     Attributes:
         by: `mean` or `max`.
@@ -140,19 +144,19 @@ class PoolFusionConfig:
     by: Literal["mean", "max"] = "mean"
 
     def __post_init__(self) -> None:
-        """Check the word; raises ConfigError."""
+        """Check the value; raise ConfigError if it is neither `mean` nor `max`."""
         settle_choices(self, {"by": ("mean", "max")}, error=ConfigError)
 
 
 class PoolFusion(Fusion):
-    """Mean or maximum over agents, cell by cell; without parameters."""
+    """The mean or maximum over agents, cell by cell; it has no parameters."""
 
     def __init__(self, config: PoolFusionConfig) -> None:
         super().__init__()
         self.config = config
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
-        """Fuse as `Fusion.forward`; kinds of agents and delays have no effect."""
+        """Fuse as described for `Fusion.forward`; kinds of agents and delays have no effect."""
         if self.config.by == "mean":
             return masked_mean(x, mask)
         return x.masked_fill(~mask[:, :, None], -torch.inf).amax(1)
@@ -160,16 +164,16 @@ class PoolFusion(Fusion):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleasedFusionConfig:
-    """The fusion of the released code.
+    """Rules of the fusion in the released code.
 
     Attributes:
         channels: Number C of channels.
-        ego_channels: Channels that are copied from the ego instead of averaged; none gives a plain
-            mean of filled maps.
-        fill_below: A partner's cell with a smaller mean absolute value over its channels is filled
-            with the ego's.
-        agent3d: The released code's unused layers, so that all keys of its checkpoints have a
-            target; None for none.
+        ego_channels: Channels that are copied from the ego instead of averaged; without any, the
+            fusion is a plain mean of filled maps.
+        fill_below: Threshold of the mean absolute value over channels: a partner's cell below it is
+            filled with the ego's cell.
+        agent3d: Sizes of the released code's unused layers, with which every key of its checkpoints
+            can be loaded; None to leave these layers out.
     """
 
     channels: int
@@ -178,12 +182,14 @@ class ReleasedFusionConfig:
     agent3d: Agent3DConfig | None = None
 
     def __post_init__(self) -> None:
-        """Check the channels' numbers; raises ConfigError."""
-        wrong = [number for number in self.ego_channels if not 0 <= number < self.channels]
-        if wrong:
+        """Check the channel indices; raise ConfigError if one is out of range."""
+        wrong_channels = [
+            channel for channel in self.ego_channels if not 0 <= channel < self.channels
+        ]
+        if wrong_channels:
             raise ConfigError(
-                f"ego_channels: expected numbers from 0 to {self.channels - 1}, found {wrong}; "
-                "choose channels that the maps have, or () for none"
+                f"ego_channels: expected numbers from 0 to {self.channels - 1}, found "
+                f"{wrong_channels}; choose channels that the maps have, or () for none"
             )
 
 
@@ -191,36 +197,40 @@ class ReleasedFusion(Fusion):
     """The released V2X_fusion up to its early return: fill, mean over slots, the ego's channels.
 
     The release has no masks: it treats cells outside a partner's map as almost empty cells, fills
-    them with the ego's and counts them in the mean. So this module needs masks of complete agents
-    (`hides_outside`). Masked cells are filled, too, and count; an agent that is masked everywhere
-    is missing, and not in the mean. The release is only correct for batches of one sample; here
-    each sample of a batch is treated as its own batch.
+    them with the ego's and includes them in the mean. So this module needs masks that hide only
+    complete agents (`hides_outside`). Other masked cells are filled, too, and included in the mean;
+    an agent that is masked everywhere counts as missing, and is left out of the mean. The released
+    code is correct only for batches of one sample; here each sample of a batch is treated
+    separately.
 
-    With `agent3d` it also has the released unused layers; they need no gradient.
+    With `agent3d`, the module also contains the released code's unused layers, which need no
+    gradient.
     """
 
     hides_outside = False
-    from_ego: Tensor
+    is_ego_channel: Tensor
 
     def __init__(self, config: ReleasedFusionConfig) -> None:
         super().__init__()
         self.config = config
         is_ego_channel = torch.zeros(config.channels, dtype=torch.bool)
         is_ego_channel[list(config.ego_channels)] = True
-        self.register_buffer("from_ego", is_ego_channel, persistent=False)
+        self.register_buffer("is_ego_channel", is_ego_channel, persistent=False)
         if config.agent3d is not None:
             unused = Agent3D(config.agent3d).requires_grad_(requires_grad=False)
-            self.model, self.compression = unused.model, unused.compression
+            self.model = unused.model
+            self.compression = unused.compression
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
-        """Fuse as `Fusion.forward`; kinds of agents and delays have no effect."""
+        """Fuse as described for `Fusion.forward`; kinds of agents and delays have no effect."""
         ego = x[:, :1]
         is_present = mask.flatten(2).any(2)[:, :, None, None, None]
         is_empty = x.abs().mean(2, keepdim=True) < self.config.fill_below
         is_filled = ~mask[:, :, None] | is_empty
         filled = torch.where(is_filled, ego, x)
-        mean = filled.masked_fill(~is_present, 0).sum(1) / is_present.sum(1)
-        return torch.where(self.from_ego[:, None, None], ego[:, 0], mean)
+        sums = filled.masked_fill(~is_present, 0).sum(1)
+        mean = sums / is_present.sum(1)
+        return torch.where(self.is_ego_channel[:, None, None], ego[:, 0], mean)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,10 +250,10 @@ class DiscoNetConfig:
 
 
 class DiscoNetFusion(Fusion):
-    """Linear(Σ w_k x_k), with a `softmax` w over the agents' scores.
+    """A linear layer applied to Σ w_k x_k, where the weights w are a `softmax` over agents' scores.
 
-    A small network computes a score from an agent's cell and the ego's. It only sees cells that the
-    mask shows, so the batch statistics depend on no others.
+    A small network computes each score from an agent's cell and the ego's. It sees only cells that
+    the mask shows, so no other cell affects the batch statistics.
     """
 
     def __init__(self, config: DiscoNetConfig) -> None:
@@ -260,17 +270,20 @@ class DiscoNetFusion(Fusion):
         self.out = nn.Linear(config.channels, config.channels)
 
     def forward(self, x: Tensor, mask: Tensor, agent_is_infra: Tensor, delay: Tensor) -> Tensor:  # noqa: ARG002
-        """Fuse as `Fusion.forward`; kinds of agents and delays have no effect."""
-        weighted = (self.weights(x, mask)[:, :, None] * visible(x, mask)).sum(1)
-        return self.out(weighted.movedim(1, -1)).movedim(-1, 1)
+        """Fuse as described for `Fusion.forward`; kinds of agents and delays have no effect."""
+        weights = self.weights(x, mask)[:, :, None]
+        weighted_sum = (weights * visible(x, mask)).sum(1)
+        channels_last = weighted_sum.movedim(1, -1)
+        return self.out(channels_last).movedim(-1, 1)
 
     def weights(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Return the weights of the agents, (B, A, H, W); arguments as in `forward`.
+        """Return the agents' weights in each cell, (B, A, H, W); arguments are as in `forward`.
 
-        Their sum is 1, and masked weights are 0.
+        A cell's weights add up to 1; masked agents have the weight 0.
         """
         cells = x.movedim(2, -1)
-        pairs = torch.cat([cells, cells[:, :1].expand_as(cells)], -1)[mask]
+        ego_cells = cells[:, :1].expand_as(cells)
+        pairs = torch.cat([cells, ego_cells], -1)[mask]
         score = self.score(pairs)[:, 0]
         masked_scores = torch.full(mask.shape, -torch.inf, dtype=score.dtype, device=score.device)
         return masked_scores.masked_scatter(mask, score).softmax(1)

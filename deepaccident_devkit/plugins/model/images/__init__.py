@@ -1,4 +1,4 @@
-"""Images → features: backbones, and the neck that joins the two maps that a backbone gives.
+"""Images → features: backbones, and the neck that merges a backbone's two feature maps.
 
 backbone, neck = image_encoder(SwinConfig())
 features = neck(backbone(normalised(images)))  # (N, 3, h, w) uint8 → (N, 512, h / 16, w / 16)
@@ -10,7 +10,7 @@ from deepaccident_devkit.plugins.model.images.encoder import (
     SmallConv,
     SmallConvConfig,
     image_encoder,
-    normalised,
+    normalise_images,
 )
 from deepaccident_devkit.plugins.model.images.swin import Swin, SwinConfig, from_official
 
@@ -23,5 +23,5 @@ __all__ = [
     "SwinConfig",
     "from_official",
     "image_encoder",
-    "normalised",
+    "normalise_images",
 ]

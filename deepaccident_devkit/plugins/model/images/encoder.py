@@ -1,9 +1,7 @@
-"""The image encoder that a configuration describes, its neck, and a small backbone for CPUs."""
-
-from __future__ import annotations
+"""The image encoder of a configuration, its neck, and a small backbone for CPUs."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -13,15 +11,14 @@ from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.model.images.swin import Swin, SwinConfig
 
 # ImageNet's statistics of R, G, B in [0, 1]; the published weights of Swin expect them.
-_IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
-_IMAGENET_STD: Final = (0.229, 0.224, 0.225)
+_IMAGENET_MEAN = (0.485, 0.456, 0.406)
+_IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class FpnNeck(nn.Module):
-    """Joins a fine and a coarse map (the released FPN_LSS).
+    """Neck that merges a fine and a coarse map (the released FPN_LSS).
 
-    The coarse map is enlarged and concatenated with the fine one, and both go through two
-    convolutions.
+    The coarse map is enlarged and concatenated with the fine one; two convolutions follow.
 
     Attributes:
         out_channels: Channels of the result.
@@ -37,10 +34,9 @@ class FpnNeck(nn.Module):
         """
         super().__init__()
         self.out_channels = out_channels
+        padding = first_kernel // 2
         layers = nn.Sequential(
-            nn.Conv2d(
-                in_channels, out_channels, first_kernel, padding=first_kernel // 2, bias=False
-            ),
+            nn.Conv2d(in_channels, out_channels, first_kernel, padding=padding, bias=False),
             nn.BatchNorm2d(out_channels),
             nn.ReLU(inplace=True),
             nn.Conv2d(out_channels, out_channels, 3, padding=1, bias=False),
@@ -50,13 +46,13 @@ class FpnNeck(nn.Module):
         self.up = nn.ModuleDict({"conv": layers})
 
     def forward(self, maps: tuple[Tensor, Tensor]) -> Tensor:
-        """Join the maps (N, C, h', w') and (N, C', h'', w''), the fine one first.
+        """Merge the maps (N, C, h', w') and (N, C', h'', w''), the fine one first.
 
         Return one map (N, `out_channels`, h', w').
         """
         fine, coarse = maps
         enlarged = functional.interpolate(
-            coarse, size=fine.shape[-2:], mode="bilinear", align_corners=True
+            coarse, fine.shape[-2:], mode="bilinear", align_corners=True
         )
         return self.up["conv"](torch.cat([fine, enlarged], 1))
 
@@ -78,13 +74,13 @@ class SmallConvConfig:
     stride: ClassVar[int] = 8
 
     def __post_init__(self) -> None:
-        """Check the number of widths; raises ConfigError."""
+        """Check the number of widths; raise ConfigError if it is wrong."""
         if len(self.widths) != 3:
             raise ConfigError(f"widths: expected three numbers of channels, found {self.widths!r}")
 
 
 class SmallConv(nn.Module):
-    """Convolutions with stride 2, and a residual block at each of the last two resolutions; ours.
+    """The devkit's small backbone: convolutions with stride 2, and a residual block for each map.
 
     Attributes:
         out_channels: Channels of the two maps.
@@ -95,9 +91,13 @@ class SmallConv(nn.Module):
         first, second, third = config.widths
         self.out_channels = (third, config.branch)
         self.fine = nn.Sequential(
-            _halved(3, first), _halved(first, second), _halved(second, third), _Residual(third)
+            _make_halving_layers(3, first),
+            _make_halving_layers(first, second),
+            _make_halving_layers(second, third),
+            _Residual(third),
         )
-        self.coarse = nn.Sequential(_halved(third, config.branch), _Residual(config.branch))
+        halving = _make_halving_layers(third, config.branch)
+        self.coarse = nn.Sequential(halving, _Residual(config.branch))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Encode images (N, 3, h, w) as maps at 1/8 and 1/16 of their resolution, rounded up."""
@@ -106,25 +106,31 @@ class SmallConv(nn.Module):
 
 
 class _Residual(nn.Module):
+    """Two convolutions with a ReLU between them, added to their input."""
+
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            *_convolution(channels, channels),
+            *_make_convolution(channels, channels),
             nn.ReLU(inplace=True),
-            *_convolution(channels, channels),
+            *_make_convolution(channels, channels),
         )
 
     def forward(self, features: Tensor) -> Tensor:
+        """Transform features (N, C, H, W); return the same shape."""
         return (features + self.layers(features)).relu()
 
 
-def _halved(in_channels: int, out_channels: int) -> nn.Sequential:
-    return nn.Sequential(*_convolution(in_channels, out_channels, stride=2), nn.ReLU(inplace=True))
+def _make_halving_layers(in_channels: int, out_channels: int) -> nn.Sequential:
+    """Return the layers that halve the resolution."""
+    layers = _make_convolution(in_channels, out_channels, stride=2)
+    return nn.Sequential(*layers, nn.ReLU(inplace=True))
 
 
-def _convolution(
+def _make_convolution(
     in_channels: int, out_channels: int, *, stride: int = 1
 ) -> tuple[nn.Conv2d, nn.BatchNorm2d]:
+    """Return a 3 × 3 convolution and its batch norm."""
     convolution = nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, bias=False)
     return convolution, nn.BatchNorm2d(out_channels)
 
@@ -133,31 +139,38 @@ EncoderConfig = SwinConfig | SmallConvConfig
 
 
 def image_encoder(config: EncoderConfig) -> tuple[Swin | SmallConv, FpnNeck]:
-    """Return a backbone and its neck; `neck(backbone(images))` are the features.
+    """Build a backbone and its neck; `neck(backbone(images))` are the features.
 
-    They map (N, 3, h, w) to (N, `config.neck_channels`, h', w'), with h' and w' the rounded up h /
-    `config.stride` and w / `config.stride`. They are separate because the release stores them under
-    the names `img_backbone` and `img_neck`.
+    Together they map (N, 3, h, w) to (N, `config.neck_channels`, h', w'), where h' and w' are h /
+    `config.stride` and w / `config.stride`, rounded up. They are separate modules because the
+    release stores them under the names `img_backbone` and `img_neck`.
 
     Raises:
-        ConfigError: The configuration belongs to neither encoder.
+        ConfigError: The configuration is for neither of the two encoders.
     """
     if not isinstance(config, EncoderConfig):
         raise ConfigError(f"expected a SwinConfig or a SmallConvConfig, found {config!r}")
-    backbone = Swin(config) if isinstance(config, SwinConfig) else SmallConv(config)
-    # Most of the small neck's work would be in the first convolution, so its kernel is smaller.
-    first_kernel = 1 if isinstance(config, SmallConvConfig) else 3
+    backbone: Swin | SmallConv
+    if isinstance(config, SwinConfig):
+        backbone = Swin(config)
+        first_kernel = 3
+    else:
+        backbone = SmallConv(config)
+        # Most of the small neck's computation would be in the first convolution, so its kernel
+        # is small.
+        first_kernel = 1
     in_channels = sum(backbone.out_channels)
     return backbone, FpnNeck(in_channels, config.neck_channels, first_kernel=first_kernel)
 
 
-def normalised(images: Tensor) -> Tensor:
+def normalise_images(images: Tensor) -> Tensor:
     """Return RGB images (…, 3, h, w) uint8 as normalised floats.
 
-    They are divided by 255, reduced by ImageNet's mean and divided by its standard deviation.
+    Values are divided by 255; then ImageNet's mean is subtracted, and the result is divided by
+    ImageNet's standard deviation.
 
     Raises:
-        ConfigError: The images are not uint8, so it is unknown how they were processed.
+        ConfigError: The images are not uint8, so they may already have been normalised.
     """
     if images.dtype != torch.uint8:
         raise ConfigError(

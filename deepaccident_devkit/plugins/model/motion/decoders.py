@@ -5,8 +5,6 @@ distribution at each cell of a map with a quarter of the features' resolution. F
 from BEVerse's iterative flow and a GRU (the released `ResFuturePrediction`).
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from typing import Final, Literal, NamedTuple
 
@@ -15,22 +13,27 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.plugins.model.warps import precise
 
+HiddenWarp = Literal["none", "warped"]
+HIDDEN_WARPS: Final[tuple[HiddenWarp, ...]] = ("none", "warped")
 # Standard deviation of the flow layer's first weights, so that training starts close to no motion.
-_FLOW_DEVIATION: Final = 0.02
-_CHANNELS: Final = {
+_FLOW_DEVIATION = 0.02
+_CHANNELS = {
     "segmentation": 2,
     "instance_center": 1,
     "instance_offset": 2,
     "instance_flow": 2,
 }
+# Rows and columns by which a bottleneck divides the resolution.
+_STRIDE = 2
 # First bias of the centres' logits: one cell in ten, so that empty cells do not dominate the first
 # steps (CenterNet, arXiv:1904.07850).
-_CENTER_BIAS: Final = -2.19
+_CENTER_BIAS = -2.19
 
 
 class LatentDistribution(NamedTuple):
-    """A diagonal normal distribution.
+    """A diagonal normal distribution of the latent at each cell of a map.
 
     Attributes:
         mu: Means, shape (N, L, h, w).
@@ -41,28 +44,29 @@ class LatentDistribution(NamedTuple):
     log_sigma: Tensor
 
     def sample(self, noise: Tensor) -> Tensor:
-        """Return the latent (N, L, h, w) of standard normal noise with that shape.
+        """Transform standard normal noise (N, L, h, w) to a latent of this distribution.
 
-        Raises GeometryError for another shape.
+        Raises GeometryError if the noise has another shape.
         """
         if noise.shape != self.mu.shape:
             raise GeometryError(
                 f"noise: expected shape {tuple(self.mu.shape)}, found {tuple(noise.shape)}"
             )
-        return self.mu + noise.to(self.mu) * self.log_sigma.exp()
+        deviation = self.log_sigma.exp()
+        scaled_noise = noise.to(self.mu) * deviation
+        return self.mu + scaled_noise
 
     def noise(self, generator: torch.Generator | None = None) -> Tensor:
-        """Draw standard normal noise of this shape.
+        """Draw standard normal noise of the distribution's shape, (N, L, h, w).
 
-        The generator is on the same device; None stands for torch's own.
+        The generator must be on the same device; None for torch's default generator.
         """
-        return torch.randn(
-            self.mu.shape, generator=generator, device=self.mu.device, dtype=self.mu.dtype
-        )
+        mu = self.mu
+        return torch.randn(mu.shape, generator=generator, device=mu.device, dtype=mu.dtype)
 
 
 class SpatialDistribution(nn.Module):
-    """Encoder of features as a `LatentDistribution`.
+    """Encoder of features into a `LatentDistribution`.
 
     It has two bottlenecks of stride 2 and a 1 × 1 convolution.
     """
@@ -89,14 +93,15 @@ class SpatialDistribution(nn.Module):
 
         Each has shape (N, latent, H / 4, W / 4), rounded up.
         """
-        mu, log_sigma = self.last_conv(self.encoder(features)).chunk(2, dim=1)
+        output = self.last_conv(self.encoder(features))
+        mu, log_sigma = output.chunk(2, dim=1)
         return LatentDistribution(mu, log_sigma.clamp(*self._log_sigma))
 
 
 class _Bottleneck(nn.Module):
-    """Half the channels, a 3 × 3 convolution of stride 2, then the output channels.
+    """A 3 × 3 convolution of stride 2 with half the channels, between two 1 × 1 convolutions.
 
-    A pooled and projected skip is added.
+    A skip, which is pooled and projected, is added to the result.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -105,11 +110,11 @@ class _Bottleneck(nn.Module):
         self.layers = nn.Sequential(
             OrderedDict(
                 conv_down_project=nn.Conv2d(inputs, inner, 1, bias=False),
-                abn_down_project=_norm(inner),
-                conv=nn.Conv2d(inner, inner, 3, stride=2, padding=1, bias=False),
-                abn=_norm(inner),
+                abn_down_project=_make_norm(inner),
+                conv=nn.Conv2d(inner, inner, 3, stride=_STRIDE, padding=1, bias=False),
+                abn=_make_norm(inner),
                 conv_up_project=nn.Conv2d(inner, outputs, 1, bias=False),
-                abn_up_project=_norm(outputs),
+                abn_up_project=_make_norm(outputs),
             )
         )
         self.projection = nn.Sequential(
@@ -120,18 +125,18 @@ class _Bottleneck(nn.Module):
         )
 
     def forward(self, features: Tensor) -> Tensor:
+        """Transform features (N, inputs, H, W) to (N, outputs, H / 2, W / 2), rounded up."""
         rows, columns = features.shape[-2:]
         # As released, the padding's zeros count at an edge.
-        padded = functional.pad(features, (0, columns % 2, 0, rows % 2))
-        return self.layers(features) + self.projection(functional.max_pool2d(padded, 2))
+        padded = functional.pad(features, (0, columns % _STRIDE, 0, rows % _STRIDE))
+        output = self.layers(features)
+        skip = self.projection(functional.max_pool2d(padded, _STRIDE))
+        return output + skip
 
 
-def _norm(channels: int) -> nn.Sequential:
+def _make_norm(channels: int) -> nn.Sequential:
+    """Return a batch norm with a ReLU."""
     return nn.Sequential(nn.BatchNorm2d(channels), nn.ReLU(inplace=True))
-
-
-HiddenWarp = Literal["none", "warped"]
-HIDDEN_WARPS: Final[tuple[HiddenWarp, ...]] = ("none", "warped")
 
 
 def warp_with_flow(features: Tensor, flow: Tensor) -> Tensor:
@@ -142,19 +147,21 @@ def warp_with_flow(features: Tensor, flow: Tensor) -> Tensor:
     """
     rows, columns = features.shape[-2:]
     # Half precision cannot distinguish neighbouring cells of a large grid.
-    dtype = torch.promote_types(features.dtype, torch.float32)
-    x = torch.arange(columns, device=flow.device, dtype=dtype) + flow[:, 0].to(dtype)
-    y = torch.arange(rows, device=flow.device, dtype=dtype)[:, None] + flow[:, 1].to(dtype)
+    precise_features = precise(features)
+    flow = flow.to(precise_features.dtype)
+    x = torch.arange(columns, device=flow.device, dtype=flow.dtype) + flow[:, 0]
+    y = torch.arange(rows, device=flow.device, dtype=flow.dtype)[:, None] + flow[:, 1]
     scaled_x = 2 * x / max(columns - 1, 1) - 1
     scaled_y = 2 * y / max(rows - 1, 1) - 1
     points = torch.stack([scaled_x, scaled_y], dim=-1)
-    return functional.grid_sample(features.to(dtype), points, align_corners=True).to(features.dtype)
+    sampled = functional.grid_sample(precise_features, points, align_corners=True)
+    return sampled.to(features.dtype)
 
 
 class FlowGru(nn.Module):
-    """Prediction of future states from a latent and the present state.
+    """Layer that predicts future states from a latent and the present state.
 
-    It is the released `ResFuturePrediction`.
+    This is the released `ResFuturePrediction`.
     """
 
     def __init__(
@@ -162,12 +169,14 @@ class FlowGru(nn.Module):
     ) -> None:
         """Build the layers for a number of future frames.
 
-        The GRU updates the previous state in its old place (`none`, as released), or warped with
-        the flow like its input (`warped`). With `detach`, gradients stop between a frame and the
-        next, as released.
+        The GRU updates the previous state either in place (`none`, as released), or warped with the
+        flow like its input (`warped`). With `detach`, gradients stop between consecutive frames, as
+        released.
         """
         super().__init__()
-        self._frames, self._hidden_warp, self._detach = frames, hidden_warp, detach
+        self._frames = frames
+        self._hidden_warp = hidden_warp
+        self._detach = detach
         joint = channels + latent
         self.offset_conv = _ConvNorm(joint, joint)
         self.offset_pred = nn.Conv2d(joint, 2, 1)
@@ -177,17 +186,20 @@ class FlowGru(nn.Module):
         self.spatial_conv = _ConvNorm(channels, channels)
 
     def forward(self, latent: Tensor, state: Tensor) -> Tensor:
-        """Return future states (N, frames, C, H, W) of a latent (N, L, H, W) and the present state.
+        """Predict the future states (N, frames, C, H, W) from a latent and the present state.
 
-        The present state has shape (N, C, H, W).
+        The latent has shape (N, L, H, W), the present state (N, C, H, W).
         """
         states = []
         for _ in range(self._frames):
-            flow = self.offset_pred(self.offset_conv(torch.cat([latent, state], dim=1)))
+            joint = torch.cat([latent, state], dim=1)
+            flow = self.offset_pred(self.offset_conv(joint))
             warped = warp_with_flow(state, flow)
-            hidden = state if self._hidden_warp == "none" else warped
+            if self._hidden_warp == "warped":
+                state = warped
             inputs = torch.cat([warped, latent], dim=1)
-            state = self.spatial_conv(self.gru_cells[0](inputs, hidden))
+            updated = self.gru_cells[0](inputs, state)
+            state = self.spatial_conv(updated)
             states.append(state)
             if self._detach:
                 state = state.detach()
@@ -195,7 +207,7 @@ class FlowGru(nn.Module):
 
 
 class _GruCell(nn.Module):
-    """A GRU of convolutions with a reset gate that is the *forgotten* share, as in FIERY."""
+    """A GRU of convolutions; its reset gate is the share that is *forgotten*, as in FIERY."""
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
@@ -204,15 +216,17 @@ class _GruCell(nn.Module):
         self.conv_state_tilde = _ConvNorm(inputs + channels, channels)
 
     def forward(self, inputs: Tensor, state: Tensor) -> Tensor:
+        """Compute the next state (N, C, H, W) from the inputs and the state, on the same cells."""
         joint = torch.cat([inputs, state], dim=1)
         update = self.conv_update(joint).sigmoid()
         reset = self.conv_reset(joint).sigmoid()
-        proposed = self.conv_state_tilde(torch.cat([inputs, (1 - reset) * state], dim=1))
+        retained = (1 - reset) * state
+        proposed = self.conv_state_tilde(torch.cat([inputs, retained], dim=1))
         return (1 - update) * state + update * proposed
 
 
 class _ConvNorm(nn.Module):
-    """A 3 × 3 convolution without bias, batch norm and ReLU."""
+    """A 3 × 3 convolution without bias, a batch norm and a ReLU."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -220,7 +234,9 @@ class _ConvNorm(nn.Module):
         self.norm = nn.BatchNorm2d(outputs)
 
     def forward(self, features: Tensor) -> Tensor:
-        return functional.relu(self.norm(self.conv(features)), inplace=True)
+        """Transform features (N, inputs, H, W) to (N, outputs, H, W)."""
+        normalised = self.norm(self.conv(features))
+        return normalised.relu_()
 
 
 class PredictedMotionMaps(NamedTuple):
@@ -244,26 +260,32 @@ class PredictedMotionMaps(NamedTuple):
 
 
 class SeparateDecoders(nn.ModuleDict):
-    """The released task heads: a 3 × 3 and a 1 × 1 convolution for each map.
+    """The released decoders: a 3 × 3 and a 1 × 1 convolution for each map.
 
-    Maps have the resolution of the states.
+    The maps have the states' resolution.
     """
 
     def __init__(self, channels: int) -> None:
         """Build the layers for states with a number of channels."""
         decoders = {}
         for name, count in _CHANNELS.items():
-            centers = slice(0, 1) if name == "instance_center" else None
-            decoders[name] = _decoder(channels, channels, count, centers=centers)
+            centers = None
+            if name == "instance_center":
+                centers = slice(0, 1)
+            decoders[name] = _make_decoder(channels, channels, count, centers=centers)
         super().__init__(decoders)
 
     def forward(self, states: Tensor) -> PredictedMotionMaps:
         """Decode states (M, C, H, W) to maps (M, …, H, W)."""
-        return PredictedMotionMaps(**{name: decoder(states) for name, decoder in self.items()})
+        maps = [self[name](states) for name in PredictedMotionMaps._fields]
+        return PredictedMotionMaps(*maps)
 
 
 class ShuffledDecoder(nn.Module):
-    """Our small decoder: all maps from a few channels; each finer cell has its own channels."""
+    """Our small decoder, which reads all maps from a few channels.
+
+    Each finer cell has its own channels.
+    """
 
     def __init__(self, channels: int, hidden: int, upsample: int) -> None:
         """Build the layers.
@@ -272,19 +294,23 @@ class ShuffledDecoder(nn.Module):
         the maps' cells along a cell of the states.
         """
         super().__init__()
-        self._upsample, cells = upsample, upsample**2
+        self._upsample = upsample
+        cells = upsample**2
         start = cells * _CHANNELS["segmentation"]
         outputs = cells * sum(_CHANNELS.values())
-        self.layers = _decoder(channels, hidden, outputs, centers=slice(start, start + cells))
+        self.layers = _make_decoder(channels, hidden, outputs, centers=slice(start, start + cells))
 
     def forward(self, states: Tensor) -> PredictedMotionMaps:
         """Decode states (M, C, H, W) to maps (M, …, H', W') on the finer grid."""
-        maps = functional.pixel_shuffle(self.layers(states), self._upsample)
-        return PredictedMotionMaps(*maps.split(list(_CHANNELS.values()), dim=1))
+        stacked_maps = functional.pixel_shuffle(self.layers(states), self._upsample)
+        maps = stacked_maps.split(list(_CHANNELS.values()), dim=1)
+        return PredictedMotionMaps(*maps)
 
 
-def _decoder(channels: int, hidden: int, outputs: int, *, centers: slice | None) -> nn.Sequential:
-    """Return two convolutions; `centers` are the outputs with centres' logits, None without any."""
+def _make_decoder(
+    channels: int, hidden: int, outputs: int, *, centers: slice | None
+) -> nn.Sequential:
+    """Build two convolutions; `centers` are the channels of the centre logits, or None."""
     output_conv = nn.Conv2d(hidden, outputs, 1)
     if centers is not None:
         with torch.no_grad():

@@ -1,7 +1,5 @@
 """The motion head: a latent, future states of the BEV features, maps, labels and losses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, get_args
@@ -22,7 +20,7 @@ from deepaccident_devkit.plugins.model.motion.decoders import (
     SpatialDistribution,
 )
 from deepaccident_devkit.plugins.model.warps import precise
-from deepaccident_devkit.support.arrays import check_least
+from deepaccident_devkit.support.arrays import check_minima
 from deepaccident_devkit.support.text import settle_choices
 
 # Value of offset and flow outside instances (`motion.MotionLabelConfig.ignore_index`).
@@ -33,21 +31,21 @@ PosteriorIgnore = Literal["keep", "zero"]
 POSTERIOR_IGNORES: Final[tuple[PosteriorIgnore, ...]] = ("keep", "zero")
 Decoders = Literal["separate", "shuffled"]
 # Smallest distance of a centre's probability from 0 and 1.
-_MIN_PROBABILITY: Final = 1e-4
+_MIN_PROBABILITY = 1e-4
 
 
 class MotionTargets(NamedTuple):
-    """A batch's motion labels, all frames warped to the present.
+    """The motion labels of a batch, with all frames warped to the present.
 
     They are read with `V2XConfig(to_present="nearest")`.
 
     Attributes:
         segmentation: 1 on instances, (N, T, H, W) int64.
-        centerness: 1 at the instances' centres, less around them, shape (N, T, 1, H, W).
+        centerness: 1 at the instances' centres, falling off around them, shape (N, T, 1, H, W).
         offset: Cells to the centre, down the rows and along the columns, shape (N, T, 2, H, W); 255
             = ignored.
         flow: Cells to the centre in the next frame, as `offset`.
-        frame_mask: The frames that losses count (`frame_mask`), (N, T) bool.
+        frame_mask: Whether losses include each frame (`frame_mask`), (N, T) bool.
     """
 
     segmentation: Tensor
@@ -57,10 +55,10 @@ class MotionTargets(NamedTuple):
     frame_mask: Tensor
 
     def posterior_input(self, *, stride: int, ignore: PosteriorIgnore, ignore_index: int) -> Tensor:
-        """Return the maps of the future frames as additional channels of the features.
+        """Stack the maps of the future frames as additional channels of the features.
 
         Args:
-            stride: Step between the rows and columns that are used, beginning with the first.
+            stride: Step between the rows and columns that are used, starting with the first.
             ignore: Value in ignored cells of offset and flow: `keep` the mark (as released), or
                 `zero`.
             ignore_index: The mark.
@@ -69,27 +67,36 @@ class MotionTargets(NamedTuple):
             Segmentation, centerness, offset, flow, frame after frame, shape (N, (T − 1) · 6, H /
             stride, W / stride).
         """
-        centerness, offset, flow = (
-            maps[:, 1:, :, ::stride, ::stride] for maps in (self.centerness, self.offset, self.flow)
-        )
-        segmentation = self.segmentation[:, 1:, None, ::stride, ::stride].to(centerness.dtype)
+        segmentation = _thin_future_maps(self.segmentation[:, :, None], stride)
+        centerness = _thin_future_maps(self.centerness, stride)
+        offset = _thin_future_maps(self.offset, stride)
+        flow = _thin_future_maps(self.flow, stride)
         if ignore == "zero":
-            offset, flow = (maps.masked_fill(maps == ignore_index, 0) for maps in (offset, flow))
-        return torch.cat([segmentation, centerness, offset, flow], dim=2).flatten(1, 2)
+            offset = offset.masked_fill(offset == ignore_index, 0)
+            flow = flow.masked_fill(flow == ignore_index, 0)
+        segmentation = segmentation.to(centerness.dtype)
+        maps = torch.cat([segmentation, centerness, offset, flow], dim=2)
+        return maps.flatten(1, 2)
+
+
+def _thin_future_maps(maps: Tensor, stride: int) -> Tensor:
+    """Drop the present from maps (N, T, C, H, W), and keep every `stride`-th row and column."""
+    return maps[:, 1:, :, ::stride, ::stride]
 
 
 def frame_mask(label_valid: Tensor, past_valid: Tensor) -> Tensor:
-    """Return the label frames that losses count, (N, T) bool.
+    """Return whether losses include each label frame, (N, T) bool.
 
-    These are frames in the recording, of samples with all past frames in it. This is the released
-    rule (`sample_ignore_mode = "past_valid"`).
+    They include the frames that are in the recording, of samples whose past frames are all in it.
+    This is the released rule (`sample_ignore_mode = "past_valid"`).
 
     Args:
         label_valid: Whether each label frame, from the present on, is in the recording, (N, T)
             bool.
         past_valid: Whether each frame before the present is in the recording, (N, P − 1) bool.
     """
-    return label_valid & past_valid.all(dim=1, keepdim=True)
+    has_whole_past = past_valid.all(dim=1, keepdim=True)
+    return label_valid & has_whole_past
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,17 +107,18 @@ class MotionHeadConfig:
         in_channels: Channels of the features and of all states.
         latent: Channels of the latent.
         future_frames: Number of frames after the present.
-        samples: Number of random draws of a prediction; the mean is additional.
+        samples: Number of random draws per prediction; the mean comes in addition.
         log_sigma: The smallest and the largest logarithm of a standard deviation.
-        decoders: `separate` convolutions for each map, as released, or `shuffled`: one decoder for
-            all maps, with separate channels for each finer cell.
+        decoders: `separate` convolutions for each map, as released, or a `shuffled` decoder of all
+            maps, with separate channels for each finer cell.
         hidden: Channels of the shuffled decoder; the separate ones have `in_channels`.
-        upsample: Number of the maps' and labels' cells along a cell of the features; 1 if separate.
+        upsample: Number of map and label cells along the side of a feature cell; 1 for separate
+            decoders.
         posterior_ignore: Value that the posterior sees in ignored cells of offset and flow: the
             mark 255 as released (`keep`), or `zero`.
-        hidden_warp: State that the GRU updates, `none` (as released: the previous one in its old
-            place) or `warped`.
-        detach: Whether gradients stop between a frame and the next, as released.
+        hidden_warp: Previous state that the GRU updates: `none` leaves it in place, as released;
+            `warped` warps it with the flow.
+        detach: Whether gradients stop between consecutive frames, as released.
         ignore_index: The labels' mark (`motion.MotionLabelConfig.ignore_index`).
     """
 
@@ -131,15 +139,18 @@ class MotionHeadConfig:
     ignore_index: int = IGNORE_INDEX
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
+        """Check the values; raise ConfigError if one is not valid."""
         words = {
             "decoders": get_args(Decoders),
             "posterior_ignore": POSTERIOR_IGNORES,
             "hidden_warp": HIDDEN_WARPS,
         }
         settle_choices(self, words, error=ConfigError)
-        check_least(self, in_channels=2, latent=1, future_frames=1, samples=0, hidden=1, upsample=1)
-        if not self.log_sigma[0] < self.log_sigma[1]:
+        check_minima(
+            self, in_channels=2, latent=1, future_frames=1, samples=0, hidden=1, upsample=1
+        )
+        smallest, largest = self.log_sigma
+        if not smallest < largest:
             raise ConfigError(
                 "log_sigma: expected the smaller limit first, such as (-5, 5), found "
                 f"{self.log_sigma!r}"
@@ -173,19 +184,23 @@ class MotionHead(nn.Module):
         """Build the layers of a configuration."""
         super().__init__()
         self.config = config
-        channels, labels = config.in_channels, config.future_frames * LABEL_CHANNELS
-        self.task_heads: nn.Module = (
-            SeparateDecoders(channels)
-            if config.decoders == "separate"
-            else ShuffledDecoder(channels, config.hidden, config.upsample)
+        channels = config.in_channels
+        latent = config.latent
+        self.task_heads: nn.Module
+        if config.decoders == "separate":
+            self.task_heads = SeparateDecoders(channels)
+        else:
+            self.task_heads = ShuffledDecoder(channels, config.hidden, config.upsample)
+        self.present_distribution = SpatialDistribution(
+            channels, channels // 2, latent, config.log_sigma
         )
-        self.present_distribution, self.future_distribution = (
-            SpatialDistribution(inputs, inputs // 2, config.latent, config.log_sigma)
-            for inputs in (channels, channels + labels)
+        all_channels = channels + config.future_frames * LABEL_CHANNELS
+        self.future_distribution = SpatialDistribution(
+            all_channels, all_channels // 2, latent, config.log_sigma
         )
         self.future_prediction = FlowGru(
             channels,
-            config.latent,
+            latent,
             config.future_frames,
             hidden_warp=config.hidden_warp,
             detach=config.detach,
@@ -201,7 +216,7 @@ class MotionHead(nn.Module):
     ) -> MotionOutputs:
         """Predict the maps of the present and the future frames.
 
-        With targets it predicts as in training, without targets as in a test.
+        With targets, it predicts as in training; without targets, as at test time.
 
         Args:
             features: Encoded features, coarser than the motion grid by the factor `upsample`, shape
@@ -227,42 +242,52 @@ class MotionHead(nn.Module):
                 ignore_index=config.ignore_index,
             )
             future = self.future_distribution(torch.cat([features, labels.to(features)], dim=1))
-            latent = future.sample(future.noise(generator) if noise is None else noise)
-            return MotionOutputs(self._decoded(features, latent), present, future)
-        # One draw after the other, because all draws together would need several times the memory.
-        draws = [
-            self._decoded(features, latent) for latent in self._draws(present, noise, generator)
-        ]
-        maps = PredictedMotionMaps(*map(torch.stack, zip(*draws, strict=True)))
-        return MotionOutputs(maps, present, None)
+            if noise is None:
+                noise = future.noise(generator)
+            maps = self._decode(features, future.sample(noise))
+            return MotionOutputs(maps, present, future)
+        draws = []
+        # Decode one draw after another: all draws at once would need several times the memory.
+        for latent in self._draw_latents(present, noise, generator):
+            draws.append(self._decode(features, latent))
+        stacked_maps = [torch.stack(maps) for maps in zip(*draws, strict=True)]
+        return MotionOutputs(PredictedMotionMaps(*stacked_maps), present, None)
 
-    def _draws(
+    def _draw_latents(
         self, present: LatentDistribution, noise: Tensor | None, generator: torch.Generator | None
     ) -> Iterator[Tensor]:
         """Yield the latent of each draw and, last, the mean."""
         count = self.config.samples
         if noise is not None and len(noise) != count:
             raise GeometryError(
-                f"noise: expected that of {count} draws, found {len(noise)}; change noise or "
+                f"noise: expected noise for {count} draws, found {len(noise)}; change noise or "
                 "samples"
             )
         for draw in range(count):
-            yield present.sample(present.noise(generator) if noise is None else noise[draw])
+            if noise is None:
+                draw_noise = present.noise(generator)
+            else:
+                draw_noise = noise[draw]
+            yield present.sample(draw_noise)
         yield present.mu
 
-    def _decoded(self, features: Tensor, latent: Tensor) -> PredictedMotionMaps:
+    def _decode(self, features: Tensor, latent: Tensor) -> PredictedMotionMaps:
         """Return the maps (N, T, …) of the features with one latent."""
         latent = functional.interpolate(
-            latent, size=features.shape[-2:], mode="bilinear", align_corners=False
+            latent, features.shape[-2:], mode="bilinear", align_corners=False
         )
         future = self.future_prediction(latent, features)
         states = torch.cat([features[:, None], future], dim=1)
         maps = self.task_heads(states.flatten(0, 1))
-        return PredictedMotionMaps(*(tensor.unflatten(0, states.shape[:2]) for tensor in maps))
+        frame_maps = [tensor.unflatten(0, states.shape[:2]) for tensor in maps]
+        return PredictedMotionMaps(*frame_maps)
 
     def _check_targets(self, features: Tensor, targets: MotionTargets) -> None:
-        rows, columns = (self.config.upsample * size for size in features.shape[-2:])
-        expected = (len(features), self.config.future_frames + 1, rows, columns)
+        """Raise GeometryError unless the targets fit the features."""
+        samples, _, rows, columns = features.shape
+        config = self.config
+        frames = config.future_frames + 1
+        expected = (samples, frames, config.upsample * rows, config.upsample * columns)
         shape = tuple(targets.segmentation.shape)
         if shape != expected:
             raise GeometryError(
@@ -298,14 +323,14 @@ class MotionLossConfig:
     ignore_index: int = IGNORE_INDEX
 
     def __post_init__(self) -> None:
-        """Check the values; raises ConfigError."""
+        """Check the values; raise ConfigError if one is not valid."""
         if not 0 < self.top_k <= 1:
             raise ConfigError(
                 f"top_k: expected a share above 0 and at most 1, found {self.top_k!r}"
             )
         if len(self.class_weights) != 2:
             raise ConfigError(
-                "class_weights: expected those of background and foreground, found "
+                "class_weights: expected the weights of background and foreground, found "
                 f"{self.class_weights!r}"
             )
 
@@ -313,25 +338,27 @@ class MotionLossConfig:
 def motion_losses(
     outputs: MotionOutputs, targets: MotionTargets, config: MotionLossConfig
 ) -> dict[str, Tensor]:
-    """Return all weighted losses of a batch as scalars.
+    """Compute all weighted losses of a batch, as scalars.
 
-    They are `motion_seg`, `_centerness`, `_offset`, `_flow` and `_prob`. Frames that
-    `targets.frame_mask` leaves out do not count. If nothing counts, a loss is zero, with zero
-    gradients.
+    Their names are `motion_seg`, `motion_centerness`, `motion_offset`, `motion_flow` and
+    `motion_prob`. Frames that `targets.frame_mask` excludes are ignored. If nothing is left, a loss
+    is zero, with zero gradients.
 
     Args:
         outputs: Outputs of a call with targets.
-        targets: The same targets.
+        targets: Targets that the call had.
         config: Rules and weights.
 
     Raises:
-        NotAvailableError: The outputs are of a call without targets.
+        NotAvailableError: The outputs come from a call without targets.
     """
     if outputs.future is None:
         raise NotAvailableError(
-            "outputs: expected those of a call with targets, found no posterior; give the targets"
+            "outputs: expected the outputs of a forward pass with targets, found no "
+            "posterior; pass the targets to the forward pass"
         )
-    maps, mask = outputs.maps, targets.frame_mask
+    maps = outputs.maps
+    mask = targets.frame_mask
     seg = segmentation_loss(maps.segmentation, targets.segmentation, mask, config)
     losses = {"motion_seg": config.segmentation * seg}
     centerness = center_loss(maps.instance_center, targets.centerness, mask, config)
@@ -361,29 +388,32 @@ def segmentation_loss(
         reduction="none",
         ignore_index=config.ignore_index,
     )
-    cells = losses.flatten(1)
-    count = max(int(config.top_k * cells.shape[1]), 1)
-    hardest = cells.topk(count, sorted=False).values
-    per_frame = hardest.mean(dim=1).unflatten(0, frame_mask.shape) * _discounts(logits, config)
-    return _mean(per_frame, frame_mask)
+    losses = losses.flatten(1)
+    count = max(int(config.top_k * losses.shape[1]), 1)
+    hardest = losses.topk(count, sorted=False).values
+    frame_losses = hardest.mean(dim=1).unflatten(0, frame_mask.shape)
+    return _average_masked(frame_losses * _discount_frames(logits, config), frame_mask)
 
 
 def center_loss(
     logits: Tensor, target: Tensor, frame_mask: Tensor, config: MotionLossConfig
 ) -> Tensor:
-    """Return the Gaussian focal loss over the discounted number of centres.
+    """Return the Gaussian focal loss, divided by the discounted number of centres.
 
     CornerNet, arXiv:1808.01244. Logits and target are (N, T, 1, H, W).
     """
     logits = precise(logits)
     probability = logits.sigmoid().clamp(_MIN_PROBABILITY, 1 - _MIN_PROBABILITY)
     is_center = target == 1
-    center_losses = -probability.log() * (1 - probability).square()
-    other_losses = -(1 - probability).log() * probability.square() * (1 - target.to(logits)).pow(4)
-    weight = torch.where(frame_mask, _discounts(logits, config), 0)
+    complement = 1 - probability
+    center_losses = -probability.log() * complement.square()
+    distance = 1 - target.to(logits)
+    other_losses = -complement.log() * probability.square() * distance.pow(4)
     losses = torch.where(is_center, center_losses, other_losses)
+    weight = torch.where(frame_mask, _discount_frames(logits, config), 0)
     loss = (losses.flatten(2).sum(dim=2) * weight).sum()
-    return loss / (is_center.flatten(2).sum(dim=2) * weight).sum().clamp(min=1)
+    center_count = (is_center.flatten(2).sum(dim=2) * weight).sum()
+    return loss / center_count.clamp(min=1)
 
 
 def vector_loss(
@@ -396,9 +426,10 @@ def vector_loss(
     """
     vectors = precise(vectors)
     distances = (vectors - target.to(vectors)).abs().sum(dim=2)
-    errors = distances * _discounts(vectors, config)[:, None, None]
+    discounts = _discount_frames(vectors, config)[:, None, None]
     is_known = (target != config.ignore_index).all(dim=2)
-    return _mean(errors, is_known & frame_mask[:, :, None, None])
+    is_counted = is_known & frame_mask[:, :, None, None]
+    return _average_masked(distances * discounts, is_counted)
 
 
 def latent_loss(
@@ -406,24 +437,30 @@ def latent_loss(
 ) -> Tensor:
     """Return the divergence KL(future ‖ present) of the posterior from the present's distribution.
 
-    It is summed over the latent's channels, and averaged over its cells and over the samples in
-    `sample_mask` (N,) bool.
+    The divergence is summed over the latent's channels, and averaged over its cells and over the
+    samples in `sample_mask` (N,) bool.
     """
-    mu, log_sigma = (precise(tensor) for tensor in present)
-    future_mu, future_log_sigma = (precise(tensor) for tensor in future)
-    spread = (2 * (future_log_sigma - log_sigma)).exp() + (
-        (future_mu - mu) * (-log_sigma).exp()
-    ).square()
-    divergence = (log_sigma - future_log_sigma + (spread - 1) / 2).sum(dim=1)
-    return _mean(divergence, sample_mask[:, None, None].expand_as(divergence))
+    mu = precise(present.mu)
+    log_sigma = precise(present.log_sigma)
+    future_mu = precise(future.mu)
+    future_log_sigma = precise(future.log_sigma)
+    variance_ratio = (2 * (future_log_sigma - log_sigma)).exp()
+    scaled_difference = (future_mu - mu) * (-log_sigma).exp()
+    spread = variance_ratio + scaled_difference.square()
+    divergence = log_sigma - future_log_sigma + (spread - 1) / 2
+    divergence = divergence.sum(dim=1)
+    is_counted = sample_mask[:, None, None].expand_as(divergence)
+    return _average_masked(divergence, is_counted)
 
 
-def _discounts(maps: Tensor, config: MotionLossConfig) -> Tensor:
+def _discount_frames(maps: Tensor, config: MotionLossConfig) -> Tensor:
     """Return the weight of each frame of maps (N, T, …), shape (T,)."""
-    steps = torch.arange(maps.shape[1], device=maps.device, dtype=maps.dtype)
+    frames = maps.shape[1]
+    steps = torch.arange(frames, device=maps.device, dtype=maps.dtype)
     return torch.pow(config.discount, steps)
 
 
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
+def _average_masked(values: Tensor, mask: Tensor) -> Tensor:
     """Return the mean of the values in the mask; zero, with zero gradients, if there are none."""
-    return torch.where(mask, values, 0).sum() / mask.sum().clamp(min=1)
+    total = torch.where(mask, values, 0).sum()
+    return total / mask.sum().clamp(min=1)

@@ -1,7 +1,7 @@
 """The layout of a junction, in metres from its middle: arms, lanes, parking slots, and terrain."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +12,7 @@ from deepaccident_devkit.support.text import choice
 
 Arm = Literal["west", "south", "east", "north"]
 RoadKind = Literal["four-way", "three-way"]
+_Distance = TypeVar("_Distance", float, FloatArray)
 ARMS: tuple[Arm, ...] = get_args(Arm)
 """The four sides of a junction, counter-clockwise."""
 OUTWARD: dict[Arm, tuple[int, int]] = {
@@ -27,7 +28,8 @@ MAX_GRADE = 0.21
 # Share of each half of a hump that is curved at its crest, and as much at its foot; the grade
 # between them is constant.
 _CURVED_SHARE = 0.25
-# Distances to the side of the arm's middle line at which a hump begins to fall, and ends, metres.
+# Distances from the arm's middle line, to either side, at which a hump begins to fall and ends,
+# metres.
 _SHOULDER_DISTANCES = (22.0, 45.0)
 # Distance between the corners of triangles along a hump.
 _TRIANGLE_STEP_M = 1.0
@@ -42,10 +44,10 @@ MAX_LANES = 2
 _MOUTH_DISTANCE_M = 2.0
 _STOP_LINE_WIDTH_M = 0.4
 SLOT_LENGTH = 5.8
-"""Length of a parking slot, metres: the gaps between parked cars are about one metre."""
-# Length before the stop line without parking slots.
+"""Length of a parking slot, metres; it leaves gaps of about one metre between parked cars."""
+# Length of the road before the stop line that has no parking slots.
 _SLOT_FREE_LENGTH_M = 6.0
-# Parking slots end at this distance.
+# Distance from the junction's middle at which the parking slots end.
 _SLOTS_END_M = 110.0
 
 
@@ -53,7 +55,7 @@ _SLOTS_END_M = 110.0
 class Hump:
     """A rise of the road, the same on both sides of its crest.
 
-    It is checked when made, and raises ConfigError.
+    Values are checked on construction; a wrong one raises ConfigError.
 
     Attributes:
         arm: Arm of the junction that it lies on.
@@ -68,7 +70,7 @@ class Hump:
     length: float = 70.0
 
     def __post_init__(self) -> None:
-        """Check that it fits on the arm, and that cars can climb it."""
+        """Check that the hump fits on its arm, and that cars can climb it."""
         object.__setattr__(self, "arm", choice("hump.arm", self.arm, ARMS, error=ConfigError))
         if self.length <= 0 or self.height < 0:
             raise ConfigError(
@@ -83,12 +85,12 @@ class Hump:
         if self.grade > MAX_GRADE:
             raise ConfigError(
                 f"hump: {self.height:g} m over {self.length:g} m are a grade of {self.grade:.1%}; "
-                f"make it longer or lower, {MAX_GRADE:.0%} is the most"
+                f"make it longer or lower; {MAX_GRADE:.0%} is the maximum"
             )
 
     @property
     def grade(self) -> float:
-        """The steepest slope, metres of height for each metre."""
+        """The steepest slope, in metres of height for each metre of road."""
         half_length = self.length / 2
         return self.height / (half_length * (1 - _CURVED_SHARE))
 
@@ -106,16 +108,18 @@ class Terrain:
     @property
     def is_flat(self) -> bool:
         """Whether the height is 0 everywhere."""
-        return self.hump is None or self.hump.height == 0
+        if self.hump is None:
+            return True
+        return self.hump.height == 0
 
     def height(self, xy: ArrayLike) -> FloatArray:
         """Return heights (N,), metres, at points (N, 2)."""
         points = np.asarray(xy, dtype=np.float64)
         if self.hump is None or self.is_flat:
             return np.zeros(points.shape[:-1])
-        along, beside = _along_and_beside(points, self.hump.arm)
-        profile, _ = _profile(along, self.hump)
-        fade, _ = _fade(beside)
+        along, to_left = _locate_on_arm(points, self.hump.arm)
+        profile, _ = _compute_hump_profile(along, self.hump)
+        fade, _ = _compute_hump_fade(to_left)
         return profile * fade
 
     def normal(self, xy: ArrayLike) -> FloatArray:
@@ -125,15 +129,16 @@ class Terrain:
         normals[..., 2] = 1.0
         if self.hump is None or self.is_flat:
             return normals
-        along, beside = _along_and_beside(points, self.hump.arm)
-        profile, profile_slope = _profile(along, self.hump)
-        fade, fade_slope = _fade(beside)
+        along, to_left = _locate_on_arm(points, self.hump.arm)
+        profile, profile_slope = _compute_hump_profile(along, self.hump)
+        fade, fade_slope = _compute_hump_fade(to_left)
         outward = np.array(OUTWARD[self.hump.arm])
-        sideways = np.array([-outward[1], outward[0]])
+        leftward = np.array([-outward[1], outward[0]])
         outward_slope = (profile_slope * fade)[..., None]
-        sideways_slope = (profile * fade_slope)[..., None]
-        normals[..., :2] = -outward_slope * outward - sideways_slope * sideways
-        return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+        leftward_slope = (profile * fade_slope)[..., None]
+        normals[..., :2] = -outward_slope * outward - leftward_slope * leftward
+        lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+        return np.asarray(normals / lengths)
 
     def triangles(self) -> Float32Array:
         """Return the surface as triangles (M, 3, 3), metres, with their normals upwards.
@@ -141,7 +146,7 @@ class Terrain:
         The triangles along a hump are small.
         """
         along = np.array([-EXTENT, EXTENT])
-        beside = np.array([-EXTENT, EXTENT])
+        to_left = along
         arm: Arm = "east"
         hump = self.hump
         if hump is not None and not self.is_flat:
@@ -149,12 +154,12 @@ class Terrain:
             begin = hump.distance - hump.length / 2
             end = hump.distance + hump.length / 2
             num_steps = int(np.ceil(hump.length / _TRIANGLE_STEP_M))
-            along = _with_edges(np.linspace(begin, end, num_steps + 1))
+            along = _add_edges(np.linspace(begin, end, num_steps + 1))
             shoulder = np.linspace(*_SHOULDER_DISTANCES, 12)
-            beside = _with_edges(np.concatenate([-shoulder[::-1], shoulder]))
+            to_left = _add_edges(np.concatenate([-shoulder[::-1], shoulder]))
         outward = np.array(OUTWARD[arm], dtype=np.float64)
-        sideways = np.array([-outward[1], outward[0]])
-        xy = along[:, None, None] * outward + beside[None, :, None] * sideways
+        leftward = np.array([-outward[1], outward[0]])
+        xy = along[:, None, None] * outward + to_left[None, :, None] * leftward
         grid = np.concatenate([xy, self.height(xy)[..., None]], axis=2)
         near_right = grid[:-1, :-1]
         far_right = grid[1:, :-1]
@@ -166,54 +171,76 @@ class Terrain:
         return np.concatenate(triangles).astype(np.float32)
 
 
-def _along_and_beside(points: FloatArray, arm: Arm) -> tuple[FloatArray, FloatArray]:
-    """Return metres from the middle along an arm, and to the left of its middle line."""
-    x, y = OUTWARD[arm]
-    points_x = points[..., 0]
-    points_y = points[..., 1]
-    along = points_x * x + points_y * y
-    beside = points_y * x - points_x * y
-    return along, beside
+def point_on_arm(arm: Arm, along: _Distance, to_left: _Distance) -> tuple[_Distance, _Distance]:
+    """Return x and y of points on an arm, metres.
+
+    Args:
+        arm: The arm.
+        along: Distances outward from the junction's middle, metres.
+        to_left: Distances to the left of the arm's middle line, seen outward, metres.
+    """
+    outward_x, outward_y = OUTWARD[arm]
+    x = along * outward_x - to_left * outward_y
+    y = along * outward_y + to_left * outward_x
+    return x, y
 
 
-def _profile(along: FloatArray, hump: Hump) -> tuple[FloatArray, FloatArray]:
-    """Return height and slope along the arm of a hump.
+def _locate_on_arm(points: FloatArray, arm: Arm) -> tuple[FloatArray, FloatArray]:
+    """Return how far points (…, 2) are along an arm, and to the left of its middle line, metres."""
+    outward_x, outward_y = OUTWARD[arm]
+    x = points[..., 0]
+    y = points[..., 1]
+    along = x * outward_x + y * outward_y
+    to_left = y * outward_x - x * outward_y
+    return along, to_left
+
+
+def _compute_hump_profile(along: FloatArray, hump: Hump) -> tuple[FloatArray, FloatArray]:
+    """Return a hump's heights (metres) and slopes at distances along its arm.
 
     The grade is constant up and down, with parabolas at the crest and at the feet.
     """
-    half = hump.length / 2
-    curve = hump.length / 2 * _CURVED_SHARE
-    offset = np.minimum(np.abs(along - hump.distance), half)
+    half_length = hump.length / 2
+    curve_length = half_length * _CURVED_SHARE
+    signed_offset = along - hump.distance
+    crest_distance = np.minimum(np.abs(signed_offset), half_length)
+    foot_distance = half_length - crest_distance
     grade = hump.grade
-    to_foot = half - offset
-    crest_height = hump.height - grade * offset**2 / (2 * curve)
-    foot_height = grade * to_foot**2 / (2 * curve)
-    slope_height = hump.height - grade * (offset - curve / 2)
-    lower_height = np.where(to_foot < curve, foot_height, slope_height)
-    height = np.where(offset < curve, crest_height, lower_height)
-    slope = grade * np.minimum(np.minimum(offset, to_foot) / curve, 1.0)
-    return height, -np.sign(along - hump.distance) * slope
+    crest_height = hump.height - grade * crest_distance**2 / (2 * curve_length)
+    foot_height = grade * foot_distance**2 / (2 * curve_length)
+    straight_height = hump.height - grade * (crest_distance - curve_length / 2)
+    height_off_crest = np.where(foot_distance < curve_length, foot_height, straight_height)
+    height = np.where(crest_distance < curve_length, crest_height, height_off_crest)
+    grade_fraction = np.minimum(crest_distance, foot_distance) / curve_length
+    slope = grade * np.minimum(grade_fraction, 1.0)
+    return height, -np.sign(signed_offset) * slope
 
 
-def _fade(beside: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the share of its height that a hump has beside the road, and that share's slope."""
+def _compute_hump_fade(to_left: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the fraction of its height that a hump has away from the middle line, and its slope.
+
+    Args:
+        to_left: Distances to the left of the arm's middle line, metres.
+    """
     begin, end = _SHOULDER_DISTANCES
     width = end - begin
-    share = np.clip((np.abs(beside) - begin) / width, 0.0, 1.0)
+    share = np.clip((np.abs(to_left) - begin) / width, 0.0, 1.0)
     fade = 1 - share**2 * (3 - 2 * share)
-    slope = -np.sign(beside) * 6 * share * (1 - share) / width
+    slope = -np.sign(to_left) * 6 * share * (1 - share) / width
     return fade, slope
 
 
-def _with_edges(positions: FloatArray) -> FloatArray:
-    """Return positions on the ground between its edges, and the edges, metres."""
+def _add_edges(positions: FloatArray) -> FloatArray:
+    """Return the positions that are on the ground, and the two edges of the ground, metres."""
     on_ground = np.abs(positions) < EXTENT
     return np.concatenate([[-EXTENT], positions[on_ground], [EXTENT]])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoadSpec:
-    """A junction of straight roads at right angles; checked when made, raises ConfigError.
+    """A junction of straight roads at right angles.
+
+    Values are checked on construction; a wrong one raises ConfigError.
 
     Attributes:
         kind: Kind of the junction; a three-way junction has no north arm.
@@ -228,7 +255,7 @@ class RoadSpec:
     hump: Hump | None = None
 
     def __post_init__(self) -> None:
-        """Check every field."""
+        """Check every field; raise ConfigError if one is not valid."""
         kind = choice("road.kind", self.kind, get_args(RoadKind), error=ConfigError)
         object.__setattr__(self, "kind", kind)
         if not 1 <= self.lanes <= MAX_LANES:
@@ -241,7 +268,9 @@ class RoadSpec:
     @property
     def arms(self) -> tuple[Arm, ...]:
         """The arms of the junction, counter-clockwise from the west."""
-        return ARMS if self.kind == "four-way" else ARMS[:3]
+        if self.kind == "four-way":
+            return ARMS
+        return ARMS[:3]
 
     @property
     def yielding_arms(self) -> tuple[Arm, ...]:
@@ -273,7 +302,8 @@ class RoadSpec:
     @property
     def crosswalk(self) -> tuple[float, float]:
         """Start and end of the crosswalk, metres along an arm."""
-        return self.mouth, self.mouth + CROSSWALK_WIDTH
+        mouth = self.mouth
+        return mouth, mouth + CROSSWALK_WIDTH
 
     @property
     def stop_line(self) -> tuple[float, float]:
@@ -286,10 +316,11 @@ class RoadSpec:
 
         Lane 0 is the rightmost.
         """
-        return (self.lanes - lane - 0.5) * LANE_WIDTH
+        lane_widths = self.lanes - lane - 0.5
+        return lane_widths * LANE_WIDTH
 
     def _check_hump(self, hump: Hump) -> None:
-        """Check that a hump is on an arm, and not in the junction; raises ConfigError."""
+        """Raise ConfigError unless a hump lies on an existing arm and outside the junction."""
         if hump.arm not in self.arms:
             raise ConfigError(
                 f"road.hump.arm: a {self.kind} junction has no {hump.arm} arm; "
@@ -308,25 +339,25 @@ def slot_edges(spec: RoadSpec) -> FloatArray:
     begin = spec.stop_line[1] + _SLOT_FREE_LENGTH_M
     num_slots = int((_SLOTS_END_M - begin) / SLOT_LENGTH)
     numbers = np.arange(num_slots + 1, dtype=np.float64)
-    return np.asarray(begin + SLOT_LENGTH * numbers)
+    edges: FloatArray = begin + SLOT_LENGTH * numbers
+    return edges
 
 
 def parking_places(spec: RoadSpec) -> FloatArray:
-    """Return the middles of all parking slots, in the direction of the traffic beside them.
+    """Return the poses of all parking slots, facing in the direction of the traffic next to them.
 
     Returns:
-        x, y (metres), yaw (radians), shape (N, 3).
+        x, y (metres), yaw (radians) of the slots' middles, shape (N, 3).
     """
     edges = slot_edges(spec)
     along = (edges[:-1] + edges[1:]) / 2
-    beside = spec.road_edge - PARKING_WIDTH / 2
+    middle_distance = spec.road_edge - PARKING_WIDTH / 2
     slots = []
     for arm in spec.arms:
-        x, y = OUTWARD[arm]
-        outward = np.arctan2(y, x)
+        outward_x, outward_y = OUTWARD[arm]
+        outward = np.arctan2(outward_y, outward_x)
         for side, yaw in ((1, outward + np.pi), (-1, outward)):
-            slot_x = along * x - side * beside * y
-            slot_y = along * y + side * beside * x
+            x, y = point_on_arm(arm, along, np.full(len(along), side * middle_distance))
             wrapped_yaw = np.arctan2(np.sin(yaw), np.cos(yaw))
-            slots.append(np.column_stack([slot_x, slot_y, np.full(len(along), wrapped_yaw)]))
+            slots.append(np.column_stack([x, y, np.full(len(along), wrapped_yaw)]))
     return np.concatenate(slots)

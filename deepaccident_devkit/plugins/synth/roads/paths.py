@@ -1,4 +1,4 @@
-"""Smooth paths to drive or walk on, as dense samples, and the points where two of them meet.
+"""Smooth paths to drive or walk on, as dense samples, and the points where two paths cross.
 
 A turn by a right angle is a clothoid, an arc and a clothoid, all of the same length.
 """
@@ -22,9 +22,9 @@ from deepaccident_devkit.support.arrays import (
 
 SPACING = 0.1
 """The largest distance between samples, metres."""
-# The search for the nearest sample starts with every nth sample.
+# Step from sample to sample in the first search for the nearest sample.
 _COARSE_STEP = 10
-# The comparison of two paths starts with every nth sample.
+# Step from sample to sample in the first comparison of two paths.
 _STRIDE = 4
 # Paths that stay nearer than this join.
 _JOINING_DISTANCE_M = 0.5
@@ -33,10 +33,10 @@ _MIN_SHRINK_FACTOR = 0.2
 _GAUSS_POINTS = np.polynomial.legendre.leggauss(3)
 # The angle that the arc of a turn turns, radians; the two clothoids together turn as much.
 _ARC_ANGLE = np.pi / 4
-# The radius at which the shape of a turn is measured, finely sampled.
+# A turn's shape is measured at this radius, where it has many samples.
 _REFERENCE_RADIUS_M = 100.0
 Piece = tuple[float, float, float]
-"""A piece for `bent`: length, curvature at the start and at the end."""
+"""A piece for `join_pieces`: length (metres), curvature (1/m) at its start and at its end."""
 
 
 class Meeting(NamedTuple):
@@ -65,11 +65,11 @@ class Path(FrozenArrays):
     s: FloatArray
 
     def __post_init__(self) -> None:
-        """Check the shapes; raises GeometryError."""
+        """Check the shapes; raise GeometryError if one is wrong."""
         xy = checked("Path.xy", self.xy, (None, 2))
         if len(xy) < 2:
             raise GeometryError(
-                f"Path.xy: expected two samples or more, found {len(xy)}; "
+                f"Path.xy: expected at least two samples, found {len(xy)}; "
                 "sample the path more densely"
             )
         object.__setattr__(self, "xy", readonly(xy))
@@ -95,11 +95,14 @@ class Path(FrozenArrays):
         """
         distances = np.asarray(s, dtype=np.float64)
         on_path = np.clip(distances, 0.0, self.length)
-        beyond = distances - on_path
+        overshoot = distances - on_path
         yaw = np.interp(on_path, self.s, self.yaw)
-        x = np.interp(on_path, self.s, self.xy[:, 0]) + np.cos(yaw) * beyond
-        y = np.interp(on_path, self.s, self.xy[:, 1]) + np.sin(yaw) * beyond
-        curvature = np.where(beyond == 0, np.interp(on_path, self.s, self.curvature), 0.0)
+        last_x = np.interp(on_path, self.s, self.xy[:, 0])
+        last_y = np.interp(on_path, self.s, self.xy[:, 1])
+        x = last_x + np.cos(yaw) * overshoot
+        y = last_y + np.sin(yaw) * overshoot
+        last_curvature = np.interp(on_path, self.s, self.curvature)
+        curvature = np.where(overshoot == 0, last_curvature, 0.0)
         return x, y, yaw, curvature
 
     def project(self, xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -111,23 +114,18 @@ class Path(FrozenArrays):
             Distances along the path and to its left, shape (N,) each, metres.
         """
         points = np.atleast_2d(np.asarray(xy, dtype=np.float64))
-        sample = self._nearest(points)
-        delta = points - self.xy[sample]
-        cos = np.cos(self.yaw[sample])
-        sin = np.sin(self.yaw[sample])
-        dx = delta[:, 0]
-        dy = delta[:, 1]
-        ahead = cos * dx + sin * dy
-        lateral = cos * dy - sin * dx
+        sample = self._nearest_samples(points)
+        offsets = points - self.xy[sample]
+        ahead, lateral = ahead_and_left(offsets[:, 0], offsets[:, 1], self.yaw[sample])
         before_start = (sample == 0) & (ahead < 0)
         after_end = (sample == len(self.s) - 1) & (ahead > 0)
-        bend = np.where(before_start | after_end, 0.0, self.curvature[sample])
-        lateral = lateral - bend * ahead**2 / 2
-        shrink_factor = np.maximum(1 - bend * lateral, _MIN_SHRINK_FACTOR)
+        curvature = np.where(before_start | after_end, 0.0, self.curvature[sample])
+        lateral = lateral - curvature * ahead**2 / 2
+        shrink_factor = np.maximum(1 - curvature * lateral, _MIN_SHRINK_FACTOR)
         return self.s[sample] + ahead / shrink_factor, lateral
 
     def reversed(self) -> "Path":
-        """Return the same path in the other direction."""
+        """Return the same path in the opposite direction."""
         return Path(
             xy=self.xy[::-1],
             yaw=self.yaw[::-1] + np.pi,
@@ -135,17 +133,37 @@ class Path(FrozenArrays):
             s=self.length - self.s[::-1],
         )
 
-    def _nearest(self, points: FloatArray) -> IntArray:
-        """Return the index (N,) of the sample nearest to each point.
+    def _nearest_samples(self, points: FloatArray) -> IntArray:
+        """Return the index (N,) of the sample nearest to each point (N, 2).
 
-        It is first sought among a few samples, then around the nearest of them.
+        Each is first sought among every tenth sample, then around the nearest of these.
         """
-        coarse_distances = _squares(points, self.xy[::_COARSE_STEP])
+        coarse_distances = _compute_square_distances(points, self.xy[::_COARSE_STEP])
         middle = _COARSE_STEP * coarse_distances.argmin(axis=1)
-        offsets = np.arange(-_COARSE_STEP, _COARSE_STEP + 1)
-        window = np.clip(middle[:, None] + offsets, 0, len(self.xy) - 1)
-        distances = ((points[:, None] - self.xy[window]) ** 2).sum(axis=2)
-        return np.asarray(window[np.arange(len(points)), distances.argmin(axis=1)])
+        steps = np.arange(-_COARSE_STEP, _COARSE_STEP + 1)
+        candidates = np.clip(middle[:, None] + steps, 0, len(self.xy) - 1)
+        offsets = points[:, None] - self.xy[candidates]
+        nearest_rows = (offsets**2).sum(axis=2).argmin(axis=1)
+        return np.asarray(candidates[np.arange(len(points)), nearest_rows])
+
+
+def ahead_and_left(
+    dx: FloatArray, dy: FloatArray, yaw: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Split offsets into their parts ahead and to the left of a heading.
+
+    All arguments broadcast.
+
+    Args:
+        dx: Offsets in x, metres.
+        dy: Offsets in y, metres.
+        yaw: Headings, radians.
+    """
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    ahead = cos * dx + sin * dy
+    lateral = cos * dy - sin * dx
+    return ahead, lateral
 
 
 def crossing(path_a: Path, path_b: Path, *, within: float = _JOINING_DISTANCE_M) -> Meeting | None:
@@ -157,18 +175,27 @@ def crossing(path_a: Path, path_b: Path, *, within: float = _JOINING_DISTANCE_M)
     Returns:
         None if they never meet.
     """
-    s_a = _first_meeting(path_a, path_b, within)
-    s_b = _first_meeting(path_b, path_a, within)
-    return None if s_a is None or s_b is None else Meeting(s_a, s_b)
+    s_a = _find_first_meeting(path_a, path_b, within)
+    s_b = _find_first_meeting(path_b, path_a, within)
+    if s_a is None or s_b is None:
+        return None
+    return Meeting(s_a, s_b)
 
 
 def straight(start: tuple[float, float], yaw: float, length: float) -> Path:
-    """Return a straight path from a point, metres and radians."""
-    return bent(start, yaw, [(length, 0.0, 0.0)])
+    """Return a straight path.
+
+    Args:
+        start: x and y of the start, metres.
+        yaw: Direction of travel, radians.
+        length: Length, metres.
+    """
+    piece = (length, 0.0, 0.0)
+    return join_pieces(start, yaw, [piece])
 
 
-def bent(start: tuple[float, float], yaw: float, pieces: list[Piece]) -> Path:
-    """Return a path of pieces: lines, arcs and clothoids.
+def join_pieces(start: tuple[float, float], yaw: float, pieces: list[Piece]) -> Path:
+    """Return a path made of lines, arcs and clothoids, one after the other.
 
     The curvature changes evenly along each piece. Position and yaw have no jumps.
 
@@ -177,75 +204,85 @@ def bent(start: tuple[float, float], yaw: float, pieces: list[Piece]) -> Path:
         yaw: Direction at the start, radians.
         pieces: Length (metres) and the curvature (1/m) at the start and at the end of each piece.
     """
-    lengths = np.array([piece[0] for piece in pieces])
-    start_curvature = np.array([piece[1] for piece in pieces])
-    end_curvature = np.array([piece[2] for piece in pieces])
+    lengths, start_curvature, end_curvature = np.array(pieces).T
     joints = np.concatenate([[0.0], np.cumsum(lengths)])
     s = even_steps(joints[-1])
-    slope = (end_curvature - start_curvature) / lengths
-    turns = lengths * (start_curvature + end_curvature) / 2
-    turned = np.concatenate([[0.0], np.cumsum(turns)])
+    curvature_slope = (end_curvature - start_curvature) / lengths
+    piece_turns = lengths * (start_curvature + end_curvature) / 2
+    turn_before_piece = np.concatenate([[0.0], np.cumsum(piece_turns)])
 
-    def yaw_and_curvature(at: FloatArray) -> tuple[FloatArray, FloatArray]:
-        piece = np.clip(np.searchsorted(joints, at, side="right") - 1, 0, len(pieces) - 1)
-        into = at - joints[piece]
-        curvature = start_curvature[piece] + slope[piece] * into
-        turn = turned[piece]
-        return yaw + turn + into * (start_curvature[piece] + curvature) / 2, curvature
+    def yaw_and_curvature(distances: FloatArray) -> tuple[FloatArray, FloatArray]:
+        next_joint = np.searchsorted(joints, distances, side="right")
+        piece = np.clip(next_joint - 1, 0, len(pieces) - 1)
+        into_piece = distances - joints[piece]
+        curvature = start_curvature[piece] + curvature_slope[piece] * into_piece
+        turn_in_piece = into_piece * (start_curvature[piece] + curvature) / 2
+        return yaw + turn_before_piece[piece] + turn_in_piece, curvature
 
     nodes, weights = _GAUSS_POINTS
     step = s[1] - s[0]
     node_yaw, _ = yaw_and_curvature(s[:-1, None] + step * (nodes + 1) / 2)
     mean_directions = np.stack([np.cos(node_yaw) @ weights, np.sin(node_yaw) @ weights], axis=1)
     moves = mean_directions * step / 2
-    xy = np.array(start) + np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
+    positions = np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)])
     sample_yaw, curvature = yaw_and_curvature(s)
-    return Path(xy=xy, yaw=sample_yaw, curvature=curvature, s=s)
+    return Path(xy=np.array(start) + positions, yaw=sample_yaw, curvature=curvature, s=s)
 
 
 def lane_change(path: Path, start: float, length: float, offset: float) -> Path:
-    """Return a path that is shifted sideways from `start + length` on, without jumps.
+    """Return a path that changes to another lane, without jumps.
 
     Args:
         path: The path before the change.
         start: Distance along it at which the change begins, metres.
         length: Length of the change, metres.
-        offset: Sideways shift, metres, positive to the left.
+        offset: Sideways shift after the change, metres, positive to the left.
     """
     share = np.clip((path.s - start) / length, 0.0, 1.0)
     shift = offset * share**3 * (10 - 15 * share + 6 * share**2)
+    return shift_path(path, shift)
+
+
+def shift_path(path: Path, offset: float | FloatArray) -> Path:
+    """Return a path that is shifted to the left.
+
+    Args:
+        path: The path.
+        offset: Shift, metres; one for all samples, or one for each, shape (N,).
+    """
     left = np.column_stack([-np.sin(path.yaw), np.cos(path.yaw)])
-    return through(path.xy + shift[:, None] * left)
+    shift = np.reshape(offset, (-1, 1)) * left
+    return path_through(path.xy + shift)
 
 
-def through(points: ArrayLike) -> Path:
-    """Return a path through dense points (N, 2), metres.
+def path_through(points: ArrayLike) -> Path:
+    """Return the path through dense points (N, 2), metres.
 
-    The points must be smooth: yaw and curvature are their differences.
+    The points must be smooth, because yaw and curvature come from their differences.
     """
     xy = checked("points", points, (None, 2))
     if len(xy) < 3:
         raise GeometryError(
-            f"points: expected three points or more, found {len(xy)}; sample the way more densely"
+            f"points: expected at least three points, found {len(xy)}; sample the way more densely"
         )
     step_lengths = np.hypot(*np.diff(xy, axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(step_lengths)])
     direction = np.gradient(xy, along, axis=0, edge_order=2)
-    yaw = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
-    curvature = np.gradient(yaw, along, edge_order=2)
+    point_yaw = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
+    point_curvature = np.gradient(point_yaw, along, edge_order=2)
     s = even_steps(along[-1])
-    columns = (xy[:, 0], xy[:, 1], yaw, curvature)
+    columns = (xy[:, 0], xy[:, 1], point_yaw, point_curvature)
     x, y, yaw, curvature = (np.interp(s, along, column) for column in columns)
     return Path(xy=np.column_stack([x, y]), yaw=yaw, curvature=curvature, s=s)
 
 
 def even_steps(length: float) -> FloatArray:
-    """Return distances from 0 to `length` (metres), in equal steps of at most `SPACING`."""
+    """Return distances from 0 to `length`, metres, in equal steps of at most `SPACING`."""
     num_steps = int(np.ceil(length / SPACING - 1e-9))
     return np.linspace(0.0, length, max(num_steps, 1) + 1)
 
 
-def _first_meeting(path: Path, other: Path, within: float) -> float | None:
+def _find_first_meeting(path: Path, other: Path, within: float) -> float | None:
     """Find where `path` first meets `other`, metres along it.
 
     Returns:
@@ -254,65 +291,69 @@ def _first_meeting(path: Path, other: Path, within: float) -> float | None:
     """
     last_row = len(path.s) - 1
     coarse_rows = np.append(np.arange(0, last_row, _STRIDE), last_row)
-    near_rows = coarse_rows[_near(path.xy[coarse_rows], other, within)]
+    near_rows = coarse_rows[_mark_near(path.xy[coarse_rows], other, within)]
     if not len(near_rows):
         return None
     gaps = np.flatnonzero(np.diff(near_rows) > _STRIDE)
-    begin = int(near_rows[0])
-    end = int(near_rows[gaps[0]] if len(gaps) else near_rows[-1])
-    window = np.arange(max(begin - _STRIDE, 0), min(end + _STRIDE, last_row) + 1)
-    if end == last_row:
+    first_row = int(near_rows[0])
+    end_row = near_rows[gaps[0]] if len(gaps) else near_rows[-1]
+    window_start = max(first_row - _STRIDE, 0)
+    window = np.arange(window_start, min(end_row + _STRIDE, last_row) + 1)
+    if end_row == last_row:
         window = window[: 2 * _STRIDE + 1]
-        is_near = _near(path.xy[window], other, within)
+        is_near = _mark_near(path.xy[window], other, within)
         return float(path.s[window[is_near][0]])
     _, lateral = other.project(path.xy[window])
     sign_changes = np.flatnonzero(lateral[:-1] * lateral[1:] < 0)
     if not len(sign_changes):
-        return float(path.s[window[np.abs(lateral).argmin()]])
-    before = int(sign_changes[0])
+        nearest_index = np.abs(lateral).argmin()
+        return float(path.s[window[nearest_index]])
+    before = sign_changes[0]
     share = lateral[before] / (lateral[before] - lateral[before + 1])
-    return float(path.s[window[before]] + share * (path.s[1] - path.s[0]))
+    step = path.s[1] - path.s[0]
+    return float(path.s[window[before]] + share * step)
 
 
-def _near(points: FloatArray, path: Path, within: float) -> BoolArray:
+def _mark_near(points: FloatArray, path: Path, within: float) -> BoolArray:
     """Mark the points (N, 2) that are nearer to the path than `within`, metres."""
-    reach = within + _COARSE_STEP * SPACING
-    coarse_distances = _squares(points, path.xy[::_COARSE_STEP])
-    mask = np.asarray(coarse_distances.min(axis=1) < reach**2)
-    _, lateral = path.project(points[mask])
-    mask[mask] = np.abs(lateral) <= within
-    return mask
+    coarse_distances = _compute_square_distances(points, path.xy[::_COARSE_STEP])
+    search_radius = within + _COARSE_STEP * SPACING
+    is_near = np.asarray(coarse_distances.min(axis=1) < search_radius**2)
+    _, lateral = path.project(points[is_near])
+    is_near[is_near] = np.abs(lateral) <= within
+    return is_near
 
 
-def _squares(points: FloatArray, others: FloatArray) -> FloatArray:
-    """Return squared distances (N, M) from points (N, 2) to other points (M, 2)."""
+def _compute_square_distances(points: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the squared distances (N, M) from points (N, 2) to other points (M, 2)."""
     x_offsets = points[:, None, 0] - others[:, 0]
     y_offsets = points[:, None, 1] - others[:, 1]
     return np.asarray(x_offsets**2 + y_offsets**2)
 
 
 def quarter_turn(tangent: float, *, left: bool) -> list[Piece]:
-    """Return pieces that turn by a right angle.
+    """Return the pieces of a turn by a right angle.
 
-    The turn takes `tangent` metres before and after the crossing of the two lines.
+    The turn begins `tangent` metres before the crossing of the two lines, and ends as far after it.
     """
-    unit_tangent, _ = _unit_turn()
-    return _pieces(tangent / unit_tangent, 1.0 if left else -1.0)
+    unit_tangent, _ = _measure_unit_turn()
+    sign = 1.0 if left else -1.0
+    return _make_turn_pieces(tangent / unit_tangent, sign)
 
 
 def tangent_of_radius(radius: float) -> float:
-    """Return the tangent of a turn by the radius of its arc, metres."""
-    unit_tangent, _ = _unit_turn()
+    """Return the tangent of a turn for the radius of its arc, metres."""
+    unit_tangent, _ = _measure_unit_turn()
     return radius * unit_tangent
 
 
 def tangent_of_corner(distance: float) -> float:
-    """Return the tangent of a turn with its middle at a distance from the crossing of the lines."""
-    unit_tangent, unit_distance = _unit_turn()
+    """Return the tangent of a turn for its distance from the crossing of its lines, metres."""
+    unit_tangent, unit_distance = _measure_unit_turn()
     return distance * unit_tangent / unit_distance
 
 
-def _pieces(radius: float, sign: float) -> list[Piece]:
+def _make_turn_pieces(radius: float, sign: float) -> list[Piece]:
     """Return the pieces of a turn; the sign is positive to the left."""
     length = _ARC_ANGLE * radius
     curvature = sign / radius
@@ -320,9 +361,10 @@ def _pieces(radius: float, sign: float) -> list[Piece]:
 
 
 @lru_cache(maxsize=1)
-def _unit_turn() -> tuple[float, float]:
-    """Return the tangent, and the distance from the lines' crossing to the turn, at radius 1."""
-    turn = bent((0.0, 0.0), 0.0, _pieces(_REFERENCE_RADIUS_M, 1.0))
+def _measure_unit_turn() -> tuple[float, float]:
+    """Return the tangent of a turn of radius 1, and its distance from the crossing of its lines."""
+    pieces = _make_turn_pieces(_REFERENCE_RADIUS_M, 1.0)
+    turn = join_pieces((0.0, 0.0), 0.0, pieces)
     xy = turn.xy / _REFERENCE_RADIUS_M
     tangent = float(xy[-1, 0])
     distances = np.hypot(xy[:, 0] - tangent, xy[:, 1])

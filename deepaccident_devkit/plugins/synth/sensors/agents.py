@@ -16,14 +16,14 @@ from deepaccident_devkit.release import Calib
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, VEHICLE_AGENTS, AgentName
 
-# The pole's cameras are placed as on a vehicle of this length and width (metres) with the x and y
-# axes exchanged.
+# Length and width of a vehicle, metres. The pole's cameras are placed as on this vehicle, with the
+# x and y axes exchanged.
 POLE_LENGTH, POLE_WIDTH = 4.9373, 8.9666
 _CAMERA_YAW = dict(
     zip(CAMERAS, np.deg2rad([0.0, 55.0, -55.0, 180.0, 110.0, -110.0]).tolist(), strict=True)
 )
-# Position of each camera on the box, along and across: 1 front or left, −1 back or right, 0 neither
-# of them.
+# Position of each camera on the box, along and across it: 1 is the front or the left, −1 the back
+# or the right, 0 the middle.
 _CAMERA_SIDES = dict(
     zip(CAMERAS, ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)), strict=True)
 )
@@ -41,14 +41,14 @@ class Mount:
         above_roof: Height of its LiDAR above its label box, which stands on the road, metres.
         below_lidar: Distance of its cameras below its LiDAR, metres; the pole's cameras are as high
             as its LiDAR.
-        field_of_view: Field of view of all cameras but the rear one, degrees.
-        backwards: Field of view of the rear camera, degrees.
+        field_of_view: Field of view of all cameras except the rear one, degrees.
+        rear_field_of_view: Field of view of the rear camera, degrees.
     """
 
     above_roof: float
     below_lidar: float
     field_of_view: float
-    backwards: float
+    rear_field_of_view: float
 
 
 MOUNTS: Mapping[RigName, Mount] = {
@@ -79,11 +79,11 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Agent:
-    """An agent, as the one that records.
+    """An agent with its sensors.
 
     Attributes:
         name: One of `taxonomy.AGENTS`.
-        row: Row of its own actor; None for the pole.
+        row: Row of its actor; None for the pole.
         box_from_ego: Transform from the ego frame to the frame of its own box, with the origin on
             the road; for the pole, `ground_from_ego`.
         ego_from_lidar: Pose of the LiDAR on the agent.
@@ -104,7 +104,8 @@ class Agent:
 
     def ground_from_lidar(self, scene: Scene) -> SE3:
         """Return the LiDAR's pose at a moment."""
-        return self.ground_from_ego(scene) @ self.ego_from_lidar
+        ground_from_ego = self.ground_from_ego(scene)
+        return ground_from_ego @ self.ego_from_lidar
 
     def calib(self, world_from_ego: SE3) -> Calib:
         """Return the calib of one frame."""
@@ -135,48 +136,57 @@ def make_agents(
     agents = []
     for name in VEHICLE_AGENTS:
         row = actors.row_of(ids[name])
-        agents.append(_vehicle(name, row, actors.all[row], image_size, mount))
+        agents.append(_make_vehicle(name, row, actors.all[row], image_size, mount))
     pole = Agent(
         name=INFRASTRUCTURE,
         row=None,
         box_from_ego=world.lidar_pole,
         ego_from_lidar=SE3.identity(),
-        cameras=_cameras(_pole_positions(), 0.0, image_size, mount),
+        cameras=_make_cameras(_place_pole_cameras(), 0.0, image_size, mount),
     )
     return (*agents, pole)
 
 
-def _vehicle(
+def _make_vehicle(
     name: AgentName, row: int, actor: Actor, image_size: tuple[int, int], mount: Mount
 ) -> Agent:
-    """Make the agent of a vehicle."""
+    """Make the agent of a vehicle.
+
+    Args:
+        name: Name of the agent.
+        row: Row of the agent's actor.
+        actor: The agent's actor.
+        image_size: Width and height of images, pixels.
+        mount: Mounting of the sensors.
+    """
     x, y = actor.origin
     lidar_height = actor.size[2] + mount.above_roof
+    no_rotation = np.eye(3)
     return Agent(
         name=name,
         row=row,
-        box_from_ego=SE3.from_rotation(np.eye(3), (x, y, 0.0)),
-        ego_from_lidar=SE3.from_rotation(np.eye(3), (0.0, 0.0, lidar_height)),
-        cameras=_cameras(_vehicle_positions(actor), -mount.below_lidar, image_size, mount),
+        box_from_ego=SE3.from_rotation(no_rotation, (x, y, 0.0)),
+        ego_from_lidar=SE3.from_rotation(no_rotation, (0.0, 0.0, lidar_height)),
+        cameras=_make_cameras(_place_vehicle_cameras(actor), -mount.below_lidar, image_size, mount),
     )
 
 
-def _vehicle_positions(actor: Actor) -> dict[str, tuple[float, float]]:
+def _place_vehicle_cameras(actor: Actor) -> dict[str, tuple[float, float]]:
     """Return x, y of each camera in the LiDAR frame, metres.
 
     They are in the middle of the box's front and back, and at its corners.
     """
     length, width, _ = actor.size
     x, y = actor.origin
-    ahead = length / 2 + _HULL_CLEARANCE_M
-    aside = width / 2 + _HULL_CLEARANCE_M
+    half_length = length / 2 + _HULL_CLEARANCE_M
+    half_width = width / 2 + _HULL_CLEARANCE_M
     positions = {}
     for camera, (along, across) in _CAMERA_SIDES.items():
-        positions[camera] = (along * ahead - x, across * aside - y)
+        positions[camera] = (along * half_length - x, across * half_width - y)
     return positions
 
 
-def _pole_positions() -> dict[str, tuple[float, float]]:
+def _place_pole_cameras() -> dict[str, tuple[float, float]]:
     """Return x, y of each camera of the pole in the LiDAR frame, metres."""
     positions = {}
     for camera, (along, across) in _CAMERA_SIDES.items():
@@ -184,13 +194,13 @@ def _pole_positions() -> dict[str, tuple[float, float]]:
     return positions
 
 
-def _cameras(
+def _make_cameras(
     positions: dict[str, tuple[float, float]],
     height: float,
     image_size: tuple[int, int],
     mount: Mount,
 ) -> tuple[Camera, ...]:
-    """Make all cameras.
+    """Make all cameras of an agent.
 
     Args:
         positions: x, y of each camera in the LiDAR frame, metres.
@@ -198,17 +208,14 @@ def _cameras(
         image_size: Width and height of images, pixels.
         mount: Mounting of the sensors.
     """
-    fields_of_view = dict.fromkeys(CAMERAS, mount.field_of_view) | {"Camera_Back": mount.backwards}
     cameras = []
     for channel, (x, y) in positions.items():
         lidar_from_forward = SE3.from_yaw(_CAMERA_YAW[channel], (x, y, height))
-        field_of_view = float(np.deg2rad(fields_of_view[channel]))
-        camera = Camera(
-            channel,
-            _OPTICAL_FROM_FORWARD @ lidar_from_forward.inverse(),
-            PinholeCamera.from_field_of_view(*image_size, field_of_view),
-        )
-        cameras.append(camera)
+        camera_from_lidar = _OPTICAL_FROM_FORWARD @ lidar_from_forward.inverse()
+        degrees = mount.rear_field_of_view if channel == "Camera_Back" else mount.field_of_view
+        field_of_view = float(np.deg2rad(degrees))
+        optics = PinholeCamera.from_field_of_view(*image_size, field_of_view)
+        cameras.append(Camera(channel, camera_from_lidar, optics))
     return tuple(cameras)
 
 
@@ -224,31 +231,33 @@ def with_single_precision(calib: Calib) -> Calib:
     world_from_lidar = calib.world_from_ego.matrix @ calib.ego_from_lidar.matrix
     camera_matrices = [pose.matrix for pose in calib.camera_from_lidar.values()]
     lidar_from_camera = np.linalg.inv(np.stack(camera_matrices))
-    single_world_from_ego = _single(calib.world_from_ego.matrix)
-    single_world_from_lidar = _single(_by_quaternion(world_from_lidar))
-    camera_from_world = np.linalg.inv(_single(world_from_lidar @ lidar_from_camera))
-    camera_from_lidar = camera_from_world @ single_world_from_lidar
-    poses = [trusted_se3(pose) for pose in camera_from_lidar]
+    single_world_from_ego = _round_to_single(calib.world_from_ego.matrix)
+    single_world_from_lidar = _round_to_single(_convert_by_quaternion(world_from_lidar))
+    single_world_from_camera = _round_to_single(world_from_lidar @ lidar_from_camera)
+    camera_from_lidar = np.linalg.inv(single_world_from_camera) @ single_world_from_lidar
+    camera_poses = [trusted_se3(pose) for pose in camera_from_lidar]
     ego_from_lidar = np.linalg.inv(single_world_from_ego) @ single_world_from_lidar
     return Calib(
         ego_from_lidar=trusted_se3(ego_from_lidar),
         world_from_ego=trusted_se3(single_world_from_ego),
-        camera_from_lidar=dict(zip(calib.camera_from_lidar, poses, strict=True)),
+        camera_from_lidar=dict(zip(calib.camera_from_lidar, camera_poses, strict=True)),
         intrinsic=calib.intrinsic,
     )
 
 
-def _single(matrices: FloatArray) -> FloatArray:
+def _round_to_single(matrices: FloatArray) -> FloatArray:
     """Round matrices to single precision."""
-    return matrices.astype(np.float32).astype(np.float64)
+    single = matrices.astype(np.float32)
+    return single.astype(np.float64)
 
 
-def _by_quaternion(matrix: FloatArray) -> FloatArray:
+def _convert_by_quaternion(pose: FloatArray) -> FloatArray:
     """Convert the rotation of a pose (4, 4) to a quaternion of single precision and back.
 
-    It differs a little then.
+    The rotation changes slightly, as in the release.
     """
-    converted = matrix.copy()
-    quaternion = _single(quaternions.from_matrix(matrix[:3, :3]))
+    converted = pose.copy()
+    exact_quaternion = quaternions.from_matrix(pose[:3, :3])
+    quaternion = _round_to_single(exact_quaternion)
     converted[:3, :3] = quaternions.to_matrix(quaternion)
     return converted

@@ -1,8 +1,8 @@
-"""Labels: the label file of an agent for a scene, and the road users that its cameras see.
+"""The labels of an agent for a scene, and the road users that its cameras see.
 
-The result depends neither on the size of the images nor on whether images are made. For every road
-user, rays through the pixels of a `WIDTH` × `HEIGHT` picture are cast; if it fills much of the
-picture, through fewer of them.
+The result depends neither on the size of the images nor on whether images are made. Rays are cast
+through the pixels of a `WIDTH` × `HEIGHT` picture that may show a road user; if it fills much of
+the picture, through only some of them.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from deepaccident_devkit.support.arrays import BoolArray, Float32Array, FloatArr
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 CLOSE = 0.05
-"""Corners that are at least this far ahead of the camera are projected, metres."""
+"""Distance ahead of the camera from which on corners are projected, metres."""
 # The pairs of corners that are the edges of a box.
 _EDGES = np.array(
     [
@@ -36,18 +36,18 @@ _RECTANGLE_MARGIN_PIXELS = 1.0
 WIDTH, HEIGHT = 400, 225
 MIN_PIXELS = 2
 """Smallest number of pixels of a visible road user."""
-# Largest number of rays to a road user, across and also down, and that number in the first attempt.
+# Largest number of rays to a road user, across and also down; and the same in the first attempt.
 _RAYS_ACROSS = 14
 _RAYS_ACROSS_FIRST = 4
 LABEL_RANGE = 120.0
 """Range of annotations: distance over the ground from the LiDAR to the box's centre, metres."""
 TRACKING_RANGE = 115.0
-"""Actors farther away than this have no id, metres."""
-# Points are counted in the boxes of a moment this long after the point cloud, when other actors
-# have already moved on.
+"""Distance up to which actors have an id, metres."""
+# Time from the point cloud to the moment of the boxes in which its points are counted. By then,
+# other actors have moved on.
 COUNT_DELAY_S = 0.003
-# Largest distance that they have moved on: more would be too wrong for a fast actor with only its
-# back in view.
+# Largest distance that the actors have moved on. More would be too wrong for a fast actor with only
+# its back in view.
 MAX_COUNT_OFFSET_M = 0.012
 _PEDESTRIAN = CATEGORIES.index("pedestrian")
 
@@ -69,35 +69,44 @@ def rectangles(
         Smallest and largest column and row, shape (A, 2) each.
     """
     depth = corners[..., 2]
-    tangents = corners[..., :2] / np.maximum(corners[..., 2:], CLOSE)
-    low, high = _spans(tangents, depth >= CLOSE)
+    is_ahead = depth >= CLOSE
+    low, high = _find_extents(_compute_slopes(corners), is_ahead)
     partly_ahead = (depth.min(axis=1) < CLOSE) & (depth.max(axis=1) > CLOSE)
     rows = np.flatnonzero(partly_ahead)
     if len(rows):
-        cut, crosses = _cut_edges(corners[rows])
-        points = np.concatenate([corners[rows], cut], axis=1)
-        is_ahead = np.concatenate([depth[rows] >= CLOSE, crosses], axis=1)
-        tangents = points[..., :2] / np.maximum(points[..., 2:], CLOSE)
-        low[rows], high[rows] = _spans(tangents, is_ahead)
+        cuts, is_cut = _cut_edges(corners[rows])
+        points = np.concatenate([corners[rows], cuts], axis=1)
+        is_counted = np.concatenate([is_ahead[rows], is_cut], axis=1)
+        low[rows], high[rows] = _find_extents(_compute_slopes(points), is_counted)
     middle = np.array(size) / 2
     return low / slope + middle, high / slope + middle
 
 
-def _spans(points: FloatArray, counted: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _compute_slopes(points: FloatArray) -> FloatArray:
+    """Return the slopes to the right and down of the rays to points (…, 3) in the optical frame.
+
+    Points nearer than `CLOSE` count as that far ahead.
+    """
+    depth = np.maximum(points[..., 2:], CLOSE)
+    slopes: FloatArray = points[..., :2] / depth
+    return slopes
+
+
+def _find_extents(points: FloatArray, is_counted: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return the smallest and largest coordinates of counted points.
 
     Args:
         points: Points, shape (A, K, 2).
-        counted: Truth values, shape (A, K).
+        is_counted: Whether each point is counted, shape (A, K), bool.
 
     Returns:
         Coordinates (A, 2) each; 0 if no point is counted.
     """
-    low = np.where(counted[..., None], points, np.inf).min(axis=1)
-    high = np.where(counted[..., None], points, -np.inf).max(axis=1)
-    empty = ~counted.any(axis=1)
-    low[empty] = 0
-    high[empty] = 0
+    low = np.where(is_counted[..., None], points, np.inf).min(axis=1)
+    high = np.where(is_counted[..., None], points, -np.inf).max(axis=1)
+    is_empty = ~is_counted.any(axis=1)
+    low[is_empty] = 0
+    high[is_empty] = 0
     return low, high
 
 
@@ -111,12 +120,12 @@ def _cut_edges(corners: FloatArray) -> tuple[FloatArray, BoolArray]:
     ends = corners[:, _EDGES[:, 1]]
     start_depth = starts[..., 2]
     end_depth = ends[..., 2]
-    crosses = (start_depth < CLOSE) != (end_depth < CLOSE)
-    depth_change = np.where(crosses, end_depth - start_depth, 1.0)
+    is_cut = (start_depth < CLOSE) != (end_depth < CLOSE)
+    depth_change = np.where(is_cut, end_depth - start_depth, 1.0)
     share = (CLOSE - start_depth) / depth_change
-    cut = starts + share[..., None] * (ends - starts)
-    cut[..., 2] = CLOSE
-    return cut, crosses
+    cuts = starts + share[..., None] * (ends - starts)
+    cuts[..., 2] = CLOSE
+    return cuts, is_cut
 
 
 def nearest_movers(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Float32Array:
@@ -131,11 +140,12 @@ def nearest_movers(scene: Scene, camera: Camera, ground_from_camera: SE3) -> Flo
     slope = np.full(2, 1 / optics.intrinsic[0, 0])
     optical_corners = (corners - ground_from_camera.translation) @ ground_from_camera.rotation
     low, high = rectangles(optical_corners, slope, (optics.width, optics.height))
-    nearest = np.full((optics.height + 2, optics.width + 2), np.inf, dtype=np.float32)
-    ends = (optics.width + 2, optics.height + 2)
-    first_pixels = np.floor(low - _RECTANGLE_MARGIN_PIXELS).clip(0, ends).astype(int).tolist()
-    end_pixels = np.ceil(high + _RECTANGLE_MARGIN_PIXELS + 2).clip(0, ends).astype(int).tolist()
-    depth = (optical_corners[:, :, 2].min(axis=1) - CLOSE).astype(np.float32)
+    size = (optics.width + 2, optics.height + 2)
+    nearest = np.full(size[::-1], np.inf, dtype=np.float32)
+    first_pixels = np.floor(low - _RECTANGLE_MARGIN_PIXELS).clip(0, size).astype(int).tolist()
+    end_pixels = np.ceil(high + _RECTANGLE_MARGIN_PIXELS + 2).clip(0, size).astype(int).tolist()
+    min_depth = optical_corners[:, :, 2].min(axis=1) - CLOSE
+    depth = min_depth.astype(np.float32)
     for row in np.flatnonzero((high > low).all(axis=1)).tolist():
         left, top = first_pixels[row]
         right, bottom = end_pixels[row]
@@ -150,7 +160,7 @@ class _Windows:
 
     Attributes:
         camera: Row of the camera, shape (W,).
-        actor: Row of the road user among the rows in question, shape (W,).
+        actor: Index of the road user in `CameraViews`' rows, shape (W,).
         first: Column and row of the upper left pixel, shape (W, 2).
         size: Pixels across and down, shape (W, 2).
     """
@@ -162,11 +172,12 @@ class _Windows:
 
     def select(self, mask: BoolArray) -> "_Windows":
         """Return the rectangles of a mask (W,)."""
-        return _Windows(self.camera[mask], self.actor[mask], self.first[mask], self.size[mask])
+        columns = [getattr(self, name)[mask] for name in _Windows.__slots__]
+        return _Windows(*columns)
 
 
 class CameraViews:
-    """The views of C cameras of K road users at a moment.
+    """The views that C cameras have of K road users at a moment.
 
     Args:
         scene: The scene.
@@ -181,18 +192,17 @@ class CameraViews:
         matrices = np.stack([pose.matrix for pose in poses])
         self._axes = matrices[:, :3, :3]
         self._origins = matrices[:, :3, 3]
-        self._slopes = np.stack([_slope(camera) for camera in cameras])
+        self._slopes = np.stack([_compute_pixel_slope(camera) for camera in cameras])
         self._scene = scene
         self._rows = rows
         offsets = scene.box_corners[rows] - self._origins[:, None, None]
-        self._windows = _windows(offsets @ self._axes[:, None], self._slopes)
+        self._windows = _find_windows(offsets @ self._axes[:, None], self._slopes)
 
     def pixels(self, mask: BoolArray | None = None, *, rays_across: int = _RAYS_ACROSS) -> IntArray:
         """Count the pixels of a `WIDTH` × `HEIGHT` picture that show each road user.
 
         Args:
-            mask: Truth values, shape (K,): the road users to count; the others have 0. None for
-                all.
+            mask: Which road users to count, shape (K,), bool; the others get 0. None for all.
             rays_across: Largest number of rays to each road user, across and also down.
 
         Returns:
@@ -201,11 +211,12 @@ class CameraViews:
         windows = self._windows
         if mask is not None:
             windows = windows.select(mask[windows.actor])
-        pixel, window, step = _pixels(windows, rays_across)
+        pixel, window, step = _choose_pixels(windows, rays_across)
         camera = windows.camera[window]
-        tangents = (pixel + 0.5 - (WIDTH / 2, HEIGHT / 2)) * self._slopes[camera]
+        from_middle = pixel + 0.5 - (WIDTH / 2, HEIGHT / 2)
+        slopes = from_middle * self._slopes[camera]
         right, down, ahead = np.moveaxis(self._axes, 2, 0)[:, camera]
-        rays = (tangents[:, :1] * right + tangents[:, 1:] * down + ahead).astype(np.float32)
+        rays = (slopes[:, :1] * right + slopes[:, 1:] * down + ahead).astype(np.float32)
         _, face = self._scene.cast(self._origins[camera], rays)
         actor = windows.actor[window]
         hits = np.flatnonzero(self._scene.face_owner[face] == self._rows[actor])
@@ -220,57 +231,67 @@ class CameraViews:
 def camera_visible(scene: Scene, agent: Agent, ground_from_lidar: SE3, rows: IntArray) -> BoolArray:
     """Return which actors of `rows` (K,) have `MIN_PIXELS` pixels in any camera of an agent.
 
-    The agent itself never has. A few rays are enough for most; all rays are cast only to the
-    others.
+    The result is False for the agent itself. For most actors a few rays decide; all rays are cast
+    only for the others.
     """
     poses = [ground_from_lidar @ camera.lidar_from_camera for camera in agent.cameras]
     views = CameraViews(scene, agent.cameras, poses, rows)
-    is_other = np.ones(len(rows), dtype=bool) if agent.row is None else rows != agent.row
-    visible = np.zeros(len(rows), dtype=bool)
+    is_other = np.ones(len(rows), dtype=bool)
+    if agent.row is not None:
+        is_other = rows != agent.row
+    is_visible = np.zeros(len(rows), dtype=bool)
     for rays_across in (_RAYS_ACROSS_FIRST, _RAYS_ACROSS):
-        counts = views.pixels(is_other & ~visible, rays_across=rays_across)
-        visible |= (counts >= MIN_PIXELS).any(axis=0)
-    return visible
+        counts = views.pixels(is_other & ~is_visible, rays_across=rays_across)
+        is_visible |= (counts >= MIN_PIXELS).any(axis=0)
+    return is_visible
 
 
-def _slope(camera: Camera) -> FloatArray:
+def _compute_pixel_slope(camera: Camera) -> FloatArray:
     """Return the slope of one pixel of the `WIDTH` × `HEIGHT` picture, across and down, (2,)."""
     optics = camera.optics
     pixel_size = np.array([optics.width / WIDTH, optics.height / HEIGHT])
     return np.asarray(pixel_size / optics.intrinsic[0, 0])
 
 
-def _windows(corners: FloatArray, slopes: FloatArray) -> _Windows:
-    """Return the pixels that boxes may cover.
+def _find_windows(corners: FloatArray, slopes: FloatArray) -> _Windows:
+    """Return the windows of pixels that boxes may cover.
 
     Args:
         corners: Corners of the boxes in C optical frames, shape (C, K, 8, 3), metres.
         slopes: Slopes of a pixel, shape (C, 2).
     """
-    count = corners.shape[1]
-    all_slopes = np.repeat(slopes, count, axis=0)
-    low, high = rectangles(corners.reshape(-1, 8, 3), all_slopes, (WIDTH, HEIGHT))
-    first = np.floor(low).clip(0, (WIDTH, HEIGHT)).astype(np.int64)
-    size = np.ceil(high).clip(0, (WIDTH, HEIGHT)).astype(np.int64) - first
+    num_actors = corners.shape[1]
+    all_slopes = np.repeat(slopes, num_actors, axis=0)
+    picture_size = (WIDTH, HEIGHT)
+    low, high = rectangles(corners.reshape(-1, 8, 3), all_slopes, picture_size)
+    first = np.floor(low).clip(0, picture_size).astype(np.int64)
+    end = np.ceil(high).clip(0, picture_size).astype(np.int64)
+    size = end - first
     rows = np.flatnonzero((size > 0).all(axis=1))
-    camera, actor = np.divmod(rows, max(count, 1))
+    camera, actor = np.divmod(rows, max(num_actors, 1))
     return _Windows(camera, actor, first[rows], size[rows])
 
 
-def _pixels(windows: _Windows, rays_across: int) -> tuple[IntArray, IntArray, IntArray]:
+def _choose_pixels(windows: _Windows, rays_across: int) -> tuple[IntArray, IntArray, IntArray]:
     """Choose evenly spaced pixels of windows.
+
+    Args:
+        windows: The windows.
+        rays_across: Largest number of pixels of each window, across and also down.
 
     Returns:
         Columns and rows of the pixels (N, 2); the window (N,) of each; and the distance of pixels
         in each window (W,).
     """
-    step = -(-windows.size.max(axis=1, initial=1) // rays_across)
+    longest_side = windows.size.max(axis=1, initial=1)
+    step = -(-longest_side // rays_across)  # rounded up
     across, down = (-(-windows.size // step[:, None])).T
     counts = across * down
     window = np.repeat(np.arange(len(counts)), counts)
     starts = np.cumsum(counts) - counts
     number = np.arange(len(window)) - np.repeat(starts, counts)
-    cell = np.stack(np.divmod(number, across[window])[::-1], axis=1)
+    row, column = np.divmod(number, across[window])
+    cell = np.stack([column, row], axis=1)
     middle = (step - 1) // 2  # the pixel in the middle of a step's square
     pixel = windows.first[window] + cell * step[window, None] + middle[window, None]
     return pixel, window, step
@@ -279,7 +300,7 @@ def _pixels(windows: _Windows, rays_across: int) -> tuple[IntArray, IntArray, In
 def annotate(
     scene: Scene, agent: Agent, world_from_ground: SE3, scan: Scan, *, exact: bool
 ) -> Labels:
-    """Return the labels of an agent at a moment: parked vehicles, other vehicles, pedestrians.
+    """Label what an agent perceives at a moment: parked vehicles, other vehicles, pedestrians.
 
     Args:
         scene: The scene.
@@ -290,14 +311,16 @@ def annotate(
             `COUNT_DELAY_S` later.
     """
     ground_from_lidar = agent.ground_from_lidar(scene)
-    center, forward, velocity = _kinematics(scene)
-    distance = np.hypot(*(center[:, :2] - ground_from_lidar.translation[:2]).T)
-    rows = _label_order(scene, distance <= LABEL_RANGE)
+    center, forward, velocity = _compute_kinematics(scene)
+    offsets = center[:, :2] - ground_from_lidar.translation[:2]
+    distance = np.hypot(offsets[:, 0], offsets[:, 1])
+    rows = _order_labels(scene, distance <= LABEL_RANGE)
     actor_id = np.where(distance > TRACKING_RANGE, UNTRACKED_ID, scene.actors.actor_id)
     lidar_from_ground = ground_from_lidar.inverse()
     lidar_center = lidar_from_ground.apply(center)
     lidar_velocity = lidar_from_ground.rotate(velocity)
-    lidar_yaw = _lidar_yaw(forward, lidar_from_ground)
+    lidar_forward = lidar_from_ground.rotate(forward)
+    lidar_yaw = np.arctan2(lidar_forward[:, 1], lidar_forward[:, 0])
     world_velocity = world_from_ground.rotate(velocity)[:, :2]
     agent_velocity = np.zeros((1, 2))
     if agent.row is not None:
@@ -306,8 +329,9 @@ def annotate(
         lidar_yaw[agent.row] = 0.0
         lidar_velocity[agent.row] = 0.0
     size = scene.actors.size[rows]
-    offset = np.zeros((len(rows), 3)) if exact else offsets_at_count(lidar_velocity[rows])
-    count_center = lidar_center[rows] + offset
+    count_center = lidar_center[rows]
+    if not exact:
+        count_center = count_center + offsets_at_count(lidar_velocity[rows])
     count_boxes = Boxes.from_arrays(count_center, size, lidar_yaw[rows], frame="lidar")
     return Labels(
         raw=False,
@@ -325,9 +349,10 @@ def annotate(
 
 
 def offsets_at_count(velocity: FloatArray) -> FloatArray:
-    """Return the offsets (N, 3), metres, of actors at the moment when points are counted.
+    """Return how far actors have moved on when points are counted, shape (N, 3), metres.
 
-    Their velocities are (N, 3), m/s.
+    Args:
+        velocity: Velocities of the actors, shape (N, 3), m/s.
     """
     offset = COUNT_DELAY_S * velocity
     length = np.linalg.norm(offset, axis=1, keepdims=True)
@@ -335,18 +360,23 @@ def offsets_at_count(velocity: FloatArray) -> FloatArray:
     return np.asarray(offset * factor)
 
 
-def _label_order(scene: Scene, mask: BoolArray) -> IntArray:
-    """Return the rows of the actors of a mask (A,) in the order of label lines.
+def _order_labels(scene: Scene, is_labelled: BoolArray) -> IntArray:
+    """Return the rows of labelled actors, in the order of label lines.
 
     The order is the same for all agents and frames, and not by ids.
+
+    Args:
+        scene: The scene.
+        is_labelled: Whether each actor is labelled, shape (A,), bool.
     """
     actors = scene.actors
-    parked = np.isin(np.arange(len(actors)), scene.setting.parked)
-    order = np.lexsort([actors.object_id, actors.category == _PEDESTRIAN, ~parked])
-    return np.asarray(order[mask[order]])
+    is_parked = np.isin(np.arange(len(actors)), scene.setting.parked)
+    is_pedestrian = actors.category == _PEDESTRIAN
+    order = np.lexsort([actors.object_id, is_pedestrian, ~is_parked])
+    return np.asarray(order[is_labelled[order]])
 
 
-def _kinematics(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _compute_kinematics(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the kinematics of all boxes, ground frame.
 
     Returns:
@@ -355,13 +385,9 @@ def _kinematics(scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     forward = scene.frames[:, :3, 0]
     up = scene.frames[:, :3, 2]
-    center = scene.frames[:, :3, 3] + up * (BOX_CLEARANCE + scene.actors.size[:, 2:] / 2)
+    foot = scene.frames[:, :3, 3]
+    center_height = BOX_CLEARANCE + scene.actors.size[:, 2:] / 2
     level_velocity = scene.snapshot.velocities
     climb = -(level_velocity * up[:, :2]).sum(axis=1) / up[:, 2]
-    return center, forward, np.column_stack([level_velocity, climb])
-
-
-def _lidar_yaw(forward: FloatArray, lidar_from_ground: SE3) -> FloatArray:
-    """Return the yaw (A,) of forward vectors (A, 3) in the LiDAR frame, in (−π, π]."""
-    lidar_forward = lidar_from_ground.rotate(forward)
-    return np.asarray(np.arctan2(lidar_forward[:, 1], lidar_forward[:, 0]))
+    velocity = np.column_stack([level_velocity, climb])
+    return foot + up * center_height, forward, velocity

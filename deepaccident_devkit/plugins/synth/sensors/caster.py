@@ -1,4 +1,4 @@
-"""Casting rays against solids and the ground: with Embree if it is installed, otherwise numpy."""
+"""Casting rays against solids and the ground, with Embree if it is installed, otherwise numpy."""
 
 import importlib.util
 from functools import lru_cache
@@ -16,7 +16,7 @@ NO_HIT = -1
 """The face of a ray that hits nothing."""
 GROUND = -2
 """The face of a ray that hits the ground."""
-# Larger than any distance, in lengths of a ray.
+# A number that is larger than any distance, in lengths of a ray.
 _MAX_DISTANCE = 1e30
 _CORNERS_A_SOLID = 8
 # Corners of a face that make its two triangles.
@@ -64,7 +64,7 @@ def make_caster(corners: FloatArray, terrain: Terrain | None = None) -> Caster:
 
 
 def has_embree() -> bool:
-    """Return whether the extra `synth` is installed."""
+    """Return whether the package embreex, of the extra `synth`, is installed."""
     return importlib.util.find_spec("embreex") is not None
 
 
@@ -72,27 +72,26 @@ def require_embree() -> None:
     """Raise MissingExtraError if images and point clouds cannot be made."""
     if not has_embree():
         raise MissingExtraError(
-            "images and point clouds need the package embreex "
-            "(in a checkout, pip install '.[synth]'), "
-            'or make a release without them (--sensors none; SynthConfig(sensors="none"))'
+            "images and point clouds need the package embreex; run pip install '.[synth]' in a "
+            'checkout, or make a release without them (--sensors none; SynthConfig(sensors="none"))'
         )
 
 
 class EmbreeCaster:
-    """Rays cast by Intel's Embree, in single precision."""
+    """A caster of rays that uses Intel's Embree, in single precision."""
 
     def __init__(self, corners: FloatArray, terrain: Terrain | None = None) -> None:
         from embreex import mesh_construction, rtcore_scene
 
         vertices = corners.reshape(-1, 3).astype(np.float32)
-        triangles = _triangles_of_solids(len(corners))
+        triangles = _list_triangles(len(corners))
         self._num_faces = len(corners) * FACES_A_SOLID
         self._has_plane = terrain is not None and terrain.is_flat
         if terrain is not None and not terrain.is_flat:
             ground_vertices = terrain.triangles().reshape(-1, 3)
             rows = np.arange(len(ground_vertices)).reshape(-1, 3) + len(vertices)
             vertices = np.concatenate([vertices, ground_vertices])
-            triangles = np.concatenate([triangles, _as_tuples(rows)])
+            triangles = np.concatenate([triangles, _to_tuples(rows)])
         self._is_empty = len(triangles) == 0
         self._scene: Any = rtcore_scene.EmbreeScene()
         if not self._is_empty:
@@ -111,10 +110,10 @@ class EmbreeCaster:
             face = np.full(len(rays), NO_HIT, np.int32)
         else:
             starts = np.broadcast_to(origin.astype(np.float32), rays.shape)
-            ends = None
+            limits = None
             if reach is not None:
-                ends = reach.astype(np.float32)  # a copy, because Embree writes into it
-            hits = self._scene.run(starts, rays, ends, query="INTERSECT", output=True)
+                limits = reach.astype(np.float32)  # a copy, because Embree writes into it
+            hits = self._scene.run(starts, rays, limits, query="INTERSECT", output=True)
             face = hits["primID"] >> 1
             distance = hits["tfar"]
             distance[face < 0] = np.inf
@@ -129,7 +128,7 @@ class EmbreeCaster:
 
 
 @lru_cache(maxsize=4)
-def _triangles_of_solids(count: int) -> NDArray[np.object_]:
+def _list_triangles(count: int) -> NDArray[np.object_]:
     """Return the rows of each triangle's three corners: two triangles for each face of the solids.
 
     Returns:
@@ -137,10 +136,10 @@ def _triangles_of_solids(count: int) -> NDArray[np.object_]:
     """
     first_rows = np.arange(count)[:, None, None, None] * _CORNERS_A_SOLID
     rows = first_rows + FACES[:, _TRIANGLES_OF_FACE]
-    return _as_tuples(rows.reshape(-1, 3))
+    return _to_tuples(rows.reshape(-1, 3))
 
 
-def _as_tuples(rows: IntArray) -> NDArray[np.object_]:
+def _to_tuples(rows: IntArray) -> NDArray[np.object_]:
     """Convert the rows of an array into tuples."""
     tuples = np.empty(len(rows), dtype=object)
     tuples[:] = list(map(tuple, rows.tolist()))
@@ -148,7 +147,7 @@ def _as_tuples(rows: IntArray) -> NDArray[np.object_]:
 
 
 class NumpyCaster:
-    """Rays intersected with the planes of the solids near them, in double precision.
+    """A caster of rays that intersects them with the planes of solids, in double precision.
 
     It is slow, but needs no Embree.
     """
@@ -158,7 +157,8 @@ class NumpyCaster:
         self._normals = normals.reshape(-1, FACES_A_SOLID, 3)
         self._offsets = offsets.reshape(-1, FACES_A_SOLID)
         self._middle = corners.mean(axis=1)
-        distances = np.linalg.norm(corners - self._middle[:, None], axis=2)
+        to_corners = corners - self._middle[:, None]
+        distances = np.linalg.norm(to_corners, axis=2)
         self._radius = distances.max(axis=1, initial=0.0)
         self._terrain = terrain
 
@@ -172,14 +172,14 @@ class NumpyCaster:
         else:
             distance, face = self._cast_from(origin, rays)
         if reach is not None:
-            beyond = distance > reach
-            distance[beyond] = np.inf
-            face[beyond] = NO_HIT
+            is_beyond = distance > reach
+            distance[is_beyond] = np.inf
+            face[is_beyond] = NO_HIT
         return distance, face
 
     def _cast_from(self, origin: FloatArray, rays: FloatArray) -> tuple[FloatArray, IntArray]:
         """Cast rays (N, 3) from one point."""
-        units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         distance = np.full(len(rays), np.inf)
         face = np.full(len(rays), NO_HIT)
         if self._terrain is not None:
@@ -187,18 +187,20 @@ class NumpyCaster:
             face[np.isfinite(distance)] = GROUND
         num_solids = len(self._radius)
         for start in range(0, num_solids, _SOLIDS_A_BLOCK):
-            solids = np.arange(start, min(start + _SOLIDS_A_BLOCK, num_solids))
-            masks = self._near(solids, origin, units)
+            end = min(start + _SOLIDS_A_BLOCK, num_solids)
+            solids = np.arange(start, end)
+            masks = self._mark_near(solids, origin, directions)
             for solid, mask in zip(solids.tolist(), masks, strict=True):
                 rows = np.flatnonzero(mask)
-                entry, entry_face = self._entry(solid, origin, rays[rows])
-                closer = entry < distance[rows]
-                distance[rows[closer]] = entry[closer]
-                face[rows[closer]] = FACES_A_SOLID * solid + entry_face[closer]
+                entry, entry_face = self._find_entry(solid, origin, rays[rows])
+                is_closer = entry < distance[rows]
+                closer_rows = rows[is_closer]
+                distance[closer_rows] = entry[is_closer]
+                face[closer_rows] = FACES_A_SOLID * solid + entry_face[is_closer]
         return distance, face
 
     def _cast_from_each(self, origins: FloatArray, rays: FloatArray) -> tuple[AnyArray, AnyArray]:
-        """Cast rays (N, 3) from points (N, 3), many of them equal."""
+        """Cast rays (N, 3) from points (N, 3); many points are equal."""
         distance = np.full(len(rays), np.inf)
         face = np.full(len(rays), NO_HIT)
         distinct_origins, numbers = np.unique(origins, axis=0, return_inverse=True)
@@ -207,47 +209,62 @@ class NumpyCaster:
             distance[rows], face[rows] = self._cast_from(origin, rays[rows])
         return distance, face
 
-    def _near(self, solids: IntArray, origin: FloatArray, units: FloatArray) -> BoolArray:
-        """Return whether each ray (N,) passes near the bounding sphere of each solid (S,).
+    def _mark_near(self, solids: IntArray, origin: FloatArray, directions: FloatArray) -> BoolArray:
+        """Mark the rays that pass near the bounding sphere of each solid.
 
-        The shape is (S, N).
+        Args:
+            solids: Numbers of the solids, shape (S,).
+            origin: Origin of the rays, shape (3,), metres.
+            directions: Unit vectors of the rays, shape (N, 3).
+
+        Returns:
+            Whether each ray passes near each solid, shape (S, N), bool.
         """
-        towards = self._middle[solids] - origin
+        to_middle = self._middle[solids] - origin
         radius = self._radius[solids] * (1 + _ROUNDING)
-        along = towards @ units.T
-        square_distance = (towards**2).sum(axis=1)
-        tangent_length = np.sqrt(np.maximum(square_distance - radius**2, 0.0))
+        along = to_middle @ directions.T
+        square_distance = (to_middle**2).sum(axis=1)
+        square_tangent = square_distance - radius**2
+        tangent_length = np.sqrt(np.maximum(square_tangent, 0.0))
         # All rays meet a sphere around the origin; another one is met only by rays that have it
         # ahead by the length of its tangent.
         encloses_origin = square_distance <= radius**2
-        return np.asarray((along >= tangent_length[:, None]) | encloses_origin[:, None])
+        is_ahead = along >= tangent_length[:, None]
+        return np.asarray(is_ahead | encloses_origin[:, None])
 
-    def _entry(
+    def _find_entry(
         self, solid: int, origin: FloatArray, rays: FloatArray
     ) -> tuple[FloatArray, IntArray]:
         """Find where rays enter a solid.
 
+        Args:
+            solid: Number of the solid.
+            origin: Origin of the rays, shape (3,), metres.
+            rays: Directions, shape (N, 3).
+
         Returns:
             Distances (infinite for rays that do not enter it), and the faces through which they
-            enter.
+            enter, shape (N,) each.
         """
-        towards = rays @ self._normals[solid].T
-        height = self._offsets[solid] - self._normals[solid] @ origin
+        normals = self._normals[solid]
+        outward_speed = rays @ normals.T
+        height = self._offsets[solid] - normals @ origin
         with np.errstate(divide="ignore", invalid="ignore"):
-            cut = height / towards
-        entering = np.where(towards < -_PARALLEL_TOLERANCE, cut, -_MAX_DISTANCE)
-        leaving = np.where(towards > _PARALLEL_TOLERANCE, cut, _MAX_DISTANCE)
-        passes_by = (np.abs(towards) <= _PARALLEL_TOLERANCE) & (height < 0)
+            distance = height / outward_speed
+        entering = np.where(outward_speed < -_PARALLEL_TOLERANCE, distance, -_MAX_DISTANCE)
+        leaving = np.where(outward_speed > _PARALLEL_TOLERANCE, distance, _MAX_DISTANCE)
+        is_parallel = np.abs(outward_speed) <= _PARALLEL_TOLERANCE
+        passes_by = (is_parallel & (height < 0)).any(axis=1)
         entry = entering.max(axis=1)
         entry_face = entering.argmax(axis=1)
-        hit = (entry <= leaving.min(axis=1)) & (entry > 0) & ~passes_by.any(axis=1)
-        return np.where(hit, entry, np.inf), entry_face
+        enters = (entry <= leaving.min(axis=1)) & (entry > 0) & ~passes_by
+        return np.where(enters, entry, np.inf), entry_face
 
 
 def ground_distance(terrain: Terrain, origin: FloatArray, rays: FloatArray) -> FloatArray:
-    """Return where rays (N, 3) from a point above the ground meet it, in lengths of the ray.
+    """Return the distances (N,) from a point above the ground to the ground along rays (N, 3).
 
-    The distance is infinite if they do not meet it.
+    They are in lengths of the ray, and infinite if a ray does not meet the ground.
     """
     if terrain.is_flat:
         return plane_distance(origin[2], rays[:, 2])
@@ -257,19 +274,19 @@ def ground_distance(terrain: Terrain, origin: FloatArray, rays: FloatArray) -> F
     under_way = np.arange(len(rays))
     for number in range(1, _NUM_MARCH_STEPS + 1):
         reached = number * step[under_way]
-        is_below = _height_above(terrain, origin, rays[under_way], reached) <= 0
+        is_below = _is_below_ground(terrain, origin, rays[under_way], reached)
         after[under_way[is_below]] = reached[is_below]
         under_way = under_way[~is_below]
         before[under_way] = reached[~is_below]
-    met = np.flatnonzero(np.isfinite(after))
-    low = before[met]
-    high = after[met]
+    rows = np.flatnonzero(np.isfinite(after))
+    low = before[rows]
+    high = after[rows]
     for _ in range(_NUM_HALVINGS):
         middle = (low + high) / 2
-        is_below = _height_above(terrain, origin, rays[met], middle) <= 0
+        is_below = _is_below_ground(terrain, origin, rays[rows], middle)
         low = np.where(is_below, low, middle)
         high = np.where(is_below, middle, high)
-    after[met] = (low + high) / 2
+    after[rows] = (low + high) / 2
     return after
 
 
@@ -288,10 +305,11 @@ def plane_distance(height: float | FloatArray, upwards: NDArray[Any]) -> NDArray
     return np.where(falling, height / descent, np.inf)
 
 
-def _height_above(
-    terrain: Terrain, origin: FloatArray, rays: FloatArray, reached: FloatArray
-) -> FloatArray:
-    """Return the heights (N,) above the ground of points on rays, metres."""
-    points = origin + rays * reached[:, None]
+def _is_below_ground(
+    terrain: Terrain, origin: FloatArray, rays: FloatArray, distance: FloatArray
+) -> BoolArray:
+    """Return which points on rays (N, 3), at distances (N,), are on or below the ground."""
+    points = origin + rays * distance[:, None]
     ground_height = terrain.height(points[:, :2])
-    return np.asarray(points[:, 2] - ground_height)
+    height_above = points[:, 2] - ground_height
+    return np.asarray(height_above <= 0)

@@ -29,18 +29,19 @@ LIDAR_CHANNELS = 32
 ELEVATION = (-30.0, 10.0)
 """Elevation of the lowest and the highest channel, degrees."""
 AZIMUTHS = 1400
-"""Rays a turn and channel; the release's LiDAR sends out 2,750 and loses 48 % of them at random."""
+"""Number of rays in a turn of a channel; the release's LiDAR sends out 2,750 and loses 48 % of
+them at random."""
 RANGE = 70.0
 RANGE_NOISE = 0.05
 """Standard deviation along the ray, metres, as in the release."""
-# Margin around a box: more than anybody moves between the point cloud and the count.
+# Margin around a box; no road user moves this far between the point cloud and the count.
 _BOX_MARGIN_M = 0.06
 # The distance of a box is multiplied by this, because a box on a slope leans.
 _LEANING_FACTOR = 0.98
 # Attenuation of the intensity for each metre of dry air, as in the release.
 _ATTENUATION = 0.03
-# Intensity from which on no return is lost, and share of lost returns at intensity 0: CARLA's
-# defaults.
+# Smallest intensity at which no return is lost, and share of lost returns at intensity 0. Both are
+# CARLA's defaults.
 _SAFE_INTENSITY = 0.8
 _MAX_LOSS = 0.4
 _NUM_RANDOM_NUMBERS = 1 << 18
@@ -55,30 +56,31 @@ def lidar_ray_directions() -> FloatArray:
 
     The shape is (32 · 1400, 3).
     """
-    elevation = np.deg2rad(np.linspace(ELEVATION[1], ELEVATION[0], LIDAR_CHANNELS))[:, None]
-    azimuth = np.linspace(np.pi, -np.pi, AZIMUTHS, endpoint=False)[None, :]
-    directions = [
-        np.cos(elevation) * np.cos(azimuth),
-        np.cos(elevation) * np.sin(azimuth),
-        np.broadcast_to(np.sin(elevation), (LIDAR_CHANNELS, AZIMUTHS)),
-    ]
-    return readonly(np.stack(directions, axis=-1).reshape(-1, 3))
+    elevations = np.linspace(ELEVATION[1], ELEVATION[0], LIDAR_CHANNELS)
+    elevation = np.deg2rad(elevations)[:, None]
+    azimuth = np.linspace(np.pi, -np.pi, AZIMUTHS, endpoint=False)
+    level_length = np.cos(elevation)
+    directions = np.empty((LIDAR_CHANNELS, AZIMUTHS, 3))
+    directions[..., 0] = level_length * np.cos(azimuth)
+    directions[..., 1] = level_length * np.sin(azimuth)
+    directions[..., 2] = np.sin(elevation)
+    return readonly(directions.reshape(-1, 3))
 
 
-def turned_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> Float32Array:
-    """Return the directions (K, 3) of some or all rays, turned by a rotation (3, 3).
+def rotate_rays(rotation: FloatArray, rows: IntArray | slice = slice(None)) -> Float32Array:
+    """Return the directions (K, 3) of some or all rays, rotated by a matrix (3, 3).
 
     Each direction does not depend on the others.
     """
-    x, y, z = _direction_columns()[:, rows]
-    turn = rotation.astype(np.float32)
-    turned = np.empty((len(x), 3), dtype=np.float32)
-    for axis in range(3):
-        turned[:, axis] = x * turn[axis, 0] + y * turn[axis, 1] + z * turn[axis, 2]
-    return turned
+    x, y, z = _list_direction_columns()[:, rows]
+    matrix = rotation.astype(np.float32)
+    rotated = np.empty((len(x), 3), dtype=np.float32)
+    for axis, (x_part, y_part, z_part) in enumerate(matrix):
+        rotated[:, axis] = x * x_part + y * y_part + z * z_part
+    return rotated
 
 
-def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> BoolArray:
+def mark_rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> BoolArray:
     """Mark the rays that may pass through a box of each group of actors.
 
     They are the rays in a window around each box.
@@ -89,7 +91,7 @@ def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> Bo
         *groups: Rows of the actors of each group.
 
     Returns:
-        Truth values, shape (G, 32 · 1400).
+        Whether each ray may pass through a box of the group, shape (G, 32 · 1400), bool.
     """
     rows = np.concatenate(groups)
     frames = scene.frames[rows]
@@ -98,24 +100,27 @@ def rays_to_boxes(scene: Scene, ground_from_lidar: SE3, *groups: IntArray) -> Bo
     corners = ground_from_lidar.inverse().apply(ground_corners).reshape(-1, 8, 3)
     offsets = ground_from_lidar.translation - frames[:, :3, 3]
     box_from_lidar = np.einsum("nk,nkl->nl", offsets, frames[:, :3, :3])
-    gap = np.maximum(np.abs(box_from_lidar[:, :2]) - half_size - _BOX_MARGIN_M, 0.0)
+    from_box = np.abs(box_from_lidar[:, :2]) - half_size - _BOX_MARGIN_M
+    gap = np.maximum(from_box, 0.0)
     nearest = np.hypot(gap[:, 0], gap[:, 1]) * _LEANING_FACTOR
     farthest = np.hypot(corners[..., 0], corners[..., 1]).max(axis=1)
-    low = corners[..., 2].min(axis=1)
-    high = corners[..., 2].max(axis=1)
-    top_channel, end_channel = _channels(low, high, nearest, farthest)
-    start, count = _azimuths(corners, around=nearest == 0)
+    height = corners[..., 2]
+    top_channel, end_channel = _find_channels(
+        height.min(axis=1), height.max(axis=1), nearest, farthest
+    )
+    start, count = _find_azimuths(corners, is_around=nearest == 0)
     # Two turns, for windows across the end.
     mask = np.zeros((len(groups), LIDAR_CHANNELS, 2 * AZIMUTHS), dtype=bool)
     group_of_row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     for row in np.flatnonzero(nearest < RANGE).tolist():
         channels = slice(top_channel[row], end_channel[row])
-        mask[group_of_row[row], channels, start[row] : start[row] + count[row]] = True
+        azimuths = slice(start[row], start[row] + count[row])
+        mask[group_of_row[row], channels, azimuths] = True
     one_turn = mask[..., :AZIMUTHS] | mask[..., AZIMUTHS:]
     return np.asarray(one_turn.reshape(len(groups), -1))
 
 
-def rays_through(size: tuple[float, float, float], position: FloatArray) -> IntArray:
+def find_rays_through(size: tuple[float, float, float], position: FloatArray) -> IntArray:
     """Return the rows of the rays that pass through a box with the same heading as the LiDAR.
 
     Args:
@@ -125,18 +130,19 @@ def rays_through(size: tuple[float, float, float], position: FloatArray) -> IntA
     """
     middle = np.array([0.0, 0.0, BOX_CLEARANCE + size[2] / 2]) - position
     half_size = np.array(size) / 2 + _BOX_MARGIN_M
+    directions = lidar_ray_directions()
     with np.errstate(divide="ignore"):
-        to_low_planes = (middle - half_size) / lidar_ray_directions()
-        to_high_planes = (middle + half_size) / lidar_ray_directions()
-    entry = np.minimum(to_low_planes, to_high_planes).max(axis=1)
-    exit_ = np.maximum(to_low_planes, to_high_planes).min(axis=1)
-    return np.flatnonzero((exit_ > 0) & (entry <= exit_))
+        to_low_planes = (middle - half_size) / directions
+        to_high_planes = (middle + half_size) / directions
+    entry_distance = np.minimum(to_low_planes, to_high_planes).max(axis=1)
+    exit_distance = np.maximum(to_low_planes, to_high_planes).min(axis=1)
+    return np.flatnonzero((exit_distance > 0) & (entry_distance <= exit_distance))
 
 
-def _channels(
+def _find_channels(
     low: FloatArray, high: FloatArray, nearest: FloatArray, farthest: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Return the channels with rays between two heights at a range of distances.
+    """Find the channels with rays between two heights at a range of distances.
 
     Args:
         low: Lower heights, shape (N,), metres.
@@ -150,43 +156,49 @@ def _channels(
     bottom = low - _BOX_MARGIN_M
     top = high + _BOX_MARGIN_M
     min_distance = np.maximum(nearest, 1e-3)
-    low_elevation = np.arctan2(bottom, np.where(bottom < 0, min_distance, farthest))
-    high_elevation = np.arctan2(top, np.where(top > 0, min_distance, farthest))
-    top_elevation = np.deg2rad(ELEVATION[1])
-    step = (top_elevation - np.deg2rad(ELEVATION[0])) / (LIDAR_CHANNELS - 1)
-    start = np.floor((top_elevation - high_elevation) / step)
-    stop = np.ceil((top_elevation - low_elevation) / step + 1)
+    bottom_distance = np.where(bottom < 0, min_distance, farthest)
+    top_distance = np.where(top > 0, min_distance, farthest)
+    low_elevation = np.arctan2(bottom, bottom_distance)
+    high_elevation = np.arctan2(top, top_distance)
+    min_elevation, max_elevation = np.deg2rad(ELEVATION)
+    step = (max_elevation - min_elevation) / (LIDAR_CHANNELS - 1)
+    start = np.floor((max_elevation - high_elevation) / step)
+    stop = np.ceil((max_elevation - low_elevation) / step + 1)
     start = start.clip(0, LIDAR_CHANNELS)
     stop = stop.clip(0, LIDAR_CHANNELS)
     return start.astype(np.int64), stop.astype(np.int64)
 
 
-def _azimuths(corners: FloatArray, *, around: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return the azimuths of the rays to boxes.
+def _find_azimuths(corners: FloatArray, *, is_around: BoolArray) -> tuple[IntArray, IntArray]:
+    """Find the azimuths of the rays to boxes.
 
     Args:
         corners: Corners of the boxes in the LiDAR frame, shape (N, 8, 3), metres.
-        around: Truth values, shape (N,): boxes around the LiDAR, which take all azimuths.
+        is_around: Whether each box surrounds the LiDAR, so that it covers all azimuths, shape (N,),
+            bool.
 
     Returns:
         First azimuth and number of azimuths, shape (N,) each.
     """
-    middle = np.arctan2(*corners[..., :2].mean(axis=1).T[::-1])
+    middle_x, middle_y = corners[..., :2].mean(axis=1).T
+    middle = np.arctan2(middle_y, middle_x)
     bearing = np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None]
     full_turn = 2 * np.pi
-    aside = np.abs((bearing + np.pi) % full_turn - np.pi)
-    half_turn = np.where(around, np.pi, aside.max(axis=1))
+    angle = np.abs((bearing + np.pi) % full_turn - np.pi)
+    half_angle = np.where(is_around, np.pi, angle.max(axis=1))
     column = (np.pi - middle) / full_turn * AZIMUTHS
-    half_width = half_turn / full_turn * AZIMUTHS + 1
+    half_width = half_angle / full_turn * AZIMUTHS + 1
     start = np.floor(column - half_width).astype(np.int64)
-    count = np.ceil(column + half_width).astype(np.int64) + 1 - start
+    last = np.ceil(column + half_width).astype(np.int64)
+    count = last + 1 - start
     return start % AZIMUTHS, np.minimum(count, AZIMUTHS)
 
 
 @cache
-def _direction_columns() -> Float32Array:
-    """Return `lidar_ray_directions` as columns, shape (3, 32 · 1400)."""
-    columns = lidar_ray_directions().T.astype(np.float32)
+def _list_direction_columns() -> Float32Array:
+    """Return the columns of `lidar_ray_directions`, shape (3, 32 · 1400)."""
+    directions = lidar_ray_directions()
+    columns = directions.T.astype(np.float32)
     return readonly(np.ascontiguousarray(columns))
 
 
@@ -260,10 +272,10 @@ def make_lidar(setting: Setting, agent: Agent) -> Lidar:
         no_distances = np.zeros(0, dtype=np.float32)
         return Lidar(row=None, body=no_rows, distance=no_distances, face=no_rows)
     position = (agent.box_from_ego @ agent.ego_from_lidar).translation
-    body = rays_through(setting.actors.all[agent.row].size, position)
+    body = find_rays_through(setting.actors.all[agent.row].size, position)
     solids = np.flatnonzero(setting.moving_owner == agent.row)
     caster = make_caster(setting.moving_shapes.corners[solids])
-    distance, face = caster.cast(position, turned_rays(np.eye(3), body))
+    distance, face = caster.cast(position, rotate_rays(np.eye(3), body))
     first_face = setting.faces + FACES_A_SOLID * int(solids[0])
     scene_face = np.where(face >= 0, face + first_face, face)
     return Lidar(row=agent.row, body=body, distance=distance, face=scene_face)
@@ -285,27 +297,27 @@ def scan(
     Args:
         scene: The scene.
         lidar: The LiDAR.
-        ground_from_lidar: Its pose.
+        ground_from_lidar: Pose of the LiDAR.
         air: Effect of the weather.
         rng: Generator of random numbers.
-        boxed: Whether only rays are followed that may pass through a label box. Then all points in
-            boxes are there, equal to the bit, but only few points outside the boxes.
+        boxed: Whether only rays are followed that may pass through a label box. The result then
+            contains all points in boxes, bit-identical, but only a few points outside the boxes.
     """
-    cast = _cast_boxed if boxed else cast_all
+    cast = _cast_to_boxes if boxed else cast_all
     rows, distance, face = cast(scene, lidar, ground_from_lidar)
-    normal, uniform = _random_numbers()
+    normal, uniform = _draw_random_numbers()
     max_start = _NUM_RANDOM_NUMBERS - len(lidar_ray_directions())
     noise_start, loss_start, drop_start = rng.integers(0, max_start, 3)
     reach = distance.astype(np.float32)
-    returned = returns(reach, uniform[loss_start + rows], air)
+    has_returned = draw_returns(reach, uniform[loss_start + rows], air)
     if air.drops:
         drops = np.flatnonzero(uniform[drop_start + rows] < air.drops)
         share = uniform[loss_start + rows[drops]]
         drop_distance = _MIN_DROP_DISTANCE_M + (_MAX_DROP_DISTANCE_M - _MIN_DROP_DISTANCE_M) * share
         reach[drops] = np.minimum(drop_distance, reach[drops])
         face[drops] = NO_HIT
-        returned[drops] = True
-    points = np.flatnonzero(returned)
+        has_returned[drops] = True
+    points = np.flatnonzero(has_returned)
     ray = rows[points]
     reach = reach[points]
     noise = np.float32(RANGE_NOISE) * normal[noise_start + ray]
@@ -320,10 +332,10 @@ def intensity(points: Scan, air: Air) -> Float32Array:
 
     It depends only on the air on the way, as in the release.
     """
-    return _intensity_at(points.reach, air)
+    return _compute_intensity(points.reach, air)
 
 
-def _intensity_at(reach: AnyArray, air: Air) -> Float32Array:
+def _compute_intensity(reach: AnyArray, air: Air) -> Float32Array:
     """Return the intensity of returns from distances in metres."""
     attenuation = _ATTENUATION + air.attenuation
     return np.asarray(np.exp(-attenuation * reach), dtype=np.float32)
@@ -335,18 +347,18 @@ def cast_all(
     """Cast all rays of a LiDAR.
 
     Returns:
-        The rows of the rays, their distances, correct up to `RANGE`, and the faces that they meet.
+        The rows of the rays, their distances (correct up to `RANGE`), and the faces that they meet.
     """
     setting = scene.setting
-    rays = turned_rays(ground_from_lidar.rotation)
+    rays = rotate_rays(ground_from_lidar.rotation)
     pose = ground_from_lidar.matrix.tobytes()
     origin = ground_from_lidar.translation
     columns = rays.reshape(LIDAR_CHANNELS, AZIMUTHS, 3)
-    static_hits = setting.remembered(pose, lambda: setting.cast_columns(origin, columns, RANGE))
-    moving_rows = _without_own(setting.moving, lidar)
-    [to_movers] = rays_to_boxes(scene, ground_from_lidar, moving_rows)
-    near = np.flatnonzero(to_movers)
-    distance, face = scene.with_movers(origin, rays, static_hits, near)
+    static_hits = setting.remember_cast(pose, lambda: setting.cast_columns(origin, columns, RANGE))
+    moving_rows = _drop_own_row(setting.moving, lidar)
+    [to_movers] = mark_rays_to_boxes(scene, ground_from_lidar, moving_rows)
+    mover_rays = np.flatnonzero(to_movers)
+    distance, face = scene.with_movers(origin, rays, static_hits, mover_rays)
     hits_body = np.isfinite(lidar.distance)
     body = lidar.body[hits_body]
     distance[body] = lidar.distance[hits_body]
@@ -354,27 +366,32 @@ def cast_all(
     return np.arange(len(rays)), distance, face
 
 
-def _cast_boxed(
+def _cast_to_boxes(
     scene: Scene, lidar: Lidar, ground_from_lidar: SE3
 ) -> tuple[IntArray, AnyArray, AnyArray]:
-    """Cast only the rays that may pass through a box; the results are as from `cast_all`."""
+    """Cast only the rays that may pass through a box.
+
+    Returns:
+        As from `cast_all`, for these rays.
+    """
     setting = scene.setting
-    moving_rows = _without_own(setting.moving, lidar)
-    to_movers, to_parked = rays_to_boxes(scene, ground_from_lidar, moving_rows, setting.parked)
-    cast_mask = to_movers | to_parked
-    cast_mask[lidar.body[np.isfinite(lidar.distance)]] = False
-    rows = np.flatnonzero(cast_mask)
-    rays = turned_rays(ground_from_lidar.rotation, rows)
-    near = np.flatnonzero(to_movers[rows])
-    distance, face = scene.cast(ground_from_lidar.translation, rays, near=near)
-    own = np.flatnonzero(~cast_mask[lidar.body])
+    moving_rows = _drop_own_row(setting.moving, lidar)
+    to_movers, to_parked = mark_rays_to_boxes(scene, ground_from_lidar, moving_rows, setting.parked)
+    is_cast = to_movers | to_parked
+    is_cast[lidar.body[np.isfinite(lidar.distance)]] = False
+    rows = np.flatnonzero(is_cast)
+    rays = rotate_rays(ground_from_lidar.rotation, rows)
+    mover_rays = np.flatnonzero(to_movers[rows])
+    distance, face = scene.cast(ground_from_lidar.translation, rays, mover_rays=mover_rays)
+    own = np.flatnonzero(~is_cast[lidar.body])
     all_rows = np.concatenate([rows, lidar.body[own]])
     all_distances = np.concatenate([distance, lidar.distance[own]])
-    return all_rows, all_distances, np.concatenate([face, lidar.face[own]])
+    all_faces = np.concatenate([face, lidar.face[own]])
+    return all_rows, all_distances, all_faces
 
 
 @cache
-def _random_numbers() -> tuple[Float32Array, Float32Array]:
+def _draw_random_numbers() -> tuple[Float32Array, Float32Array]:
     """Return standard normal random numbers, and uniform ones from 0 to 1, (2 ** 18,) each.
 
     Each turn takes them from another position: to draw new ones would take as long as to cast the
@@ -386,27 +403,24 @@ def _random_numbers() -> tuple[Float32Array, Float32Array]:
     return readonly(normal), readonly(uniform)
 
 
-def _without_own(rows: IntArray, lidar: Lidar) -> IntArray:
-    """Return rows of actors without the LiDAR's own."""
+def _drop_own_row(rows: IntArray, lidar: Lidar) -> IntArray:
+    """Return rows of actors, without the row of the LiDAR's own agent."""
     if lidar.row is None:
         return rows
     other_rows: IntArray = rows[rows != lidar.row]
     return other_rows
 
 
-def returns(reach: Float32Array, luck: Float32Array, air: Air) -> NDArray[np.bool_]:
-    """Return whether rays return, weak ones less often.
+def draw_returns(reach: Float32Array, chance: Float32Array, air: Air) -> NDArray[np.bool_]:
+    """Draw which rays (N,) come back to the sensor; weak ones do so less often.
 
     Args:
         reach: Distances at which they met something, shape (N,), metres.
-        luck: Random numbers from 0 to 1, shape (N,).
+        chance: Random numbers from 0 to 1, shape (N,).
         air: Effect of the weather.
-
-    Returns:
-        Truth values, shape (N,).
     """
-    near = np.minimum(reach, RANGE)
-    weakness = np.maximum(1 - _intensity_at(near, air) / _SAFE_INTENSITY, 0)
-    loss = _MAX_LOSS * weakness + air.lost * (near / RANGE) ** 2
-    in_range = reach <= RANGE
-    return np.asarray(in_range & (luck >= loss))
+    limited_reach = np.minimum(reach, RANGE)
+    weakness = np.maximum(1 - _compute_intensity(limited_reach, air) / _SAFE_INTENSITY, 0)
+    loss = _MAX_LOSS * weakness + air.lost * (limited_reach / RANGE) ** 2
+    is_in_range = reach <= RANGE
+    return np.asarray(is_in_range & (chance >= loss))

@@ -1,4 +1,4 @@
-"""Light and air: the time of day and the weather in an image, the sky, rain, and lamps."""
+"""Light and air: the effects of time of day and weather on images, the sky, rain, and lamps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepaccident_devkit.plugins.synth.roads import MAP_EXTENT, Arm
+from deepaccident_devkit.plugins.synth.roads.paths import ahead_and_left
 from deepaccident_devkit.plugins.synth.sensors.scene import Scene
 from deepaccident_devkit.plugins.synth.solids import Color
 from deepaccident_devkit.plugins.synth.world import LAMP_COLORS, LANTERN_COLOR, World
@@ -23,14 +24,14 @@ _CLOUD_GREY = np.array([168.0, 174.0, 182.0])
 _SUN_GAIN = 1.7
 _WET_DARKENING = 0.32
 _SKY_COLUMNS, _SKY_ROWS = 1024, 192
-# Slope (height over distance) at the upper edge of the sky's picture; higher directions have the
+# Slope (height over distance) at the upper edge of the sky's picture. Higher directions have the
 # colours of this edge.
 _MAX_SKY_SLOPE = 1.2
 # Number of clouds over a distance equal to the height of the cloud layer.
 _CLOUD_DENSITY = 2.5
 # Number of streaks of hard rain in a picture of any size.
 _NUM_STREAKS = 520
-# Steps of a pixel for OpenCV's coordinates, a power of 2.
+# Steps in each pixel of the coordinates that OpenCV takes, a power of 2.
 _SUBPIXEL_STEPS = 16
 _LIGHT_CELLS = 600
 _CELL_SIZE_M = 2 * MAP_EXTENT / _LIGHT_CELLS
@@ -71,7 +72,7 @@ class _WeatherAir:
     Attributes:
         sun: Share of the sunlight that it lets through.
         cover: Share of the sky's blue that grey replaces.
-        haze: Haze a kilometre.
+        haze: Haze for each kilometre, as for `Light.haze`.
         wet: Wetness of the ground.
         rain: Strength of the rain.
     """
@@ -137,8 +138,7 @@ class Light:
 
         It is a share of the surface's colour.
         """
-        sun_share = (1 - self.ambient) * _SUN_GAIN
-        return np.asarray(self.tint * sun_share)
+        return np.asarray(self.tint * self._sun_share)
 
     @property
     def sky(self) -> FloatArray:
@@ -153,11 +153,17 @@ class Light:
     @property
     def in_shadow(self) -> float:
         """Brightness of level ground in a shadow, as a share of its brightness in the sun."""
-        sunny = (1 - self.ambient) * _SUN_GAIN * self.to_sun[2]
-        return float(self.ambient / (self.ambient + sunny))
+        sunlight = self._sun_share * self.to_sun[2]
+        return float(self.ambient / (self.ambient + sunlight))
+
+    @property
+    def _sun_share(self) -> float:
+        """Share of the sun in the light, with its gain."""
+        direct_share = 1 - self.ambient
+        return direct_share * _SUN_GAIN
 
 
-def light_of(weather: str, time_of_day: str) -> Light:
+def make_light(weather: str, time_of_day: str) -> Light:
     """Return the light in a weather at a time of day.
 
     Args:
@@ -176,8 +182,8 @@ def light_of(weather: str, time_of_day: str) -> Light:
         to_sun=readonly(to_sun),
         tint=readonly(np.array(sky.tint) * (0.82 + 0.18 * air.sun)),
         ambient=1 - sky.sun * air.sun,
-        zenith=_mixed(sky.zenith, grey * 0.8, air.cover),
-        horizon=_mixed(sky.horizon, grey, air.cover),
+        zenith=_mix_colors(sky.zenith, grey * 0.8, air.cover),
+        horizon=_mix_colors(sky.horizon, grey, air.cover),
         cover=air.cover,
         haze=air.haze / 1000,
         wet=air.wet,
@@ -186,9 +192,11 @@ def light_of(weather: str, time_of_day: str) -> Light:
     )
 
 
-def _mixed(color: tuple[int, int, int], other: FloatArray, share: float) -> FloatArray:
+def _mix_colors(
+    color: tuple[int, int, int], other_color: FloatArray, other_share: float
+) -> FloatArray:
     """Return a colour mixed with a share of another one."""
-    mixed = np.array(color) * (1 - share) + other * share
+    mixed = np.array(color) * (1 - other_share) + other_color * other_share
     return readonly(mixed)
 
 
@@ -211,65 +219,80 @@ class Sky:
         """
         import cv2
 
-        level_distance, azimuth = cv2.cartToPolar(x, y)
+        distance, azimuth = cv2.cartToPolar(x, y)
         column = np.asarray(azimuth) * np.float32(_SKY_COLUMNS / (2 * np.pi))
-        slope = z / np.maximum(np.asarray(level_distance), np.float32(1e-6))
+        slope = z / np.maximum(np.asarray(distance), np.float32(1e-6))
         slope = np.clip(slope, 0, np.float32(_MAX_SKY_SLOPE))
         row = slope * np.float32((_SKY_ROWS - 1) / _MAX_SKY_SLOPE)
-        return np.asarray(
-            cv2.remap(self.picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        colors = cv2.remap(
+            self.picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
+        return np.asarray(colors)
 
 
 def make_sky(light: Light, rng: np.random.Generator) -> Sky:
     """Make the sky in a light; `rng` draws the clouds."""
     azimuth = (np.arange(_SKY_COLUMNS) + 0.5) / _SKY_COLUMNS * 2 * np.pi
     slope = np.arange(_SKY_ROWS) / (_SKY_ROWS - 1) * _MAX_SKY_SLOPE
-    up = (np.minimum(slope / 0.6, 1.0) ** 0.7)[:, None, None]
-    gradient = light.horizon * (1 - up) + light.zenith * up
+    zenith_share = np.minimum(slope / 0.6, 1.0) ** 0.7
+    zenith_share = zenith_share[:, None, None]
+    gradient = light.horizon * (1 - zenith_share) + light.zenith * zenith_share
     color = np.broadcast_to(gradient, (_SKY_ROWS, _SKY_COLUMNS, 3)).copy()
     columns = np.broadcast_arrays(np.cos(azimuth), np.sin(azimuth), slope[:, None])
     directions = np.stack(columns, axis=-1)
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    glow = np.maximum(directions @ light.to_sun, 0.0)[..., None]
+    sun_cosine = np.maximum(directions @ light.to_sun, 0.0)[..., None]
     sun_strength = 1 - light.ambient
-    color += sun_strength * light.tint * (90 * glow**12 + 400 * glow**900)
-    clouds = _clouds(azimuth, slope, light.cover, rng)[..., None]
-    cover = clouds * np.minimum(slope / 0.12, 1.0)[:, None, None]
-    cloud_color = light.horizon * (0.92 + 0.12 * glow**4)
-    picture = (color * (1 - cover) + cloud_color * cover).clip(0, 255).astype(np.uint8)
+    glow = 90 * sun_cosine**12 + 400 * sun_cosine**900
+    color += sun_strength * light.tint * glow
+    clouds = _draw_clouds(azimuth, slope, light.cover, rng)[..., None]
+    horizon_fade = np.minimum(slope / 0.12, 1.0)
+    cover = clouds * horizon_fade[:, None, None]
+    cloud_color = light.horizon * (0.92 + 0.12 * sun_cosine**4)
+    mixed = color * (1 - cover) + cloud_color * cover
+    picture = mixed.clip(0, 255).astype(np.uint8)
     return Sky(np.concatenate([picture, picture[:, :1]], axis=1))
 
 
-def _clouds(
+def _draw_clouds(
     azimuth: FloatArray, slope: FloatArray, cover: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw a layer of clouds: the share (rows, columns) of each pixel that it takes, 0 to 0.85."""
+    """Draw a layer of clouds.
+
+    Args:
+        azimuth: Azimuth of each column of the sky's picture, radians.
+        slope: Slope of each row.
+        cover: Share of the sky under clouds.
+        rng: Generator of random numbers.
+
+    Returns:
+        Fraction of each pixel that clouds cover, shape (rows, columns), 0 to 0.85.
+    """
     import cv2
 
-    noise = _seamless_noise(256, rng)
+    noise = _draw_noise(256, rng)
     distance = _CLOUD_DENSITY / np.maximum(slope, 0.04)[:, None]
     column = (distance * np.cos(azimuth) * 8 % 256).astype(np.float32)
     row = (distance * np.sin(azimuth) * 8 % 256).astype(np.float32)
-    layer = np.asarray(
-        cv2.remap(noise, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP),
-        dtype=np.float64,
-    )
-    threshold = np.quantile(noise, 1 - min(cover + 0.15, 0.98))
+    values = cv2.remap(noise, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    layer = np.asarray(values, dtype=np.float64)
+    cloud_share = min(cover + 0.15, 0.98)
+    threshold = np.quantile(noise, 1 - cloud_share)
     thickness = (layer - threshold) / (0.6 * float(noise.std()))
     return np.asarray(0.85 * np.clip(thickness, 0, 1))
 
 
-def _seamless_noise(side: int, rng: np.random.Generator) -> Float32Array:
+def _draw_noise(side: int, rng: np.random.Generator) -> Float32Array:
     """Draw rough and fine noise (side, side) that continues across opposite edges."""
-    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
+    frequencies = np.fft.fftfreq(side)
+    frequency = np.hypot(frequencies[None, :], frequencies[:, None])
     white_noise = np.fft.fft2(rng.standard_normal((side, side)))
     spectrum = white_noise / np.maximum(frequency, 1 / side) ** 1.6
     spectrum[0, 0] = 0
     return np.asarray(np.fft.ifft2(spectrum).real, dtype=np.float32)
 
 
-def rain_streaks(size: tuple[int, int], rain: float, rng: np.random.Generator) -> ByteArray:
+def draw_rain(size: tuple[int, int], rain: float, rng: np.random.Generator) -> ByteArray:
     """Draw the light of rain to add to a picture: streaks, near ones longer and brighter.
 
     Args:
@@ -294,11 +317,12 @@ def rain_streaks(size: tuple[int, int], rain: float, rng: np.random.Generator) -
     brightness = (18 + 40 * nearness).astype(np.int64).tolist()
     for start_point, end_point, value in zip(start_points, end_points, brightness, strict=True):
         cv2.line(streaks, start_point, end_point, value, 1, cv2.LINE_AA, 4)
-    return np.asarray(cv2.merge([cv2.GaussianBlur(streaks, (3, 3), 0)] * 3))
+    blurred = cv2.GaussianBlur(streaks, (3, 3), 0)
+    return np.asarray(cv2.merge([blurred] * 3))
 
 
-def lamplight(scene: Scene) -> Float32Array:
-    """Return the light of lamps on the ground.
+def draw_lamplight(scene: Scene) -> Float32Array:
+    """Draw the light of lamps on the ground.
 
     All moving vehicles have a wide beam ahead and a little light behind them; lanterns have light
     around them.
@@ -319,74 +343,88 @@ def lamplight(scene: Scene) -> Float32Array:
     is_lantern = (props.colors[:, 0] == LANTERN_COLOR).all(axis=1)
     lantern_positions = props.corners[is_lantern, :, :2].mean(axis=1)
     for x, y in lantern_positions.tolist():
-        _add_pool(light_map, x, y)
+        window, east, north = _find_cells_around(x, y, _LANTERN_REACH_M)
+        distance = np.hypot(east, north)
+        decay = np.clip(1 - distance / _LANTERN_REACH_M, 0, 1)
+        light_map[window] += (_LANTERN_BRIGHTNESS * decay).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(light_map, (5, 5), 0))
 
 
-def light_at(light_map: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
-    """Return the light (R, C) at points `x` and `y`, (R, C) metres; 0 beyond the map."""
+def sample_light(light_map: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
+    """Return the light (R, C) at points; 0 beyond the map.
+
+    Args:
+        light_map: Light on the ground, from `draw_lamplight`.
+        x: Coordinates x of the points, shape (R, C), metres.
+        y: Coordinates y of the points, shape (R, C), metres.
+    """
     import cv2
 
     scale = np.float32(1 / _CELL_SIZE_M)
     shift = np.float32(MAP_EXTENT / _CELL_SIZE_M - 0.5)
     column = x * scale + shift
     row = y * scale + shift
-    return np.asarray(cv2.remap(light_map, column, row, cv2.INTER_LINEAR))
+    light = cv2.remap(light_map, column, row, cv2.INTER_LINEAR)
+    return np.asarray(light)
 
 
 def _add_beam(light_map: Float32Array, x: float, y: float, yaw: float, half_length: float) -> None:
-    """Add the beam of a vehicle at a pose to a map, in place."""
-    rows, columns, east, north = _cells_around(x, y, _BEAM_LENGTH_M + half_length)
+    """Add the light of a vehicle to a map, in place.
+
+    Args:
+        light_map: Light on the ground.
+        x: Position x of the vehicle's middle, metres.
+        y: Position y of the vehicle's middle, metres.
+        yaw: Heading of the vehicle, radians.
+        half_length: Half its length, metres.
+    """
+    window, east, north = _find_cells_around(x, y, _BEAM_LENGTH_M + half_length)
     if not east.size:
         return
-    cos = np.cos(yaw)
-    sin = np.sin(yaw)
-    ahead = cos * east + sin * north - half_length
-    aside = np.abs(cos * north - sin * east)
-    width = 0.9 + _BEAM_SPREAD * np.maximum(ahead, 0)
+    from_middle, lateral = ahead_and_left(east, north, yaw)
+    ahead = from_middle - half_length
+    to_side = np.abs(lateral)
+    half_width = 0.9 + _BEAM_SPREAD * np.maximum(ahead, 0)
     onset = np.clip(ahead / 2, 0, 1)
     decay = np.clip(1 - ahead / _BEAM_LENGTH_M, 0, 1) ** 1.5
-    beam = onset * decay * np.clip(1.6 - aside / width, 0, 1)
-    to_rear = np.hypot(ahead + 2 * half_length + 1, aside)
-    rear_light = 0.12 * np.clip(1 - to_rear / 4, 0, 1)
-    light_map[rows, columns] += (_BEAM_BRIGHTNESS * beam + rear_light).astype(np.float32)
+    beam = onset * decay * np.clip(1.6 - to_side / half_width, 0, 1)
+    from_rear = np.hypot(ahead + 2 * half_length + 1, to_side)
+    rear_light = 0.12 * np.clip(1 - from_rear / 4, 0, 1)
+    light_map[window] += (_BEAM_BRIGHTNESS * beam + rear_light).astype(np.float32)
 
 
-def _add_pool(light_map: Float32Array, x: float, y: float) -> None:
-    """Add the light around a lantern to a map, in place."""
-    rows, columns, east, north = _cells_around(x, y, _LANTERN_REACH_M)
-    decay = np.clip(1 - np.hypot(east, north) / _LANTERN_REACH_M, 0, 1)
-    light_map[rows, columns] += (_LANTERN_BRIGHTNESS * decay).astype(np.float32)
-
-
-def _cells_around(x: float, y: float, reach: float) -> tuple[slice, slice, AnyArray, AnyArray]:
-    """Return the cells of the light map up to `reach` metres from a point.
+def _find_cells_around(
+    x: float, y: float, radius_m: float
+) -> tuple[tuple[slice, slice], AnyArray, AnyArray]:
+    """Return the cells of the light map up to `radius_m` from a point.
 
     Returns:
         Rows and columns, and the distances of the cells to the east (1, C) and north (R, 1).
     """
-    rows = _cell_span(y, reach)
-    columns = _cell_span(x, reach)
-    north = _cell_offsets(rows, y)
-    east = _cell_offsets(columns, x)
-    return rows, columns, east[None, :], north[:, None]
+    rows = _find_cell_span(y, radius_m)
+    columns = _find_cell_span(x, radius_m)
+    north = _compute_cell_offsets(rows, y)
+    east = _compute_cell_offsets(columns, x)
+    return (rows, columns), east[None, :], north[:, None]
 
 
-def _cell_span(middle: float, reach: float) -> slice:
-    """Return the rows or columns of the light map up to `reach` metres from a coordinate."""
-    start = int((middle - reach + MAP_EXTENT) / _CELL_SIZE_M)
-    stop = int((middle + reach + MAP_EXTENT) / _CELL_SIZE_M) + 1
-    return slice(max(start, 0), min(max(stop, 0), _LIGHT_CELLS))
+def _find_cell_span(coordinate_m: float, radius_m: float) -> slice:
+    """Return the rows or columns of the light map up to `radius_m` from a coordinate."""
+    start = int((coordinate_m - radius_m + MAP_EXTENT) / _CELL_SIZE_M)
+    stop = int((coordinate_m + radius_m + MAP_EXTENT) / _CELL_SIZE_M) + 1
+    first_cell = max(start, 0)
+    end_cell = min(max(stop, 0), _LIGHT_CELLS)
+    return slice(first_cell, end_cell)
 
 
-def _cell_offsets(span: slice, middle: float) -> AnyArray:
+def _compute_cell_offsets(span: slice, coordinate_m: float) -> AnyArray:
     """Return the distances of rows or columns of the light map from a coordinate, metres."""
     cells = np.arange(span.start, max(span.stop, span.start))
     positions = (cells + 0.5) * _CELL_SIZE_M - MAP_EXTENT
-    return positions - middle
+    return positions - coordinate_m
 
 
-def lit_lamps(world: World, signals: Mapping[Arm, int]) -> dict[int, Color]:
+def find_lit_lamps(world: World, signals: Mapping[Arm, int]) -> dict[int, Color]:
     """Return the colours of the lamps that shine, by their rows among `World.props`.
 
     Args:
@@ -398,5 +436,6 @@ def lit_lamps(world: World, signals: Mapping[Arm, int]) -> dict[int, Color]:
     for head in world.signals:
         if head.arm in signals:
             state = signals[head.arm]
-            colors[head.rows[state]] = LAMP_COLORS[state]
+            lamp_row = head.rows[state]
+            colors[lamp_row] = LAMP_COLORS[state]
     return colors

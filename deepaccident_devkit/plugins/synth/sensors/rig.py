@@ -1,4 +1,4 @@
-"""All sensors of a scenario's agents, and the recordings of each at a moment."""
+"""All sensors of a scenario's agents, and what each records at a moment."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -18,6 +18,7 @@ from deepaccident_devkit.plugins.synth.roads import (
     GroundMap,
     tag_of_code,
 )
+from deepaccident_devkit.plugins.synth.roads.paths import ahead_and_left
 from deepaccident_devkit.plugins.synth.sensors.agents import (
     MOUNTS,
     Agent,
@@ -41,7 +42,7 @@ from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.support.arrays import ByteArray, FloatArray
 from deepaccident_devkit.taxonomy import AGENTS, BEV_RESOLUTION, BEV_SHAPE, CATEGORIES, AgentName
 
-# Row and column of the agent in a BEV picture.
+# Row and column of the agent in a BEV picture, pixels.
 _MIDDLE_PIXEL = (BEV_SHAPE[0] - 1) / 2
 _TAG_OF_CATEGORY = np.array(
     [TAGS["pedestrian" if category == "pedestrian" else "vehicle"] for category in CATEGORIES],
@@ -51,34 +52,43 @@ _TAG_OF_CATEGORY = np.array(
 _BLUR_PIXELS = 0.7
 _NOISE_STD = 0.03
 _GAMMA, _CONTRAST, _TINT = 0.8, 0.8, np.array([1.05, 1.0, 0.88], dtype=np.float32)
-# The purposes of random numbers.
+# Purposes of random numbers, each with its own stream.
 _LOOK_STREAM, _LIDAR_STREAM, _CAMERA_STREAM = range(3)
 
 
-def bev_picture(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevImage:
-    """Paint the BEV picture around an agent; higher road users cover lower ones."""
+def draw_ground_image(scene: Scene, top: GroundMap, ground_from_ego: SE3) -> BevImage:
+    """Draw the BEV picture around an agent; higher road users cover lower ones."""
     import cv2
 
     x, y = ground_from_ego.translation[:2].tolist()
     yaw = ground_from_ego.yaw
-    codes = _map_around(top, x, y, yaw)
+    codes = _resample_map(top, x, y, yaw)
     semantic = np.asarray(cv2.LUT(codes, tag_of_code()), dtype=np.uint8)
     instance = np.zeros(BEV_SHAPE, dtype=np.uint16)
-    poses = _relative_poses(scene.snapshot.poses, x, y, yaw)
+    poses = scene.snapshot.poses
+    ahead, lateral = ahead_and_left(poses[:, 0] - x, poses[:, 1] - y, yaw)
+    ego_poses = np.column_stack([ahead, lateral, poses[:, 2] - yaw])
     actors = scene.actors
     radius = np.hypot(actors.size[:, 0], actors.size[:, 1]) / 2
-    reach = BEV_RESOLUTION * BEV_SHAPE[0] / 2 + radius
-    near = np.flatnonzero(np.abs(poses[:, :2]).max(axis=1) < reach)
-    by_height = near[np.argsort(actors.size[near, 2], kind="stable")]
+    max_distance = BEV_RESOLUTION * BEV_SHAPE[0] / 2 + radius
+    near_rows = np.flatnonzero(np.abs(ego_poses[:, :2]).max(axis=1) < max_distance)
+    by_height = near_rows[np.argsort(actors.size[near_rows, 2], kind="stable")]
     for row in by_height.tolist():
-        window, mask = _footprint(poses[row], actors.size[row])
+        window, mask = _find_footprint(ego_poses[row], actors.size[row])
         semantic[window][mask] = _TAG_OF_CATEGORY[actors.category[row]]
         instance[window][mask] = actors.object_id[row]
     return BevImage(semantic, instance)
 
 
-def _map_around(top: GroundMap, x: float, y: float, yaw: float) -> ByteArray:
-    """Resample the codes of the map to the agent's grid, nearest cell."""
+def _resample_map(top: GroundMap, x: float, y: float, yaw: float) -> ByteArray:
+    """Resample the codes of the map to an agent's grid, nearest cell.
+
+    Args:
+        top: Map of the ground with everything on it.
+        x: Position x of the agent, metres.
+        y: Position y of the agent, metres.
+        yaw: Heading of the agent, radians.
+    """
     import cv2
 
     cos = np.cos(yaw)
@@ -102,18 +112,9 @@ def _map_around(top: GroundMap, x: float, y: float, yaw: float) -> ByteArray:
     return np.asarray(codes)
 
 
-def _relative_poses(poses: FloatArray, x: float, y: float, yaw: float) -> FloatArray:
-    """Convert poses (A, 3) from the ground frame to the frame of an agent."""
-    dx = poses[:, 0] - x
-    dy = poses[:, 1] - y
-    cos = np.cos(yaw)
-    sin = np.sin(yaw)
-    ahead = cos * dx + sin * dy
-    lateral = cos * dy - sin * dx
-    return np.column_stack([ahead, lateral, poses[:, 2] - yaw])
-
-
-def _footprint(pose: FloatArray, size: FloatArray) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+def _find_footprint(
+    pose: FloatArray, size: FloatArray
+) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
     """Return the pixels with their middle on a box, seen from above.
 
     Args:
@@ -126,24 +127,24 @@ def _footprint(pose: FloatArray, size: FloatArray) -> tuple[tuple[slice, slice],
     x, y, yaw = pose.tolist()
     length, width, _ = size.tolist()
     radius = np.hypot(length, width) / 2 / BEV_RESOLUTION
-    rows = _window(_MIDDLE_PIXEL - x / BEV_RESOLUTION, radius)
-    columns = _window(_MIDDLE_PIXEL - y / BEV_RESOLUTION, radius)
+    rows = _find_pixel_span(_MIDDLE_PIXEL - x / BEV_RESOLUTION, radius)
+    columns = _find_pixel_span(_MIDDLE_PIXEL - y / BEV_RESOLUTION, radius)
     row_x = (_MIDDLE_PIXEL - np.arange(rows.start, rows.stop)) * BEV_RESOLUTION
     column_y = (_MIDDLE_PIXEL - np.arange(columns.start, columns.stop)) * BEV_RESOLUTION
     dx = (row_x - x)[:, None]
     dy = (column_y - y)[None, :]
-    cos = np.cos(yaw)
-    sin = np.sin(yaw)
-    within_length = np.abs(cos * dx + sin * dy) <= length / 2
-    within_width = np.abs(cos * dy - sin * dx) <= width / 2
-    return (rows, columns), within_length & within_width
+    ahead, lateral = ahead_and_left(dx, dy, yaw)
+    is_within_length = np.abs(ahead) <= length / 2
+    is_within_width = np.abs(lateral) <= width / 2
+    return (rows, columns), is_within_length & is_within_width
 
 
-def _window(middle: float, radius: float) -> slice:
-    """Return the rows or columns of the picture around a middle, pixels."""
-    low = int(np.floor(middle - radius))
-    high = int(np.ceil(middle + radius)) + 1
-    return slice(min(max(low, 0), BEV_SHAPE[0]), max(min(high, BEV_SHAPE[0]), 0))
+def _find_pixel_span(middle: float, radius: float) -> slice:
+    """Return the rows or columns of the BEV picture up to a radius from a middle, pixels."""
+    start = int(np.floor(middle - radius))
+    stop = int(np.ceil(middle + radius)) + 1
+    last_stop = BEV_SHAPE[0]
+    return slice(min(max(start, 0), last_stop), max(min(stop, last_stop), 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +178,7 @@ class Rig:
             recordings.
         exact: Whether calib files are ideal, and numbers of points exact.
         decimals: Number of decimals to which labels and calib are rounded; None for all.
-        name: Name of its mounting and its optics (`plan.SynthConfig`).
+        name: Name of the mounting and the optics of its sensors (`plan.SynthConfig`).
     """
 
     # the world and its agents
@@ -204,51 +205,53 @@ class Rig:
         ground_from_ego = agent.ground_from_ego(scene)
         ground_from_lidar = ground_from_ego @ agent.ego_from_lidar
         lidar = self.lidars[agent.name]
-        rng = self._random(_LIDAR_STREAM, frame, agent)
+        rng = self._make_rng(_LIDAR_STREAM, frame, agent)
         points = scan(scene, lidar, ground_from_lidar, self.air, rng, boxed=not self.clouds)
         labels = annotate(scene, agent, world_from_ground, points, exact=self.exact)
         calib = agent.calib(world_from_ground @ ground_from_ego)
         if not self.exact:
             calib = with_single_precision(calib)
         if self.decimals is not None:
-            labels = _rounded_labels(labels, self.decimals)
-            calib = _rounded_calib(calib, self.decimals)
+            labels = _round_labels(labels, self.decimals)
+            calib = _round_calib(calib, self.decimals)
         return Sighting(labels, calib, points)
 
     def bev(self, scene: Scene, agent: Agent) -> BevImage:
         """Return the picture of an agent's BEV camera."""
         ground_from_ego = agent.ground_from_ego(scene)
-        return bev_picture(scene, self.setting.world.top, ground_from_ego)
+        return draw_ground_image(scene, self.setting.world.top, ground_from_ego)
 
     def surroundings(self, scene: Scene, signals: Mapping[Arm, int]) -> Surroundings | None:
-        """Return the part that the images of all agents at a moment have in common.
+        """Return what the images of all agents share at a moment.
 
         Args:
             scene: The scene.
-            signals: States of the traffic lights, as for `light.lit_lamps`.
+            signals: States of the traffic lights, as for `light.find_lit_lamps`.
 
         Returns:
             None if no images are made.
         """
-        return self.studio.surroundings(scene, signals) if self.studio else None
+        if self.studio is None:
+            return None
+        return self.studio.surroundings(scene, signals)
 
     def images(
         self, scene: Scene, surroundings: Surroundings, agent: Agent, frame: int
     ) -> Iterator[tuple[str, ByteArray]]:
         """Yield channel and picture (H, W, 3) of each camera of an agent, one at a time."""
-        rng = self._random(_CAMERA_STREAM, frame, agent)
+        rng = self._make_rng(_CAMERA_STREAM, frame, agent)
         ground_from_lidar = agent.ground_from_lidar(scene)
         for camera in agent.cameras:
             ground_from_camera = ground_from_lidar @ camera.lidar_from_camera
             picture = camera_picture(scene, surroundings, camera, ground_from_camera, rng)
             if self.name != "released":
-                picture = _by_other_optics(picture, rng)
+                picture = _apply_road_optics(picture, rng)
             yield camera.channel, picture
 
-    def _random(self, purpose: int, frame: int, agent: Agent) -> np.random.Generator:
+    def _make_rng(self, purpose: int, frame: int, agent: Agent) -> np.random.Generator:
         """Return the generator of random numbers for a purpose at a frame of an agent."""
-        seed = [*self.seed, purpose, frame, AGENTS.index(agent.name)]
-        return np.random.default_rng(seed)
+        agent_number = AGENTS.index(agent.name)
+        return np.random.default_rng([*self.seed, purpose, frame, agent_number])
 
 
 def make_rig(  # noqa: PLR0913 - the place, the agents, the sky, and the recordings
@@ -302,33 +305,40 @@ def make_rig(  # noqa: PLR0913 - the place, the agents, the sky, and the recordi
     )
 
 
-def _rounded_labels(labels: Labels, decimals: int) -> Labels:
+def _round_labels(labels: Labels, decimals: int) -> Labels:
     """Return labels with rounded numbers."""
-    names = ("agent_velocity", "center", "size", "yaw", "velocity")
-    return replace(labels, **{name: getattr(labels, name).round(decimals) for name in names})
+    rounded = {}
+    for name in ("agent_velocity", "center", "size", "yaw", "velocity"):
+        rounded[name] = getattr(labels, name).round(decimals)
+    return replace(labels, **rounded)
 
 
-def _rounded_calib(calib: Calib, decimals: int) -> Calib:
+def _round_calib(calib: Calib, decimals: int) -> Calib:
     """Return a calib with rounded numbers."""
 
-    def rounded(pose: SE3) -> SE3:
-        return trusted_se3(pose.matrix.round(decimals))
+    def round_pose(pose: SE3) -> SE3:
+        rounded_matrix = pose.matrix.round(decimals)
+        return trusted_se3(rounded_matrix)
 
     camera_poses = calib.camera_from_lidar.items()
     return Calib(
-        ego_from_lidar=rounded(calib.ego_from_lidar),
-        world_from_ego=rounded(calib.world_from_ego),
-        camera_from_lidar={channel: rounded(pose) for channel, pose in camera_poses},
+        ego_from_lidar=round_pose(calib.ego_from_lidar),
+        world_from_ego=round_pose(calib.world_from_ego),
+        camera_from_lidar={channel: round_pose(pose) for channel, pose in camera_poses},
         intrinsic={channel: matrix.round(decimals) for channel, matrix in calib.intrinsic.items()},
     )
 
 
-def _by_other_optics(picture: ByteArray, rng: np.random.Generator) -> ByteArray:
-    """Return a picture (H, W, 3) that is softer, warmer, of less contrast, and noisier."""
+def _apply_road_optics(picture: ByteArray, rng: np.random.Generator) -> ByteArray:
+    """Render a picture (H, W, 3) as the optics of the rig `road` would record it.
+
+    The result is softer, warmer, noisier and lower in contrast.
+    """
     import cv2
 
-    soft = cv2.GaussianBlur(picture, (0, 0), _BLUR_PIXELS).astype(np.float32) / 255
-    toned = (soft**_GAMMA - 0.5) * _CONTRAST + 0.5
+    blurred = cv2.GaussianBlur(picture, (0, 0), _BLUR_PIXELS)
+    brightness = blurred.astype(np.float32) / 255
+    toned = (brightness**_GAMMA - 0.5) * _CONTRAST + 0.5
     noise = rng.standard_normal(picture.shape, dtype=np.float32) * _NOISE_STD
     values = np.rint((toned * _TINT + noise) * 255)
     return np.asarray(np.clip(values, 0, 255), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""The static world of a scenario, and one moment of it, ready to be recorded."""
+"""A scenario's static world, and one moment of it, ready to be recorded."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,24 +28,24 @@ from deepaccident_devkit.plugins.synth.world import World
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-# Points where bodies touch the ground: the share of the length ahead of and behind the middle, and
-# of the width beside it.
+# Points where bodies touch the ground: their distance ahead of and behind the middle as a share of
+# the length, and to its side as a fraction of the width.
 _AXLE_SHARE = 0.3
 _WHEEL_SHARE = 0.4
-# The owner of solids that belong to no road user.
+# Owner row of solids that do not belong to a road user.
 _NO_OWNER = -1
 _UPRIGHT_CATEGORY = CATEGORIES.index("pedestrian")
 _FENCE_HEIGHT_M = 1e3
-# Largest angle between two lines that count as one, radians, and the share of its length by which a
-# ray may be shorter.
+# Largest angle between two lines that count as one, radians; and the share of its length by which a
+# ray may miss a thing and still be cast.
 _LINE_TOLERANCE = 1e-6
 _LENGTH_TOLERANCE = 1e-3
 # Number of sensor poses that are remembered: five LiDARs, thirty cameras, and a reserve.
 _MAX_REMEMBERED_POSES = 40
 
 
-def placed_on(
-    terrain: Terrain, poses: FloatArray, size: FloatArray, upright: BoolArray
+def place_on_ground(
+    terrain: Terrain, poses: FloatArray, size: FloatArray, is_upright: BoolArray
 ) -> FloatArray:
     """Return the frames of bodies on the ground.
 
@@ -53,7 +53,7 @@ def placed_on(
         terrain: Shape of the ground.
         poses: x, y (metres), yaw (radians) of the boxes' centres, shape (A, 3).
         size: Length, width, height, shape (A, 3), metres.
-        upright: Truth values, shape (A,): bodies that stay upright on a slope.
+        is_upright: Whether each body stays upright on a slope, shape (A,), bool.
 
     Returns:
         Frames (A, 4, 4): origin on the ground below the box's centre, x forward, z up.
@@ -65,16 +65,18 @@ def placed_on(
     left = np.stack([-sin, cos, zero], axis=1)
     height = zero
     if not terrain.is_flat:
-        ahead = _AXLE_SHARE * size[:, :1]
-        aside = _WHEEL_SHARE * size[:, 1:2]
+        axle_distance = _AXLE_SHARE * size[:, :1]
+        wheel_distance = _WHEEL_SHARE * size[:, 1:2]
         xy = poses[:, :2]
-        along = ahead * forward[:, :2]
-        across = aside * left[:, :2]
-        contacts = np.concatenate([xy + along, xy - along, xy + across, xy - across])
-        front, rear, port, starboard = terrain.height(contacts).reshape(4, -1)
-        tilted = ~upright
-        forward[tilted, 2] = ((front - rear) / (2 * ahead[:, 0]))[tilted]
-        left[tilted, 2] = ((port - starboard) / (2 * aside[:, 0]))[tilted]
+        to_front = axle_distance * forward[:, :2]
+        to_left = wheel_distance * left[:, :2]
+        contacts = [xy + to_front, xy - to_front, xy + to_left, xy - to_left]
+        contact_height = terrain.height(np.concatenate(contacts))
+        front, rear, port, starboard = contact_height.reshape(4, -1)
+        pitch_slope = (front - rear) / (2 * axle_distance[:, 0])
+        roll_slope = (port - starboard) / (2 * wheel_distance[:, 0])
+        forward[:, 2] = np.where(is_upright, 0.0, pitch_slope)
+        left[:, 2] = np.where(is_upright, 0.0, roll_slope)
         height = (front + rear + port + starboard) / 4
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     up = np.cross(forward, left)
@@ -89,11 +91,12 @@ def placed_on(
     return frames
 
 
-def moved(corners: FloatArray, frames: FloatArray) -> FloatArray:
+def move_points(points: FloatArray, frames: FloatArray) -> FloatArray:
     """Move points (P, K, 3) in the own frames of P bodies by the bodies' frames (P, 4, 4)."""
-    turned: FloatArray = corners @ np.swapaxes(frames[:, :3, :3], 1, 2)
+    rotation = np.swapaxes(frames[:, :3, :3], 1, 2)
+    rotated: FloatArray = points @ rotation
     translation = frames[:, None, :3, 3]
-    return turned + translation
+    return rotated + translation
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +126,8 @@ class Surfaces:
     @cached_property
     def colors(self) -> FloatArray:
         """RGB colours of the faces in white light, shape (F, 3), float64, 0 to 255."""
-        return self.solids.colors.reshape(-1, 3).astype(np.float64)
+        colors = self.solids.colors.reshape(-1, 3)
+        return colors.astype(np.float64)
 
     @cached_property
     def face_owner(self) -> IntArray:
@@ -142,7 +146,7 @@ class Setting:
         moving: Rows of the actors that are not parked, shape (M,).
         parked: Rows of the parked actors, shape (A − M,).
         moving_shapes: Solids of the moving actors, each in its owner's frame.
-        moving_owner: Row of the actor to which each of these solids belongs, shape (Q,).
+        moving_owner: Row of the actor that each of these solids belongs to, shape (Q,).
         props: Rows of the world's solids among the solids of `static`, shape (W,).
         caster: Caster of rays against the static world and the ground.
     """
@@ -166,12 +170,12 @@ class Setting:
         self.world = world
         self.actors = actors
         self.terrain = world.terrain
-        parked = np.array([actor.parked for actor in actors.all], dtype=bool)
-        solid_parked = parked[actors.solid_actor]
+        is_parked = np.array([actor.parked for actor in actors.all], dtype=bool)
+        is_parked_solid = is_parked[actors.solid_actor]
         frames = self.frames(actors.at(0.0).poses)
-        parked_solids = np.flatnonzero(solid_parked)
+        parked_solids = np.flatnonzero(is_parked_solid)
         owners = actors.solid_actor[parked_solids]
-        parked_corners = moved(actors.solids.corners[parked_solids], frames[owners])
+        parked_corners = move_points(actors.solids.corners[parked_solids], frames[owners])
         num_props = len(world.props)
         self.static = Surfaces(
             concatenate_solids([actors.solids.select(parked_solids), world.props]),
@@ -179,12 +183,13 @@ class Setting:
             np.concatenate([owners, np.full(num_props, _NO_OWNER)]),
         )
         self.props = len(parked_solids) + np.arange(num_props)
-        self.moving = np.flatnonzero(~parked)
-        self.parked = np.flatnonzero(parked)
-        self.moving_shapes = actors.solids.select(np.flatnonzero(~solid_parked))
-        self.moving_owner = actors.solid_actor[~solid_parked]
+        self.moving = np.flatnonzero(~is_parked)
+        self.parked = np.flatnonzero(is_parked)
+        moving_solids = np.flatnonzero(~is_parked_solid)
+        self.moving_shapes = actors.solids.select(moving_solids)
+        self.moving_owner = actors.solid_actor[moving_solids]
         self.caster = make_caster(self.static.corners, self.terrain)
-        self._fence: Caster = make_caster(_fences(self.static.corners))
+        self._fence = make_caster(_make_fences(self.static.corners))
         self._casts_by_pose: dict[bytes, tuple[AnyArray, AnyArray] | None] = {}
 
     @property
@@ -194,18 +199,20 @@ class Setting:
 
     @cached_property
     def face_owner(self) -> IntArray:
-        """Row of the actor to which each face belongs, moving faces too, or −1 (none).
+        """Row of the actor that each face belongs to, including moving faces, or −1 (none).
 
         The shape is (F + 2,). The last two are for `caster.GROUND` and `caster.NO_HIT`, so that
         every face can be used as an index.
         """
-        moving_face_owner = np.repeat(self.moving_owner, FACES_A_SOLID)
-        return np.concatenate([self.static.face_owner, moving_face_owner, [_NO_OWNER, _NO_OWNER]])
+        static_owner = self.static.face_owner
+        moving_owner = np.repeat(self.moving_owner, FACES_A_SOLID)
+        no_owners = [_NO_OWNER, _NO_OWNER]
+        return np.concatenate([static_owner, moving_owner, no_owners])
 
     def frames(self, poses: FloatArray) -> FloatArray:
         """Return the actors' frames on the ground, (A, 4, 4), at poses (A, 3)."""
-        upright = self.actors.category == _UPRIGHT_CATEGORY
-        return placed_on(self.terrain, poses, self.actors.size, upright)
+        is_upright = self.actors.category == _UPRIGHT_CATEGORY
+        return place_on_ground(self.terrain, poses, self.actors.size, is_upright)
 
     def cast_columns(
         self, origin: FloatArray, rays: AnyArray, limit: float = np.inf
@@ -224,61 +231,76 @@ class Setting:
             Distances and faces, shape (R · C,) each.
         """
         flat_rays = rays.reshape(-1, 3)
-        if not self.terrain.is_flat or not _in_columns(rays):
+        if not self.terrain.is_flat or not _share_ground_lines(rays):
             return self.caster.cast(origin, flat_rays)
         distance = plane_distance(origin[2], flat_rays[:, 2]).astype(np.float32)
-        face = np.where(np.isfinite(distance), np.int32(GROUND), np.int32(NO_HIT))
-        clear_length = self._clear_length(origin, rays[0])
+        meets_ground = np.isfinite(distance)
+        face = np.where(meets_ground, np.int32(GROUND), np.int32(NO_HIT))
+        free_length = self._free_length(origin, rays[0])
         level = np.sqrt(rays[..., 0] ** 2 + rays[..., 1] ** 2)
-        level_length = np.minimum(distance, limit).reshape(rays.shape[:2]) * level
-        may_hit = level_length > clear_length * (1 - _LENGTH_TOLERANCE)
+        relevant_distance = np.minimum(distance, limit).reshape(rays.shape[:2])
+        level_length = relevant_distance * level
+        may_hit = level_length > free_length * (1 - _LENGTH_TOLERANCE)
         rows = np.flatnonzero(may_hit.ravel())
         distance[rows], face[rows] = self.caster.cast(origin, flat_rays.take(rows, axis=0))
         return distance, face
 
-    def _clear_length(self, origin: FloatArray, directions: AnyArray) -> AnyArray:
-        """Return the distances over the ground to the first thing above or below rays.
+    def _free_length(self, origin: FloatArray, directions: AnyArray) -> AnyArray:
+        """Return how far rays travel until they are above or below the first object.
 
-        No ray over the same line meets a thing before.
+        Before that distance, no ray over the same line hits an object.
 
         Args:
             origin: Origin of the rays, shape (3,), metres.
             directions: Directions, shape (N, 3).
 
         Returns:
-            Distances (N,), metres; infinite if there is nothing.
+            Distances (N,), metres; infinite if there is no object.
         """
         level = directions * np.array([1, 1, 0], dtype=np.float32)
-        reached, _ = self._fence.cast(np.array([*origin[:2], 0.0]), level)
-        return np.asarray(reached * np.linalg.norm(level, axis=1))
+        x, y, _ = origin
+        distance, _ = self._fence.cast(np.array([x, y, 0.0]), level)
+        return np.asarray(distance * np.linalg.norm(level, axis=1))
 
-    def remembered(
+    def remember_cast(
         self, pose: bytes, cast: Callable[[], tuple[AnyArray, AnyArray]]
     ) -> tuple[AnyArray, AnyArray]:
-        """Return the result of `cast`, from memory if it was called twice for the same pose before.
+        """Cast the rays of a sensor, or return their hits from memory.
 
-        Do not change it.
+        The hits are kept from the second call for the same pose on. Do not change them.
+
+        Args:
+            pose: Pose of the sensor, as bytes.
+            cast: Function that casts the rays of the sensor.
         """
-        known_pose = pose in self._casts_by_pose
+        is_known_pose = pose in self._casts_by_pose
         result = self._casts_by_pose.pop(pose, None) or cast()
-        self._casts_by_pose[pose] = result if known_pose else None
+        self._casts_by_pose[pose] = result if is_known_pose else None
         if len(self._casts_by_pose) > _MAX_REMEMBERED_POSES:
             oldest_pose = next(iter(self._casts_by_pose))
             del self._casts_by_pose[oldest_pose]
         return result
 
 
-def _in_columns(rays: AnyArray) -> bool:
+def _share_ground_lines(rays: AnyArray) -> bool:
     """Return whether the rays (R, C, 3) of each column go over the same line on the ground."""
     top = rays[0, :, :2]
     bottom = rays[-1, :, :2]
     cross_product = top[:, 0] * bottom[:, 1] - top[:, 1] * bottom[:, 0]
     scale = (np.abs(top) * np.abs(bottom)).sum(axis=1)
-    return bool((np.abs(cross_product) <= _LINE_TOLERANCE * scale).all())
+    is_parallel = np.abs(cross_product) <= _LINE_TOLERANCE * scale
+    return bool(is_parallel.all())
 
 
-def _fences(corners: FloatArray) -> FloatArray:
-    """Return upright boxes (P, 8, 3) around solids, from deep below the ground to high above it."""
+def _make_fences(corners: FloatArray) -> FloatArray:
+    """Return upright boxes around solids, from deep below the ground to high above it.
+
+    Args:
+        corners: Corners of the solids, shape (P, 8, 3), metres.
+
+    Returns:
+        Corners of the boxes, shape (P, 8, 3), metres.
+    """
     low = corners.min(axis=1)
     high = corners.max(axis=1)
     low[:, 2] = -_FENCE_HEIGHT_M
@@ -293,7 +315,7 @@ class Scene:
     Attributes:
         setting: The static world.
         snapshot: Positions of the road users, seen from above.
-        frames: Their frames on the ground, as in `placed_on`, shape (A, 4, 4).
+        frames: Frames of the road users on the ground, as in `place_on_ground`, shape (A, 4, 4).
         movers: Surfaces of the road users that are not parked.
         caster: Caster of rays against `movers`.
     """
@@ -312,38 +334,38 @@ class Scene:
     @cached_property
     def box_corners(self) -> FloatArray:
         """Corners of the label boxes on the ground, shape (A, 8, 3), metres."""
-        size = self.actors.size
-        offsets = size[:, None, :] / 2 * CORNER_SIGNS
-        offsets[:, :, 2] += size[:, 2:] / 2 + BOX_CLEARANCE
-        return moved(offsets, self.frames)
+        half_size = self.actors.size[:, None, :] / 2
+        corners = half_size * CORNER_SIGNS
+        corners[:, :, 2] += half_size[:, :, 2] + BOX_CLEARANCE
+        return move_points(corners, self.frames)
 
     @property
     def face_owner(self) -> IntArray:
-        """Row of the actor to which each face belongs, as in `Setting.face_owner`."""
+        """Row of the actor that each face belongs to, as in `Setting.face_owner`."""
         return self.setting.face_owner
 
     def cast(
-        self, origin: FloatArray, directions: AnyArray, *, near: IntArray | None = None
+        self, origin: FloatArray, directions: AnyArray, *, mover_rays: IntArray | None = None
     ) -> tuple[AnyArray, AnyArray]:
         """Find where N rays from above the ground first meet a surface or the ground.
 
         Args:
             origin: Origin of the rays, as for `Caster.cast`.
             directions: Directions, shape (N, 3).
-            near: Rows of the rays that can meet a moving road user; None for all.
+            mover_rays: Rows of the rays that can meet a moving road user; None for all.
 
         Returns:
             Distances (N,) in lengths of the direction, infinite if a ray meets nothing; and the
             faces (N,), or `caster.GROUND` or `caster.NO_HIT`.
         """
-        rows = np.arange(len(directions)) if near is None else near
-        reached, mover_face = self._cast_at_movers(origin, directions, rows)
+        rows = np.arange(len(directions)) if mover_rays is None else mover_rays
+        mover_distance, mover_face = self._cast_at_movers(origin, directions, rows)
         reach = np.full(len(directions), np.inf, dtype=np.float32)
-        reach[rows] = reached
+        reach[rows] = mover_distance
         distance, face = self.setting.caster.cast(origin, directions, reach)
-        ahead = np.flatnonzero(reached < distance[rows])
-        distance[rows[ahead]] = reached[ahead]
-        face[rows[ahead]] = mover_face[ahead]
+        hits = np.flatnonzero(mover_distance < distance[rows])
+        distance[rows[hits]] = mover_distance[hits]
+        face[rows[hits]] = mover_face[hits]
         return distance, face
 
     def with_movers(
@@ -351,42 +373,42 @@ class Scene:
         origin: FloatArray,
         directions: AnyArray,
         static_hits: tuple[AnyArray, AnyArray],
-        near: IntArray,
+        mover_rays: IntArray,
     ) -> tuple[AnyArray, AnyArray]:
-        """Add moving road users to the hits of rays without them.
+        """Add moving road users to the hits of rays at the static world.
 
         Args:
             origin: Origin of the rays, as for `cast`.
             directions: Directions, shape (N, 3).
             static_hits: Distances and faces of the rays without moving road users.
-            near: Rows of the rays that can meet a moving road user.
+            mover_rays: Rows of the rays that can meet a moving road user.
 
         Returns:
             Distances and faces, as from `cast`.
         """
         static_distance, static_face = static_hits
-        reached, mover_face = self._cast_at_movers(origin, directions, near)
-        ahead = np.flatnonzero(reached < static_distance[near])
+        mover_distance, mover_face = self._cast_at_movers(origin, directions, mover_rays)
+        hits = np.flatnonzero(mover_distance < static_distance[mover_rays])
         distance = static_distance.copy()
         face = static_face.copy()
-        distance[near[ahead]] = reached[ahead]
-        face[near[ahead]] = mover_face[ahead]
+        distance[mover_rays[hits]] = mover_distance[hits]
+        face[mover_rays[hits]] = mover_face[hits]
         return distance, face
 
     def _cast_at_movers(
         self, origin: FloatArray, directions: AnyArray, rows: IntArray
     ) -> tuple[AnyArray, AnyArray]:
-        """Return distances and faces of the rays of `rows` until they meet a moving road user."""
+        """Return distances and faces where the rays of `rows` meet a moving road user."""
         rays = directions.take(rows, axis=0)
         ray_origin = origin if origin.ndim == 1 else origin[rows]
-        reached, face = self.caster.cast(ray_origin, rays)
-        return reached, face + self.setting.faces
+        distance, face = self.caster.cast(ray_origin, rays)
+        return distance, face + self.setting.faces
 
 
 def make_scene(setting: Setting, time: float) -> Scene:
     """Make the scene at a time, seconds since the first recorded frame."""
     snapshot = setting.actors.at(time)
     frames = setting.frames(snapshot.poses)
-    corners = moved(setting.moving_shapes.corners, frames[setting.moving_owner])
+    corners = move_points(setting.moving_shapes.corners, frames[setting.moving_owner])
     movers = Surfaces(setting.moving_shapes, corners, setting.moving_owner)
     return Scene(setting, snapshot, frames, movers, make_caster(corners))

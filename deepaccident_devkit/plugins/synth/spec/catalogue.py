@@ -1,6 +1,5 @@
 """Scenario files from text to template, draws from a template, and the paper's twelve designs."""
 
-import os
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -19,7 +18,7 @@ from deepaccident_devkit.plugins.synth.spec.checks import (
 from deepaccident_devkit.plugins.synth.spec.model import ActorSpec, AllOf, Part, Role, ScenarioSpec
 from deepaccident_devkit.plugins.synth.spec.reading import parse_yaml, read_part
 from deepaccident_devkit.support.reading import fault_text, read_bytes
-from deepaccident_devkit.support.text import path_of
+from deepaccident_devkit.support.text import PathType, path_of
 
 _EXCHANGED_ROLES: dict[Role, Role] = {
     "ego": "other", "other": "ego", "ego_behind": "other_behind", "other_behind": "ego_behind",
@@ -84,30 +83,38 @@ def draw(template: SpecTemplate, rng: np.random.Generator) -> ScenarioSpec:
     spec = cast("ScenarioSpec", template.root.draw(rng))
     actor_parts = cast("AllOf", template.root.fields["actors"]).items
     actors = [
-        _completed(actor, cast("Part", part), spec, rng)
+        _complete_actor(actor, cast("Part", part), spec, rng)
         for actor, part in zip(spec.actors, actor_parts, strict=True)
     ]
     roles = {actor.role for actor in actors}
     actors += [ActorSpec(role=role) for role in LEADERS if role not in roles]
     spec = replace(spec, actors=tuple(actors))
     if spec.exchange and bool(rng.random() < 0.5):
-        return _exchanged(spec)
+        return _exchange_roles(spec)
     return replace(spec, exchange=False)
 
 
-def _completed(
+def _complete_actor(
     actor: ActorSpec, part: Part, spec: ScenarioSpec, rng: np.random.Generator
 ) -> ActorSpec:
-    """Return an actor with the values that follow from others."""
+    """Fill in an actor's values that follow from other fields.
+
+    Args:
+        actor: A draw of the actor.
+        part: The actor in the file.
+        spec: A draw of the scenario.
+        rng: Generator of random numbers.
+    """
     if actor.role == "pedestrian":
         return replace(actor, category="pedestrian")
     if "lane" in part.fields or spec.road.lanes == 1:
         return actor
-    lane = int(rng.choice(usual_lanes(actor.turn, spec.road.lanes)))
+    lanes = usual_lanes(actor.turn, spec.road.lanes)
+    lane = int(rng.choice(lanes))
     return replace(actor, lane=lane)
 
 
-def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
+def _exchange_roles(spec: ScenarioSpec) -> ScenarioSpec:
     """Return a scenario in which ego and other have changed places."""
     previous_arm = spec.actor("ego").from_arm
     actors = []
@@ -116,38 +123,39 @@ def _exchanged(spec: ScenarioSpec) -> ScenarioSpec:
         actors.append(replace(actor, role=role))
     meet = spec.meet
     if meet is not None:
-        roles = [_EXCHANGED_ROLES.get(role, role) for role in meet.actors]
-        meet = replace(meet, actors=(roles[0], roles[1]))
+        role, other_role = (_EXCHANGED_ROLES.get(role, role) for role in meet.actors)
+        meet = replace(meet, actors=(role, other_role))
     spec = replace(spec, actors=tuple(actors), meet=meet, exchange=True)
     new_arm = spec.actor("ego").from_arm
     if spec.road.kind == "three-way" or previous_arm is None or new_arm is None:
         return spec
-    return _turned(spec, ARMS.index(previous_arm) - ARMS.index(new_arm))
+    return _turn_arms(spec, ARMS.index(previous_arm) - ARMS.index(new_arm))
 
 
-def _turned(spec: ScenarioSpec, quarters: int) -> ScenarioSpec:
+def _turn_arms(spec: ScenarioSpec, quarters: int) -> ScenarioSpec:
     """Return a scenario with all arms turned by a number of quarter turns, counter-clockwise."""
 
-    def turned_arm(arm: Arm) -> Arm:
+    def turn_arm(arm: Arm) -> Arm:
         index = ARMS.index(arm) + quarters
         return ARMS[index % len(ARMS)]
 
-    hump = spec.road.hump
-    if hump is not None:
-        hump = replace(hump, arm=turned_arm(hump.arm))
+    road = spec.road
+    if road.hump is not None:
+        turned_hump = replace(road.hump, arm=turn_arm(road.hump.arm))
+        road = replace(road, hump=turned_hump)
     actors = []
     for actor in spec.actors:
         arm = actor.from_arm
-        actors.append(actor if arm is None else replace(actor, from_arm=turned_arm(arm)))
-    return replace(spec, road=replace(spec.road, hump=hump), actors=tuple(actors))
+        actors.append(actor if arm is None else replace(actor, from_arm=turn_arm(arm)))
+    return replace(spec, road=road, actors=tuple(actors))
 
 
-def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
+def read_spec(path: PathType) -> SpecTemplate:
     """Read the scenario of a YAML file (docs/synth.md has all fields).
 
     Raises:
-        ConfigError: There is no such file, or it is no possible scenario; the message names line,
-            field and remedy.
+        ConfigError: There is no such file, or it does not describe a possible scenario; the message
+            names line, field and remedy.
     """
     try:
         text = read_bytes(path_of(path), "spec").decode()
@@ -161,7 +169,7 @@ def read_spec(path: str | os.PathLike[str]) -> SpecTemplate:
     if len(text) > _MAX_CHARACTERS:
         raise ConfigError(
             f"{path}: has more than {_MAX_CHARACTERS} characters; give a scenario file, "
-            "it has a few dozen lines"
+            "which has a few dozen lines"
         )
     return parse_spec(text, str(path))
 
@@ -174,7 +182,8 @@ def parse_spec(text: str, source: str = "scenario") -> SpecTemplate:
         source: Name of the file in error messages.
 
     Raises:
-        ConfigError: It is no possible scenario; the message names line, field and remedy.
+        ConfigError: The text does not describe a possible scenario; the message names line, field
+            and remedy.
     """
     root = read_part(parse_yaml(text, source), ScenarioSpec)
     check_scenario_spec(root)
@@ -198,5 +207,6 @@ def design_text(number: int) -> str:
 
 @cache
 def read_design(number: int) -> SpecTemplate:
-    """Read the scenario of a design; raises ConfigError if there is no such design."""
-    return parse_spec(design_text(number), f"design {number}")
+    """Read the scenario of a design; raise ConfigError if there is no such design."""
+    text = design_text(number)
+    return parse_spec(text, f"design {number}")

@@ -12,15 +12,15 @@ from deepaccident_devkit.plugins.synth.spec.model import AllOf, Part, Role
 # Arm, turn and lane of a driver.
 _Movement: TypeAlias = tuple[Arm, Turn, int]
 LEADERS: Final[Mapping[Role, Role]] = {"ego_behind": "ego", "other_behind": "other"}
-"""Role of the leader by the role of its follower."""
-_LEADING_ROLES: Final = tuple(LEADERS.values())
-_AGENT_ROLES: Final = (*_LEADING_ROLES, *LEADERS)
-_AGENT_CATEGORIES: Final = ("car", "truck", "van", "motorcycle")
-_WALKER_ROLE: Final = "pedestrian"
-_MAX_ACTORS: Final = 100
-# From kerb to kerb no pedestrian becomes faster.
-_MAX_WALKING_SPEED: Final = 3.0  # m/s
-_FORBIDDEN_FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
+"""Follower's role → leader's role."""
+_LEADING_ROLES = tuple(LEADERS.values())
+_AGENT_ROLES = (*_LEADING_ROLES, *LEADERS)
+_AGENT_CATEGORIES = ("car", "truck", "van", "motorcycle")
+_WALKER_ROLE = "pedestrian"
+_MAX_ACTORS = 100
+# No pedestrian becomes faster between the kerbs.
+_MAX_WALKING_SPEED = 3.0  # m/s
+_FORBIDDEN_FIELDS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(LEADERS, ("from_arm", "turn", "lane", "start_distance", "side", "lane_change")),
     **dict.fromkeys((*_LEADING_ROLES, "background"), ("gap", "side")),
     _WALKER_ROLE: ("turn", "lane", "gap", "ignores", "lane_change"),
@@ -32,29 +32,31 @@ def check_scenario_spec(root: Part) -> None:
     """Check the rules that the types of the fields cannot express.
 
     Raises:
-        ConfigError: A possible draw is no possible scenario; the message names line and field.
+        ConfigError: A draw would give an impossible scenario; the message names line and field.
     """
-    actors = _actors(root)
+    actors = _list_actors(root)
     _check_roles(root, actors)
     _check_roads(root)
-    junctions = _junctions(root)
+    junctions = _list_junctions(root)
     for actor in actors:
         _check_fields(actor)
         _check_category(actor)
-        _check_way(actor, junctions)
+        _check_route(actor, junctions)
         _check_lane(actor, junctions)
         _check_speed(actor)
     _check_view(root, actors)
     _check_meeting(root, actors, junctions)
 
 
-def _actors(root: Part) -> Sequence[Part]:
+def _list_actors(root: Part) -> Sequence[Part]:
     """Return the actors that a file names."""
     actors = root.fields["actors"]
-    return actors.items if isinstance(actors, AllOf) else ()  # type: ignore[return-value]
+    if not isinstance(actors, AllOf):
+        return ()
+    return actors.items  # type: ignore[return-value]
 
 
-def _role(actor: Part) -> Role:
+def _get_role(actor: Part) -> Role:
     """Return the role of an actor."""
     return cast("Role", actor.values("role")[0])
 
@@ -62,22 +64,23 @@ def _role(actor: Part) -> Role:
 def _check_roles(root: Part, actors: Sequence[Part]) -> None:
     """Check that ego and other exist, and that no agent is repeated."""
     if len(actors) > _MAX_ACTORS:
-        sentence = f"there are {len(actors)}; no road has room for so many"
-        raise _fault(root, "actors", sentence, f"keep {_MAX_ACTORS}")
-    counts = Counter(_role(actor) for actor in actors)
+        sentence = f"there are {len(actors)}, but a road has room for only {_MAX_ACTORS}"
+        raise _make_fault(root, "actors", sentence, f"keep {_MAX_ACTORS}")
+    counts = Counter(_get_role(actor) for actor in actors)
     for role in _LEADING_ROLES:
         if not counts[role]:
-            raise _fault(root, "actors", f"there is no actor with role {role}", "add one")
+            sentence = f"there is no actor with role {role}"
+            raise _make_fault(root, "actors", sentence, "add one")
     previous_roles: set[Role] = set()
     for actor in actors:
-        role = _role(actor)
+        role = _get_role(actor)
         if role in _AGENT_ROLES and role in previous_roles:
             sentence = f"there are {counts[role]} actors with role {role}"
-            raise _fault(actor, "role", sentence, "keep one")
+            raise _make_fault(actor, "role", sentence, "keep one")
         previous_roles.add(role)
 
 
-def _junctions(root: Part) -> tuple[Junction, ...]:
+def _list_junctions(root: Part) -> tuple[Junction, ...]:
     """Return one junction of each kind and number of lanes that can be drawn."""
     pairs: set[tuple[Any, Any]] = set()
     for road in root.values("road"):
@@ -85,36 +88,38 @@ def _junctions(root: Part) -> tuple[Junction, ...]:
             pairs.update(product(road.values("kind"), road.values("lanes")))
     if not pairs:
         return (Junction(),)
-    return tuple(Junction(RoadSpec(kind=kind, lanes=lanes)) for kind, lanes in sorted(pairs))
+    specs = [RoadSpec(kind=kind, lanes=lanes) for kind, lanes in sorted(pairs)]
+    return tuple(Junction(spec) for spec in specs)
 
 
 def _check_fields(actor: Part) -> None:
     """Check that an actor has only fields of its role, and that it has an arm."""
-    role = _role(actor)
+    role = _get_role(actor)
     for name in actor.fields:
         if name in _FORBIDDEN_FIELDS[role]:
-            raise _fault(actor, name, f"is not possible for the role {role}", "leave it out")
+            raise _make_fault(actor, name, f"is not possible for the role {role}", "remove it")
     if role not in LEADERS and "from_arm" not in actor.fields:
         sentence = f"is missing; the role {role} needs it"
-        raise _fault(actor, "from_arm", sentence, f"add one of {', '.join(ARMS)}")
+        remedy = f"add one of {', '.join(ARMS)}"
+        raise _make_fault(actor, "from_arm", sentence, remedy)
 
 
 def _check_category(actor: Part) -> None:
     """Check that the category of an actor fits its role."""
     if "category" not in actor.fields:
         return
-    role = _role(actor)
-    possible = _possible_categories(role)
+    role = _get_role(actor)
+    possible = _list_categories(role)
     for category in actor.values("category"):
         if category not in possible:
             remedy = (
                 f"choose {', '.join(possible)}; a cyclist has the role background, "
                 "a pedestrian the role pedestrian"
             )
-            raise _fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
+            raise _make_fault(actor, "category", f"the role {role} cannot be a {category}", remedy)
 
 
-def _possible_categories(role: Role) -> tuple[str, ...]:
+def _list_categories(role: Role) -> tuple[str, ...]:
     """Return the categories that an actor of a role can have."""
     if role == _WALKER_ROLE:
         return (_WALKER_ROLE,)
@@ -123,24 +128,24 @@ def _possible_categories(role: Role) -> tuple[str, ...]:
     return _AGENT_CATEGORIES
 
 
-def _check_way(actor: Part, junctions: Sequence[Junction]) -> None:
+def _check_route(actor: Part, junctions: Sequence[Junction]) -> None:
     """Check that every junction has the arm of an actor, and allows its turn."""
-    if _role(actor) in LEADERS:
+    if _get_role(actor) in LEADERS:
         return
     for junction, arm, turn in product(junctions, actor.values("from_arm"), actor.values("turn")):
         kind = junction.spec.kind
         if arm not in junction.arms:
             remedy = f"choose {' or '.join(junction.arms)}"
-            raise _fault(actor, "from_arm", f"a {kind} junction has no {arm} arm", remedy)
-        if _drives(actor) and turn not in junction.turns(arm):
-            sentence = f"nobody can go {turn} from the {arm} arm of a {kind} junction"
+            raise _make_fault(actor, "from_arm", f"a {kind} junction has no {arm} arm", remedy)
+        if _is_driver(actor) and turn not in junction.turns(arm):
+            sentence = f"the turn {turn} is impossible from the {arm} arm of a {kind} junction"
             remedy = f"choose {' or '.join(junction.turns(arm))}"
-            raise _fault(actor, "turn", sentence, remedy)
+            raise _make_fault(actor, "turn", sentence, remedy)
 
 
-def _drives(actor: Part) -> bool:
+def _is_driver(actor: Part) -> bool:
     """Return whether an actor is a vehicle that moves."""
-    return _role(actor) not in (_WALKER_ROLE, "parked")
+    return _get_role(actor) not in (_WALKER_ROLE, "parked")
 
 
 def _check_lane(actor: Part, junctions: Sequence[Junction]) -> None:
@@ -149,26 +154,26 @@ def _check_lane(actor: Part, junctions: Sequence[Junction]) -> None:
     lane = max(actor.values("lane"))
     if lane >= num_lanes:
         sentence = f"there is no lane {lane} where the road has one lane in each direction"
-        raise _fault(actor, "lane", sentence, "choose 0, or give the road two lanes")
+        raise _make_fault(actor, "lane", sentence, "choose 0, or give the road two lanes")
     if all(value is None for value in actor.values("lane_change")):
         return
     if num_lanes < 2:
         sentence = "there is no other lane where the road has one lane in each direction"
-        raise _fault(actor, "lane_change", sentence, "leave it out, or give the road two lanes")
+        raise _make_fault(actor, "lane_change", sentence, "remove it, or give the road two lanes")
     if set(actor.values("turn")) != {"straight"}:
         sentence = "is possible only with the turn straight"
-        raise _fault(actor, "lane_change", sentence, "leave it out, or go straight on")
+        raise _make_fault(actor, "lane_change", sentence, "remove it, or use the turn straight")
 
 
 def _check_speed(actor: Part) -> None:
     """Check the speed of a pedestrian, who walks or runs over the road and stops at its end."""
     speeds = [speed for speed in actor.values("max_speed") if speed is not None]
     max_speed = max(speeds, default=0.0)
-    if _role(actor) == _WALKER_ROLE and max_speed > _MAX_WALKING_SPEED:
+    if _get_role(actor) == _WALKER_ROLE and max_speed > _MAX_WALKING_SPEED:
         sentence = (
             f"expected 0.5 to {_MAX_WALKING_SPEED:g} m/s for a pedestrian, found {max_speed:g}"
         )
-        raise _fault(actor, "max_speed", sentence, "walking is 1 to 2 m/s, running 3")
+        raise _make_fault(actor, "max_speed", sentence, "walking is 1 to 2 m/s, running is 3 m/s")
 
 
 def _check_roads(root: Part) -> None:
@@ -202,20 +207,20 @@ def _check_view(root: Part, actors: Sequence[Part]) -> None:
     if "hidden" not in root.values("view"):
         return
     ego, other = (
-        next(actor for actor in actors if _role(actor) == role) for role in _LEADING_ROLES
+        next(actor for actor in actors if _get_role(actor) == role) for role in _LEADING_ROLES
     )
     for ego_arm, other_arm in product(ego.values("from_arm"), other.values("from_arm")):
         if abs(ARMS.index(ego_arm) - ARMS.index(other_arm)) % 2 == 0:
             sentence = (
                 f"no house can stand between ego from the {ego_arm} and other from the {other_arm}"
             )
-            raise _fault(root, "view", sentence, "choose open, or neighbouring arms")
+            raise _make_fault(root, "view", sentence, "choose open, or neighbouring arms")
 
 
 def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junction]) -> None:
     """Check that the roles that are timed to meet exist and can meet."""
-    actors_by_role = {_role(actor): actor for actor in actors}
-    counts = Counter(_role(actor) for actor in actors)
+    actors_by_role = {_get_role(actor): actor for actor in actors}
+    counts = Counter(_get_role(actor) for actor in actors)
     meetings = root.values("meet")
     for meeting in meetings:
         if not isinstance(meeting, Part):
@@ -223,31 +228,31 @@ def _check_meeting(root: Part, actors: Sequence[Part], junctions: Sequence[Junct
         roles = meeting_roles(meeting)
         for role in roles:
             if role in LEADERS or role == "parked":
-                remedy = "choose two roles such as ego and other"
-                raise _fault(meeting, "actors", f"{role} cannot be timed", remedy)
+                remedy = "choose two roles, such as ego and other"
+                raise _make_fault(meeting, "actors", f"{role} cannot be timed", remedy)
             if counts[role] != 1:
                 sentence = f"there are {counts[role]} actors with role {role}"
-                raise _fault(meeting, "actors", sentence, "choose roles that one actor has")
+                raise _make_fault(meeting, "actors", sentence, "choose roles that one actor has")
         if roles[0] == roles[1]:
-            raise _fault(meeting, "actors", f"{roles[0]} cannot meet itself", "name two roles")
+            raise _make_fault(meeting, "actors", f"{roles[0]} cannot meet itself", "name two roles")
         pair = (actors_by_role[roles[0]], actors_by_role[roles[1]])
         if None not in meetings:
             for actor in pair:
-                _check_timed(meeting, actor)
-        if all(_drives(actor) and actor.values("lane_change") == (None,) for actor in pair):
+                _check_start(meeting, actor)
+        if all(_is_driver(actor) and actor.values("lane_change") == (None,) for actor in pair):
             _check_crossing(meeting, pair, junctions)
 
 
-def _check_timed(meeting: Part, actor: Part) -> None:
-    """Check that the file gives no start of a timed driver: it follows from the meeting.
+def _check_start(meeting: Part, actor: Part) -> None:
+    """Check that the file does not set the start of a timed driver, which follows from its timing.
 
-    The start distance of a pedestrian is only its place.
+    A pedestrian's start distance only sets its place, so it is permitted.
     """
-    role = _role(actor)
+    role = _get_role(actor)
     if role != _WALKER_ROLE and actor.values("start_distance") != (None,):
-        sentence = f"follows from meet ({meeting.where}) for {role}, who is timed"
-        remedy = "leave it out; meet.offset says who comes later"
-        raise _fault(actor, "start_distance", sentence, remedy)
+        sentence = f"is computed from meet ({meeting.where}) for the timed role {role}"
+        remedy = "remove it; meet.offset sets which of the two comes later"
+        raise _make_fault(actor, "start_distance", sentence, remedy)
 
 
 def meeting_roles(meeting: Part) -> tuple[Role, Role]:
@@ -259,32 +264,34 @@ def meeting_roles(meeting: Part) -> tuple[Role, Role]:
 
 
 def _check_crossing(meeting: Part, pair: tuple[Part, Part], junctions: Sequence[Junction]) -> None:
-    """Check that the paths of two drivers meet, whatever is drawn."""
+    """Check that the paths of two drivers cross, whatever is drawn."""
     for junction in junctions:
-        movements_of_pair = [_movements(actor, junction) for actor in pair]
-        for movements in product(*movements_of_pair):
+        possible_movements = [_list_movements(actor, junction) for actor in pair]
+        for movements in product(*possible_movements):
             routes = [junction.route(*movement) for movement in movements]
             if junction.conflicts(*routes) is not None:
                 continue
-            drivers = [
-                f"{_role(actor)} ({' '.join(map(str, movement))})"
-                for actor, movement in zip(pair, movements, strict=True)
-            ]
-            sentence = f"the ways of {' and '.join(drivers)} do not meet"
-            raise _fault(meeting, "actors", sentence, _crossing_remedy(*movements))
+            drivers = []
+            for actor, movement in zip(pair, movements, strict=True):
+                words = " ".join(map(str, movement))
+                drivers.append(f"{_get_role(actor)} ({words})")
+            sentence = f"the paths of {' and '.join(drivers)} do not cross"
+            raise _make_fault(meeting, "actors", sentence, _suggest_remedy(*movements))
 
 
-def _crossing_remedy(movement: _Movement, other_movement: _Movement) -> str:
-    """Return the remedy for two ways that do not meet."""
-    if (movement[0], movement[2]) == (other_movement[0], other_movement[2]):
+def _suggest_remedy(movement: _Movement, other_movement: _Movement) -> str:
+    """Suggest how to change two routes that do not intersect."""
+    arm, _, lane = movement
+    other_arm, _, other_lane = other_movement
+    if arm == other_arm and lane == other_lane:
         return (
-            "in one lane they follow each other; let one of them come by the other lane, "
+            "in one lane they follow each other; let one of them start in the other lane, "
             "with a lane_change"
         )
     return "change an arm, a turn or a lane"
 
 
-def _movements(actor: Part, junction: Junction) -> Iterator[_Movement]:
+def _list_movements(actor: Part, junction: Junction) -> Iterator[_Movement]:
     """Yield every arm, turn and lane of a driver that can be drawn."""
     for arm, turn in product(actor.values("from_arm"), actor.values("turn")):
         lanes: Sequence[int] = usual_lanes(turn, junction.spec.lanes)
@@ -298,10 +305,13 @@ def usual_lanes(turn: Turn, lanes: int) -> range:
     """Return the lanes of a road from which a turn is usually made."""
     if turn == "left":
         return range(lanes - 1, lanes)
-    return range(1) if turn == "right" else range(lanes)
+    if turn == "right":
+        return range(1)
+    return range(lanes)
 
 
-def _fault(part: Part, name: str, sentence: str, remedy: str) -> ConfigError:
+def _make_fault(part: Part, name: str, sentence: str, remedy: str) -> ConfigError:
     """Return the error for a field of a part."""
-    location = f"{part.line(name)}: {part.path_of(name)}"
-    return ConfigError(f"{location}: {sentence}; {remedy}")
+    line = part.line(name)
+    path = part.path_of(name)
+    return ConfigError(f"{line}: {path}: {sentence}; {remedy}")

@@ -1,4 +1,4 @@
-"""The fields of a scenario file: the parts of a scenario to simulate, and their open choices.
+"""The fields of a scenario file, and the choices that it leaves open.
 
 `spec.draw` draws one value from each range and from each list of choices in a file. A field's name
 is its key in the file, except that `from_arm` is written `from`.
@@ -24,14 +24,14 @@ Category = Literal["car", "truck", "van", "cyclist", "motorcycle", "pedestrian"]
 Weather = Literal["Clear", "Cloudy", "HardRain", "MidRain", "SoftRain", "Wet", "WetCloudy"]
 TimeOfDay = Literal["Noon", "Sunset", "Night"]
 
-# The meta file's names for an arm itself and for the arms 1, 2 and 3 further, counter-clockwise.
+# The meta file's names for the same arm, and for the arms that are 1, 2 and 3 quarter turns further
+# counter-clockwise.
 _SPAWN_SIDES = ("same", "right", "opposite", "left")
-_MEETING_ROLES: tuple[Role, Role] = ("ego", "other")
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """The span of a number, both ends included.
+    """The permitted range of a number, both ends included.
 
     Attributes:
         low: Smallest value.
@@ -51,7 +51,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActorSpec:
-    """One road user that the file names; the road users of the background are drawn in addition.
+    """A road user that the file names; background road users come in addition.
 
     Attributes:
         role: Role in the scenario; each of the first four at most once. `ego`, `other` and the two
@@ -64,12 +64,12 @@ class ActorSpec:
         turn: Turn that it takes at the junction.
         lane: Number of its lane; 0 is the rightmost lane. If not given, it follows from the turn:
             the leftmost lane to turn left, the rightmost to turn right, any lane to go straight on.
-        max_speed: Speed that it reaches on a free straight road, for a pedestrian 3 m/s at most; if
-            not given, drawn by its category.
+        max_speed: Speed that it reaches on a free straight road; at most 3 m/s for a pedestrian. If
+            not set, it is drawn for its category.
         start_distance: Distance along its path from its start to the middle of the junction; for a
             parked vehicle, the distance at which it stands; for a pedestrian, at which it steps
-            onto the road. If not given, it is drawn. Drivers of `meet` cannot have it: their start
-            follows from their timing.
+            onto the road. If not set, it is drawn. It cannot be set for drivers of `meet`, whose
+            start follows from their timing.
         gap: Distance at the start, from bumper to bumper, to the vehicle that it follows; only for
             followers.
         side: Side of the road, as a driver towards the junction sees it: where a parked vehicle
@@ -77,7 +77,7 @@ class ActorSpec:
         lane_change: Distance before the middle of the junction at which it begins to change into
             the other lane of its road; only with the turn `straight`, on a road with two lanes. The
             vehicle behind it stays in its lane.
-        ignores: Rules that it breaks. In the normal twin it obeys them.
+        ignores: Rules that it breaks in the accident. In the normal twin it obeys them.
     """
 
     # identity
@@ -99,12 +99,12 @@ class ActorSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeetSpec:
-    """The road users that are timed to meet where their paths cross.
+    """The two road users that are timed to collide where their paths cross.
 
     Attributes:
-        actors: Two roles that one actor each has; neither a follower nor `parked`.
-        offset: Time by which the second comes to the crossing of the paths after the first, if
-            nobody brakes.
+        actors: Two roles, each of which exactly one actor has; neither a follower nor `parked`.
+        offset: Time by which the second actor comes to the crossing of the paths after the first
+            one, if neither brakes.
     """
 
     actors: tuple[Role, Role] = ("ego", "other")
@@ -142,7 +142,7 @@ class ScenarioSpec:
         exchange: Whether ego and other (and their followers) change places in half of the draws. In
             a draw that is made in Python, whether they have changed places.
         actors: Named road users; `ego` and `other` are among them.
-        meet: Road users that are timed to meet; nobody if not given.
+        meet: Road users that are timed to meet; if not set, there is no such pair.
         background: All other road users.
         weather: Weather of the whole recording, in the release's words.
         time_of_day: Time of day, which decides the light.
@@ -164,7 +164,7 @@ class ScenarioSpec:
     time_of_day: TimeOfDay = "Noon"
 
     def actor(self, role: Role) -> ActorSpec:
-        """Return the first actor of a role; raises KeyError if there is none."""
+        """Return the first actor with a role; raise KeyError if there is none."""
         for actor in self.actors:
             if actor.role == role:
                 return actor
@@ -172,12 +172,14 @@ class ScenarioSpec:
 
     @property
     def spawn_side(self) -> str:
-        """Side of ego from which other comes, in the meta file's words.
+        """Side from which other approaches ego, in the meta file's words.
 
-        It is `left`, `right`, `opposite` or `same`.
+        One of `left`, `right`, `opposite` and `same`.
         """
-        ego, other = (ARMS.index(self.actor(role).from_arm or "west") for role in _MEETING_ROLES)
-        return _SPAWN_SIDES[(other - ego) % len(ARMS)]
+        ego_arm = self.actor("ego").from_arm or "west"
+        other_arm = self.actor("other").from_arm or "west"
+        quarters = ARMS.index(other_arm) - ARMS.index(ego_arm)
+        return _SPAWN_SIDES[quarters % len(ARMS)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,16 +204,16 @@ class Range:
     Attributes:
         low: Smallest number.
         high: Largest number.
-        whole: Whether only whole numbers are drawn.
+        is_whole: Whether only whole numbers are drawn.
     """
 
     low: float
     high: float
-    whole: bool
+    is_whole: bool
 
     def draw(self, rng: np.random.Generator) -> float:
-        """Draw a number of the span."""
-        if self.whole:
+        """Draw a number from the range."""
+        if self.is_whole:
             return int(rng.integers(int(self.low), int(self.high) + 1))
         return float(rng.uniform(self.low, self.high))
 
@@ -235,19 +237,21 @@ class OneOf:
         return option.draw(rng)
 
     def alternatives(self) -> Iterator[Any]:
-        """Iterate over the values; of a range over both ends."""
-        return itertools.chain.from_iterable(option.alternatives() for option in self.options)
+        """Yield the values; a range gives both of its ends."""
+        for option in self.options:
+            yield from option.alternatives()
 
 
 @dataclass(frozen=True, slots=True)
 class AllOf:
-    """A list; a draw has every item."""
+    """A list; a draw contains every item."""
 
     items: tuple[FieldChoice, ...]
 
     def draw(self, rng: np.random.Generator) -> tuple[Any, ...]:
         """Draw each item."""
-        return tuple(item.draw(rng) for item in self.items)
+        values = [item.draw(rng) for item in self.items]
+        return tuple(values)
 
     def alternatives(self) -> Iterator[AllOf]:
         """Yield only the list itself: the open choices are in its items."""
@@ -260,7 +264,7 @@ class Part:
 
     Attributes:
         kind: Dataclass of the part.
-        where: Line of the file, such as `mine.yaml:12`.
+        where: Line of the file where the part begins, such as `mine.yaml:12`.
         path: Path of the part, such as `actors[1]`; empty for the whole file.
         fields: Fields that the file names, in the order of the dataclass; the others have their
             defaults.
@@ -289,15 +293,11 @@ class Part:
         return (default_of(self.kind, name),)
 
     def instances(self) -> Iterator[Any]:
-        """Iterate over the instances that can be drawn (of a range only its ends).
-
-        They are made one at a time.
-        """
-        options = [tuple(_instances(choice)) for choice in self.fields.values()]
-        return (
-            self.kind(**dict(zip(self.fields, values, strict=True)))
-            for values in itertools.product(*options)
-        )
+        """Yield the instances that can be drawn (of a range only its ends), one at a time."""
+        options = [tuple(_list_values(choice)) for choice in self.fields.values()]
+        for values in itertools.product(*options):
+            values_by_name = dict(zip(self.fields, values, strict=True))
+            yield self.kind(**values_by_name)
 
     def line(self, name: str) -> str:
         """Return the line of a field; if the file does not name the field, the line of the part."""
@@ -306,14 +306,16 @@ class Part:
     def path_of(self, name: str) -> str:
         """Return the path of a field, such as `actors[1].from`."""
         key = key_of(name)
-        return f"{self.path}.{key}" if self.path else key
+        if not self.path:
+            return key
+        return f"{self.path}.{key}"
 
 
 FieldChoice: TypeAlias = Fixed | Range | OneOf | AllOf | Part
 
 
-def _instances(choice: FieldChoice) -> Iterator[Any]:
-    """Yield the values of a choice, of a part all its instances."""
+def _list_values(choice: FieldChoice) -> Iterator[Any]:
+    """Yield the values of a choice; a part gives all its instances."""
     for value in choice.alternatives():
         if isinstance(value, Part):
             yield from value.instances()
@@ -331,7 +333,8 @@ def key_of(name: str) -> str:
 
 def default_of(kind: type[Any], name: str) -> Any:
     """Return the default of a field of a dataclass."""
-    field = next(field for field in dataclasses.fields(kind) if field.name == name)
+    fields_by_name = {field.name: field for field in dataclasses.fields(kind)}
+    field = fields_by_name[name]
     if field.default_factory is dataclasses.MISSING:
         return field.default
     return field.default_factory()

@@ -1,4 +1,4 @@
-"""Values of a scenario file with their lines, checked against the types of the model's classes."""
+"""The values of a scenario file with their lines, checked against the types of the model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
-    Final,
     Literal,
     TypeAlias,
     Union,
@@ -31,27 +30,29 @@ from deepaccident_devkit.plugins.synth.spec.model import (
     Range,
     key_of,
 )
-from deepaccident_devkit.support.text import meant_text, spelled
+from deepaccident_devkit.support.text import match_spelling, meant_text
 
 if TYPE_CHECKING:
     import yaml
 
 # The tags that PyYAML gives to plain values by itself.
-_PLAIN_TAGS: Final = tuple(
+_PLAIN_TAGS = tuple(
     f"tag:yaml.org,2002:{name}"
     for name in ("map", "seq", "str", "int", "float", "bool", "null", "timestamp")
 )
-# YAML 1.1 also reads 010 as eight, 1:30 as ninety and 1_0 as ten, which few people expect.
-_DECIMAL_PATTERN: Final = re.compile(
+# Numbers that people and YAML read in the same way. YAML 1.1 also reads 010 as eight, 1:30 as
+# ninety and 1_0 as ten, which few people expect.
+_DECIMAL_PATTERN = re.compile(
     r"[-+]?(\.inf|\.nan|(0|[1-9]\d*)(\.\d*)?([eE][-+]?\d+)?|\.\d+)", re.IGNORECASE
 )
-# Fields with one value, no range or list of choices: they decide which other fields are needed.
-_SINGLE_VALUE_FIELDS: Final = {"name", "design", "exchange", "role"}
-# All numbers of a scenario are smaller.
-_NUMBER_LIMIT: Final = 1e9
+# Fields that must have one value, no range or list of choices, because they decide which other
+# fields are needed.
+_SINGLE_VALUE_FIELDS = {"name", "design", "exchange", "role"}
+# A number that is larger than any number in a scenario.
+_NUMBER_LIMIT = 1e9
 # Largest number of characters of a value that a message shows.
-_MAX_VALUE_CHARACTERS: Final = 80
-# A plain word of YAML: a string, a number, a boolean, None; or something that fits no field.
+_MAX_VALUE_CHARACTERS = 80
+# A plain word of YAML: a string, a number, a boolean or None, or something that fits no field.
 Scalar: TypeAlias = object
 
 
@@ -76,8 +77,9 @@ def parse_yaml(text: str, source: str) -> Node:
         source: Name of the text in messages.
 
     Raises:
-        ConfigError: It is empty or no YAML, or has a repeated key, a key that is no word, an alias,
-            a tag, or a number that is not decimal; the message has line, path and remedy.
+        ConfigError: The text is empty or not YAML, or contains a repeated key, a key that is not a
+            word, an alias, a tag, or a number that is not decimal; the message gives line, path and
+            remedy.
     """
     import yaml
 
@@ -90,33 +92,38 @@ def parse_yaml(text: str, source: str) -> Node:
             )
         return _TreeReader(source, loader).node(root, root.start_mark.line)
     except yaml.MarkedYAMLError as error:
-        raise ConfigError(f"{source}:{_fault(error)}") from error
+        raise ConfigError(f"{source}:{_describe_fault(error)}") from error
     except (yaml.YAMLError, RecursionError) as error:
         fault = shortened(str(error).splitlines()[0])
-        raise ConfigError(f"{source}: no YAML: {fault}; write it again as plain text") from error
+        raise ConfigError(
+            f"{source}: is not valid YAML: {fault}; save it again as plain text"
+        ) from error
 
 
-def _fault(error: yaml.MarkedYAMLError) -> str:
+def _describe_fault(error: yaml.MarkedYAMLError) -> str:
     """Return the message of an error, from the number of the line on.
 
     PyYAML often finds a fault only some lines after the real one.
     """
-    marks = [mark for mark in (error.problem_mark, error.context_mark) if mark]
-    lines = list(dict.fromkeys(mark.line + 1 for mark in marks)) or [1]
+    lines: list[int] = []
+    for mark in (error.problem_mark, error.context_mark):
+        if mark and mark.line + 1 not in lines:
+            lines.append(mark.line + 1)
+    first_line = lines[0] if lines else 1
     beginning = ""
     if len(lines) > 1:
-        beginning = f", or line {lines[-1]}, where the faulty part begins"
+        beginning = f", or line {lines[1]}, where the faulty part begins"
     problem = shortened(str(error.problem))
     return (
-        f"{lines[0]}: no YAML: {problem}; correct that line{beginning}: "
-        "its quotes, brackets or indent (no tabs)"
+        f"{first_line}: is not valid YAML: {problem}; check the quotes, brackets and indentation "
+        f"(no tabs) of that line{beginning}"
     )
 
 
 class _TreeReader:
-    """Reader that makes nodes of PyYAML's nodes.
+    """A reader that converts PyYAML's nodes to `Node`s.
 
-    A node that comes a second time is an alias.
+    A node that is read a second time is an alias.
     """
 
     def __init__(self, source: str, loader: yaml.SafeLoader) -> None:
@@ -125,28 +132,30 @@ class _TreeReader:
         self._node_ids: set[int] = set()
 
     def node(self, raw: yaml.Node, line: int, path: str = "") -> Node:
-        """Return a node with everything in it; `path` is its path, such as `actors[1]`."""
+        """Convert a node with everything in it; `path` is its path, such as `actors[1]`."""
         import yaml
 
         where = f"{self._source}:{line + 1}"
         if id(raw) in self._node_ids:
-            raise self._error(line, path, "aliases (*name) are not read here; write the value out")
+            raise self._make_error(
+                line, path, "aliases (*name) are not supported; write the value out"
+            )
         self._node_ids.add(id(raw))
         if not raw.tag.startswith(_PLAIN_TAGS):
-            sentence = f"tags ({shortened(raw.tag)}) are not read here; leave the tag out"
-            raise self._error(line, path, sentence)
+            sentence = f"tags ({shortened(raw.tag)}) are not supported; remove the tag"
+            raise self._make_error(line, path, sentence)
         if isinstance(raw, yaml.MappingNode):
-            return Node(where, self._entries(raw, path))
+            return Node(where, self._read_entries(raw, path))
         if isinstance(raw, yaml.SequenceNode):
             items = [
                 self.node(item, item.start_mark.line, f"{path}[{index}]")
                 for index, item in enumerate(raw.value)
             ]
             return Node(where, tuple(items))
-        return Node(where, self._scalar(raw, line, path))
+        return Node(where, self._read_scalar(raw, line, path))
 
-    def _scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
-        """Return the value of a plain word; raises ConfigError."""
+    def _read_scalar(self, raw: yaml.Node, line: int, path: str) -> Scalar:
+        """Return a scalar's value; raise ConfigError for a tag or a number that is not decimal."""
         try:
             value = self._loader.construct_object(raw)
         except (ValueError, LookupError, AttributeError, OverflowError) as error:
@@ -155,35 +164,37 @@ class _TreeReader:
             sentence = (
                 f"{raw.value[:40]!r} cannot be read ({fault}); put it in quotes if it is a word"
             )
-            raise self._error(line, path, sentence) from error
+            raise self._make_error(line, path, sentence) from error
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if is_number and not _DECIMAL_PATTERN.fullmatch(raw.value):
             sentence = (
                 f"{shortened(raw.value)!r} is not a plain decimal number; "
                 "write one, or put it in quotes if it is a word"
             )
-            raise self._error(line, path, sentence)
+            raise self._make_error(line, path, sentence)
         return value
 
-    def _entries(self, raw: yaml.MappingNode, path: str) -> dict[str, Node]:
-        """Return the entries of a mapping by key; raises ConfigError."""
+    def _read_entries(self, raw: yaml.MappingNode, path: str) -> dict[str, Node]:
+        """Return a mapping's entries by key; raise ConfigError for a repeated or unusual key."""
         entries: dict[str, Node] = {}
         for raw_key, raw_value in raw.value:
             key = raw_key.value
             line = raw_key.start_mark.line
             if not isinstance(key, str):
-                sentence = "expected a key that is a word, found a list or mapping; write a word"
-                raise self._error(line, path, sentence)
+                sentence = "expected a word as a key, found a list or mapping; write a word"
+                raise self._make_error(line, path, sentence)
             entry_path = f"{path}.{key}" if path else key
             if key in entries:
-                raise self._error(line, entry_path, "is there twice; keep one of them")
+                raise self._make_error(line, entry_path, "appears twice; keep one of them")
             entries[key] = self.node(raw_value, line, entry_path)
         return entries
 
-    def _error(self, line: int, path: str, sentence: str) -> ConfigError:
+    def _make_error(self, line: int, path: str, sentence: str) -> ConfigError:
         """Return the error for a line and a path."""
-        parts = (f"{self._source}:{line + 1}", shortened(path), sentence)
-        return ConfigError(": ".join(part for part in parts if part))
+        location = f"{self._source}:{line + 1}"
+        if path:
+            location = f"{location}: {shortened(path)}"
+        return ConfigError(f"{location}: {sentence}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +221,8 @@ class FieldType:
 def field_types(kind: type[Any]) -> dict[str, FieldType]:
     """Return the types of a model dataclass's fields, by name."""
     hints = get_type_hints(kind, include_extras=True)
-    return {field.name: _field_type(hints[field.name]) for field in dataclasses.fields(kind)}
+    names = [field.name for field in dataclasses.fields(kind)]
+    return {name: _parse_type_hint(hints[name]) for name in names}
 
 
 def required_fields(kind: type[Any]) -> tuple[str, ...]:
@@ -232,12 +244,12 @@ def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
         path: Path of the part in the file, such as `actors[1]`; empty for the whole file.
 
     Raises:
-        ConfigError: It is no mapping, has an unknown key, lacks a required one, or a value does not
-            fit its field.
+        ConfigError: The node is not a mapping, has an unknown key, lacks a required one, or a value
+            does not fit its field.
     """
     entries = node.value
     if not isinstance(entries, Mapping):
-        raise _mismatch(node, path or "the file", "keys and values")
+        raise _make_mismatch(node, path or "the file", "keys and values")
     types_by_name = field_types(kind)
     names_by_key = {key_of(name): name for name in types_by_name}
     prefix = f"{path}." if path else ""
@@ -258,25 +270,27 @@ def read_part(node: Node, kind: type[Any], path: str = "") -> Part:
     return Part(kind, node.where, path, fields, lines)
 
 
-def _field_type(hint: Any) -> FieldType:
+def _parse_type_hint(hint: Any) -> FieldType:
     """Return the field type that a type hint describes."""
     origin = get_origin(hint)
     arguments = get_args(hint)
     if origin in (Union, types.UnionType):
         (member,) = (argument for argument in arguments if argument is not type(None))
-        return dataclasses.replace(_field_type(member), optional=True)
+        return dataclasses.replace(_parse_type_hint(member), optional=True)
     if origin is Annotated:
-        return dataclasses.replace(_field_type(arguments[0]), bounds=arguments[1])
+        return dataclasses.replace(_parse_type_hint(arguments[0]), bounds=arguments[1])
     if origin is Literal:
         return FieldType(str, words=arguments)
     if origin is tuple:
-        length = None if arguments[-1] is Ellipsis else len(arguments)
-        return FieldType(tuple, items=_field_type(arguments[0]), length=length)
+        length = None
+        if arguments[-1] is not Ellipsis:
+            length = len(arguments)
+        return FieldType(tuple, items=_parse_type_hint(arguments[0]), length=length)
     return FieldType(hint)
 
 
 def _read(node: Node, field_type: FieldType, path: str, *, single: bool) -> FieldChoice:
-    """Read a field with its open choices; raises ConfigError.
+    """Read a field with its open choices; raise ConfigError if the value does not fit.
 
     Args:
         node: Value of the field.
@@ -289,87 +303,96 @@ def _read(node: Node, field_type: FieldType, path: str, *, single: bool) -> Fiel
     if not isinstance(node.value, tuple):
         return _read_value(node, field_type, path)
     if single:
-        raise _mismatch(node, path, f"{_described(field_type)}, one value and not several")
+        raise _make_mismatch(node, path, f"{_describe_type(field_type)}, one value, not several")
     if field_type.base in (int, float):
         return _read_range(node, field_type, path)
     if not node.value:
-        raise _mismatch(node, path, _described(field_type))
+        raise _make_mismatch(node, path, _describe_type(field_type))
     return OneOf(_read_items(node.value, field_type, path))
 
 
 def _read_list(node: Node, field_type: FieldType, path: str) -> FieldChoice:
-    """Read a list with every item in it; raises ConfigError."""
+    """Read a list with all its items; raise ConfigError if one does not fit."""
+    nodes = node.value
     item_type = field_type.items
-    if item_type is None or not isinstance(node.value, tuple):
-        raise _mismatch(node, path, _described(field_type))
-    if field_type.length is not None and len(node.value) != field_type.length:
-        raise _mismatch(node, path, f"a list of {field_type.length}")
-    return AllOf(_read_items(node.value, item_type, path))
+    if item_type is None or not isinstance(nodes, tuple):
+        raise _make_mismatch(node, path, _describe_type(field_type))
+    if field_type.length not in (None, len(nodes)):
+        raise _make_mismatch(node, path, f"a list of {field_type.length}")
+    return AllOf(_read_items(nodes, item_type, path))
 
 
 def _read_items(
     nodes: tuple[Node, ...], item_type: FieldType, path: str
 ) -> tuple[FieldChoice, ...]:
-    """Read the items of a list; raises ConfigError."""
-    return tuple(
-        _read_value(node, item_type, f"{path}[{index}]") for index, node in enumerate(nodes)
-    )
+    """Read the items of a list; raise ConfigError if one does not fit."""
+    items = []
+    for index, node in enumerate(nodes):
+        item_path = f"{path}[{index}]"
+        items.append(_read_value(node, item_type, item_path))
+    return tuple(items)
 
 
 def _read_range(node: Node, field_type: FieldType, path: str) -> FieldChoice:
-    """Read a range of numbers; raises ConfigError."""
-    ends = node.value
-    if not isinstance(ends, tuple) or len(ends) != 2:
-        raise _mismatch(node, path, f"{_described(field_type)}, or [low, high]")
-    low = _number(ends[0], field_type, f"{path}[0]")
-    high = _number(ends[1], field_type, f"{path}[1]")
+    """Read a range of numbers; raise ConfigError if it is not valid."""
+    bounds = node.value
+    if not isinstance(bounds, tuple) or len(bounds) != 2:
+        raise _make_mismatch(node, path, f"{_describe_type(field_type)}, or [low, high]")
+    low = _read_number(bounds[0], field_type, f"{path}[0]")
+    high = _read_number(bounds[1], field_type, f"{path}[1]")
     if low > high:
         raise ConfigError(
-            f"{node.where}: {path}: expected [low, high], found [{low:g}, {high:g}]; "
-            "exchange the two"
+            f"{node.where}: {path}: expected [low, high], found [{low:g}, {high:g}]; swap the two"
         )
     return Range(low, high, field_type.base is int)
 
 
 def _read_value(node: Node, field_type: FieldType, path: str) -> FieldChoice:
-    """Read one value; raises ConfigError."""
+    """Read one value; raise ConfigError if it does not fit its field."""
     value = node.value
     if value is None and field_type.optional:
         return Fixed(None)
     if dataclasses.is_dataclass(field_type.base):
         return read_part(node, field_type.base, path)
     if field_type.base in (int, float):
-        return Fixed(_number(node, field_type, path))
+        return Fixed(_read_number(node, field_type, path))
     words = field_type.words
-    value = spelled(value, words)
-    fits = value in words if words else isinstance(value, field_type.base)
+    value = match_spelling(value, words)
+    fits = isinstance(value, field_type.base)
+    if words:
+        fits = value in words
     if not fits:
-        remedy = _remedy(field_type, value) + meant_text(value, words)
-        raise _mismatch(node, path, _described(field_type), remedy)
+        remedy = _find_remedy(field_type, value) + meant_text(value, words)
+        raise _make_mismatch(node, path, _describe_type(field_type), remedy)
     return Fixed(value)
 
 
-def _number(node: Node, field_type: FieldType, path: str) -> float:
-    """Read a number within its bounds; raises ConfigError."""
+def _read_number(node: Node, field_type: FieldType, path: str) -> float:
+    """Read a number; raise ConfigError unless it lies within its bounds."""
     value = node.value
     bounds = field_type.bounds
-    possible = (int,) if field_type.base is int else (int, float)
-    if isinstance(value, bool) or not isinstance(value, possible) or not abs(value) < _NUMBER_LIMIT:
-        raise _mismatch(node, path, _described(field_type), _remedy(field_type, value))
+    number_types = (int,) if field_type.base is int else (int, float)
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, number_types)
+        or not abs(value) < _NUMBER_LIMIT
+    ):
+        remedy = _find_remedy(field_type, value)
+        raise _make_mismatch(node, path, _describe_type(field_type), remedy)
     if bounds is not None and not bounds.low <= value <= bounds.high:
-        raise _mismatch(node, path, _described(field_type))
+        raise _make_mismatch(node, path, _describe_type(field_type))
     return field_type.base(value)  # type: ignore[no-any-return]
 
 
-def _mismatch(node: Node, path: str, expected: str, remedy: str = "") -> ConfigError:
+def _make_mismatch(node: Node, path: str, expected: str, remedy: str = "") -> ConfigError:
     """Return the error for a value that does not fit its field."""
-    value = _value_text(node)
+    value = _format_value(node)
     if len(value) > _MAX_VALUE_CHARACTERS:
         value = f"{value[: _MAX_VALUE_CHARACTERS - 1]}…"
     return ConfigError(f"{node.where}: {path}: expected {expected}, found {value}{remedy}")
 
 
-def _remedy(field_type: FieldType, value: Scalar) -> str:
+def _find_remedy(field_type: FieldType, value: Scalar) -> str:
     """Return the remedy for wrong or missing quotes, or for a number that YAML reads as a text.
 
     YAML reads a number such as `1e1` as a text. The remedy is empty for other faults.
@@ -380,29 +403,36 @@ def _remedy(field_type: FieldType, value: Scalar) -> str:
     if field_type.base in (int, float) and isinstance(value, str):
         return "; write a decimal number, without quotes and without e"
     if field_type.base is bool and value in ("true", "false"):
-        return "; leave the quotes out"
+        return "; remove the quotes"
     return ""
 
 
-def _described(field_type: FieldType) -> str:
+def _describe_type(field_type: FieldType) -> str:
     """Return a type in words."""
     if field_type.words:
         return f"one of {', '.join(field_type.words)}"
     if field_type.base is tuple and field_type.items is not None:
-        words = field_type.items.words
-        return f"a list, as [{', '.join(words[:2])}]" if words else "a list"
+        examples = field_type.items.words[:2]
+        if examples:
+            return f"a list, as [{', '.join(examples)}]"
+        return "a list"
     names = {str: "a text", bool: "true or false", int: "a whole number", float: "a number"}
     text = names.get(field_type.base, "keys and values")
-    return f"{text}, {field_type.bounds}" if field_type.bounds else text
+    if field_type.bounds is None:
+        return text
+    return f"{text}, {field_type.bounds}"
 
 
-def _value_text(node: Node) -> str:
+def _format_value(node: Node) -> str:
     """Return a value as messages show it."""
     value = node.value
-    if isinstance(value, Mapping):
-        return f"the keys {', '.join(value)}" if value else "nothing"
+    if isinstance(value, Mapping) and value:
+        return f"the keys {', '.join(value)}"
     if isinstance(value, tuple):
-        return f"[{', '.join(_value_text(item) for item in value)}]"
-    if value is None:
+        items = [_format_value(item) for item in value]
+        return f"[{', '.join(items)}]"
+    if value is None or isinstance(value, Mapping):
         return "nothing"
-    return repr(value) if isinstance(value, str) else str(value)
+    if isinstance(value, str):
+        return repr(value)
+    return str(value)

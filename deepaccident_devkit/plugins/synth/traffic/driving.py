@@ -11,8 +11,8 @@ import numpy as np
 
 from deepaccident_devkit.plugins.synth.actors import Body
 from deepaccident_devkit.plugins.synth.roads import Arm, Junction, Route, Turn, straight
-from deepaccident_devkit.plugins.synth.roads.layout import OUTWARD, RoadSpec
-from deepaccident_devkit.plugins.synth.roads.paths import Path, through
+from deepaccident_devkit.plugins.synth.roads.layout import OUTWARD, RoadSpec, point_on_arm
+from deepaccident_devkit.plugins.synth.roads.paths import Path, ahead_and_left, shift_path
 from deepaccident_devkit.plugins.synth.spec.model import Role, Rule, Side
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 
@@ -28,11 +28,12 @@ MAX_STEER_RATE = 0.6
 """Fastest turn of the front wheels, radians a second."""
 HARDEST_BRAKING = 8.0
 """The hardest braking on dry asphalt, m/s²."""
-# The steering aims to be on the path again after this distance: a constant, and one for each m/s.
+# The steering aims to be on the path again after a distance: a constant part, and a part for each
+# m/s of speed.
 _LOOK_AHEAD_M = 2.5
 _LOOK_AHEAD_S = 0.25
 _TABLE_SPACING_M = 0.25
-# Length for which the table goes straight on after a path's end.
+# Length for which the table goes straight on after the end of a path.
 _EXTENSION_M = 80.0
 # Braking of drivers before a bend, m/s².
 _BEND_BRAKING = 1.8
@@ -41,9 +42,9 @@ _SPEED_STIFFNESS = 2.5
 # The hardest braking near standstill, m/s², and its increase for each m/s of speed.
 _STANDSTILL_BRAKING = 3.0
 _BRAKING_INCREASE = 1.0
-# A smaller gap counts as this.
+# Smaller gaps count as this one.
 _MIN_GAP_M = 0.1
-# Paths can cross from this distance before the stop line to this distance past the junction.
+# Paths can cross from the first distance before the stop line to the second one past the junction.
 _MARGIN_BEFORE_STOP_LINE_M = 4.0
 _MARGIN_AFTER_EXIT_M = 10.0
 # Distance from the lane's middle to the right, where cyclists ride.
@@ -52,12 +53,12 @@ _CYCLIST_OFFSET_M = 1.1
 _KERB_DISTANCE_M = 0.7
 WALKER = "pedestrian"
 Stretch = tuple[float, float, float]
-"""Start and end of a part of a path, metres along it, and the highest speed there, m/s."""
+"""Start and end of a stretch of a path, metres along it, and the maximum speed on it, m/s."""
 
 
 @dataclass(slots=True, eq=False)
 class MotionState:
-    """The state of all road users that the simulation steps, one row each.
+    """The state of all road users between two steps of the simulation, one row for each.
 
     Attributes:
         x: Positions x of the middle of the rear axle, shape (A,), metres.
@@ -89,15 +90,17 @@ def step_motion(
         on_path: Rows x, y, yaw, curvature of the paths at `state.along`, shape (4, A).
         wheelbase: Wheelbases, shape (A,), metres, infinite for road users without wheels.
     """
-    distance = np.maximum(state.speed + acceleration * (PERIOD / 2), 0.0) * PERIOD
+    mean_speed = state.speed + acceleration * (PERIOD / 2)
+    distance = np.maximum(mean_speed, 0.0) * PERIOD
     state.speed = np.maximum(state.speed + acceleration * PERIOD, 0.0)
-    lateral, turned = _path_offsets(state, on_path)
-    curvature = on_path[3]
-    state.along = state.along + distance * np.cos(turned) / (1.0 - curvature * lateral)
-    steer = _target_steer(state.speed, lateral, turned, curvature, wheelbase)
-    change = steer - state.steer
+    path_x, path_y, path_yaw, curvature = on_path
+    _, lateral = ahead_and_left(state.x - path_x, state.y - path_y, path_yaw)
+    angle = (state.yaw - path_yaw + np.pi) % (2 * np.pi) - np.pi
+    state.along = state.along + distance * np.cos(angle) / (1.0 - curvature * lateral)
+    steer = _compute_steer(state.speed, lateral, angle, curvature, wheelbase)
     max_change = MAX_STEER_RATE * PERIOD
-    state.steer = state.steer + np.minimum(np.maximum(change, -max_change), max_change)
+    change = np.minimum(np.maximum(steer - state.steer, -max_change), max_change)
+    state.steer = state.steer + change
     turn = distance * np.tan(state.steer) / wheelbase
     mean_yaw = state.yaw + turn / 2
     state.x = state.x + distance * np.cos(mean_yaw)
@@ -105,33 +108,26 @@ def step_motion(
     state.yaw = state.yaw + turn
 
 
-def _path_offsets(state: MotionState, on_path: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far each road user is to the left of its path, and turned to the left of it.
-
-    Returns:
-        Distances (A,) in metres and angles (A,) in radians.
-    """
-    x, y, yaw, _ = on_path
-    dx = state.x - x
-    dy = state.y - y
-    lateral = np.cos(yaw) * dy - np.sin(yaw) * dx
-    turned = (state.yaw - yaw + np.pi) % (2 * np.pi) - np.pi
-    return lateral, turned
-
-
-def _target_steer(
+def _compute_steer(
     speed: FloatArray,
     lateral: FloatArray,
-    turned: FloatArray,
+    angle: FloatArray,
     curvature: FloatArray,
     wheelbase: FloatArray,
 ) -> FloatArray:
-    """Return the steering angle that follows the path and returns to it.
+    """Return the steering angles (A,), radians, that follow the path and return to it.
 
     The return is critically damped over the distance ahead.
+
+    Args:
+        speed: Speeds, shape (A,), m/s.
+        lateral: Distances to the left of the path, shape (A,), metres.
+        angle: Angles from the path's direction, shape (A,), radians, positive to the left.
+        curvature: Curvatures of the paths, shape (A,), 1/m.
+        wheelbase: Wheelbases, shape (A,), metres, infinite for road users without wheels.
     """
-    ahead = _LOOK_AHEAD_M + _LOOK_AHEAD_S * speed
-    target = curvature - lateral / ahead**2 - 2 * turned / ahead
+    look_ahead = _LOOK_AHEAD_M + _LOOK_AHEAD_S * speed
+    target = curvature - lateral / look_ahead**2 - 2 * angle / look_ahead
     max_curvature = _MAX_TANGENT / wheelbase
     bounded = np.minimum(np.maximum(target, -max_curvature), max_curvature)
     finite_wheelbase = np.where(wheelbase < np.inf, wheelbase, 0.0)
@@ -139,13 +135,15 @@ def _target_steer(
 
 
 class Tracks:
-    """Points along each path, and the speed that its bends allow; one row for each road user.
+    """A table of points along each path, and of the speeds that the bends of the path allow.
+
+    It has one row for each road user.
 
     Args:
         paths: Path of each road user; it goes straight on after its end.
         lateral: Highest sideways accelerations in bends, shape (A,), m/s².
-        stops: Truth values, shape (A,): whether the road user stops at the path's end.
-        paces: Slow stretches of each road user, before which nobody brakes in advance.
+        stops: Whether each road user stops at the end of its path, shape (A,), bool.
+        paces: Slow stretches of each road user; drivers do not brake in advance for them.
     """
 
     def __init__(
@@ -155,8 +153,8 @@ class Tracks:
         stops: BoolArray,
         paces: Sequence[Sequence[Stretch]] = (),
     ) -> None:
-        longest = max(path.length for path in paths)
-        along = np.arange(0.0, longest + _EXTENSION_M, _TABLE_SPACING_M)
+        lengths = [path.length for path in paths]
+        along = np.arange(0.0, max(lengths) + _EXTENSION_M, _TABLE_SPACING_M)
         distinct_paths = {id(path): path for path in paths}
         row_by_path = {key: row for row, key in enumerate(distinct_paths)}
         tables = [np.stack(path.at(along), axis=-1) for path in distinct_paths.values()]
@@ -164,8 +162,8 @@ class Tracks:
         rows = np.array([row_by_path[id(path)] for path in paths])
         self._points = points  # (P, K, 4)
         self._path_rows = rows  # (A,)
-        ends = np.where(stops, [path.length for path in paths], np.inf)
-        self._allowed = _allowed_speed(along, points[rows, :, 3], lateral, ends)
+        ends = np.where(stops, lengths, np.inf)
+        self._allowed = _compute_allowed_speed(along, points[rows, :, 3], lateral, ends)
         for row, pace in enumerate(paces):
             for begin, end, max_speed in pace:
                 cells = slice(*np.searchsorted(along, (begin, end)))
@@ -176,12 +174,13 @@ class Tracks:
         self._last_cell = len(along) - 2
 
     def at(self, along: FloatArray) -> FloatArray:
-        """Return rows x, y, yaw, curvature (4, A) of the paths at `along` (A,), in metres."""
-        cell, share = self._cell(along)
-        flat = self._flat_offsets + cell
-        before = self._flat_points[:, flat]
-        after = self._flat_points[:, flat + 1]
-        return np.asarray(before + share * (after - before))
+        """Return rows x, y, yaw, curvature (4, A) of the paths at `along` (A,), metres."""
+        cell, share = self._locate_cell(along)
+        flat_cell = self._flat_offsets + cell
+        before = self._flat_points[:, flat_cell]
+        after = self._flat_points[:, flat_cell + 1]
+        points: FloatArray = before + share * (after - before)
+        return points
 
     def points_near(self, rows: IntArray, along: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the points of the table that are nearest to positions on some paths.
@@ -196,33 +195,38 @@ class Tracks:
         """
         nearest = np.rint(along / _TABLE_SPACING_M).astype(np.int64)
         cells = nearest.clip(0, self._last_cell)
-        points = self._points[self._path_rows[rows, None], cells]
-        return np.asarray(points), cells * _TABLE_SPACING_M
+        path_rows = self._path_rows[rows, None]
+        return self._points[path_rows, cells], cells * _TABLE_SPACING_M
 
     def allowed_speed(self, along: FloatArray) -> FloatArray:
-        """Return the highest speeds, (A,) m/s, that allow to brake gently for the bends ahead."""
-        cell, _ = self._cell(along)
+        """Return the highest speeds (A,), m/s, from which drivers can brake gently for bends."""
+        cell, _ = self._locate_cell(along)
         return np.asarray(self._allowed[self._rows, cell])
 
-    def _cell(self, along: FloatArray) -> tuple[IntArray, FloatArray]:
+    def _locate_cell(self, along: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return the cells (A,) of the table at positions (A,), and the shares of them passed."""
         position = along / _TABLE_SPACING_M
         cell = np.minimum(np.maximum(position, 0.0), self._last_cell).astype(np.int64)
         return cell, position - cell
 
 
-def _allowed_speed(
+def _compute_allowed_speed(
     along: FloatArray, curvature: FloatArray, lateral: FloatArray, ends: FloatArray
 ) -> FloatArray:
-    """Return speeds (A, K), m/s, that let each enter the bends ahead slowly enough.
+    """Return the speeds (A, K), m/s, from which drivers reach the bends ahead slowly enough.
 
-    Each also stops at its path's end, where `ends` (A,), in metres, is finite.
+    Args:
+        along: Positions along the paths, shape (K,), metres.
+        curvature: Curvatures of the paths there, shape (A, K), 1/m.
+        lateral: Highest sideways accelerations in bends, shape (A,), m/s².
+        ends: Positions at which road users stop, shape (A,), metres; infinite for those that drive
+            on.
     """
-    bend = lateral[:, None] / np.maximum(np.abs(curvature), 1e-4)
-    bend[along >= ends[:, None]] = 0.0
+    square_speed = lateral[:, None] / np.maximum(np.abs(curvature), 1e-4)
+    square_speed[along >= ends[:, None]] = 0.0
     braking_term = 2 * _BEND_BRAKING * along
-    lead = bend + braking_term
-    lowest_ahead = np.minimum.accumulate(lead[:, ::-1], axis=1)[:, ::-1]
+    reversed_sums = (square_speed + braking_term)[:, ::-1]
+    lowest_ahead = np.minimum.accumulate(reversed_sums, axis=1)[:, ::-1]
     return np.sqrt(np.maximum(lowest_ahead - braking_term, 0.0))
 
 
@@ -252,24 +256,27 @@ class IdmParameters:
 def free_acceleration(
     parameters: IdmParameters, speed: FloatArray, allowed: FloatArray
 ) -> FloatArray:
-    """Return the accelerations (A,), m/s², if nobody is in the way.
+    """Return the accelerations (A,), m/s², if no road user is in the way.
 
     Args:
         parameters: Parameters of the road users.
         speed: Speeds, shape (A,), m/s.
         allowed: Speeds that the bends ahead allow, shape (A,), m/s.
     """
-    on_straight = parameters.acceleration * (1.0 - (speed / parameters.max_speed) ** 4)
+    speed_ratio = speed / parameters.max_speed
+    on_straight = parameters.acceleration * (1.0 - speed_ratio**4)
     in_bend = np.maximum(_SPEED_STIFFNESS * (allowed - speed), -parameters.slowing)
-    return np.asarray(np.clip(np.minimum(on_straight, in_bend), -HARDEST_BRAKING, None))
+    acceleration = np.minimum(on_straight, in_bend)
+    return np.clip(acceleration, -HARDEST_BRAKING, None)
 
 
 def hardest_braking(speed: FloatArray) -> FloatArray:
     """Return the hardest braking (A,), m/s², at speeds (A,), m/s.
 
-    At low speed nobody brakes hard.
+    At low speeds, the hardest braking is gentler.
     """
-    return np.minimum(_STANDSTILL_BRAKING + _BRAKING_INCREASE * speed, HARDEST_BRAKING)
+    braking = _STANDSTILL_BRAKING + _BRAKING_INCREASE * speed
+    return np.minimum(braking, HARDEST_BRAKING)
 
 
 def following_acceleration(
@@ -283,7 +290,7 @@ def following_acceleration(
         gap: Gaps to the road users ahead, shape (A,), metres; infinite without one.
         leader_speed: Speeds of the road users ahead along the same path, shape (A,), m/s.
     """
-    return _interaction_acceleration(
+    return _compute_interaction(
         parameters, speed, gap, leader_speed, parameters.min_gap, parameters.time_gap
     )
 
@@ -293,31 +300,31 @@ def stopping_acceleration(
 ) -> FloatArray:
     """Return the accelerations (A,), m/s², that stop road users before a line.
 
-    The line is `gap` (A,) metres ahead; the gap is infinite if there is none.
+    Args:
+        parameters: Parameters of the road users.
+        speed: Speeds, shape (A,), m/s.
+        gap: Distances to the line ahead, shape (A,), metres; infinite without a line.
     """
     line_speed = np.zeros_like(speed)
     min_gap = np.full_like(speed, 0.5)
-    return _interaction_acceleration(
+    return _compute_interaction(
         parameters, speed, gap, line_speed, min_gap, 0.3 * parameters.time_gap
     )
 
 
 def can_stop(parameters: IdmParameters, speed: FloatArray, gap: FloatArray) -> BoolArray:
-    """Return whether braking a little harder than comfortably stops before a line.
+    """Return which road users (A,) can stop by braking a little harder than comfortably.
 
     Args:
         parameters: Parameters of the road users.
         speed: Speeds, shape (A,), m/s.
         gap: Distances to the line ahead, shape (A,), metres.
-
-    Returns:
-        Truth values, shape (A,).
     """
     max_square_speed = 2 * 1.5 * parameters.braking * gap
     return np.asarray(speed**2 <= max_square_speed)
 
 
-def _interaction_acceleration(
+def _compute_interaction(
     parameters: IdmParameters,
     speed: FloatArray,
     gap: FloatArray,
@@ -338,17 +345,18 @@ def lane_path(junction: Junction, route: Route, category: str) -> Path:
     """Return the path of a driver or rider on a route."""
     if category != "cyclist":
         return route.path
-    return _cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
+    return _make_cyclist_path(junction.spec, route.from_arm, route.turn, route.lane)
 
 
 def lane_span(route: Route) -> tuple[float, float]:
     """Return start and end of the part of a route that may cross others, metres along it."""
     start = route.stop_s - _MARGIN_BEFORE_STOP_LINE_M
-    return start, route.exit_s + _MARGIN_AFTER_EXIT_M
+    end = route.exit_s + _MARGIN_AFTER_EXIT_M
+    return start, end
 
 
-def middle_of(route: Route) -> float:
-    """Return the metres along a route to the middle of the junction."""
+def distance_to_middle(route: Route) -> float:
+    """Return the distance along a route to the middle of the junction, metres."""
     return (route.enter_s + route.exit_s) / 2
 
 
@@ -361,28 +369,23 @@ def road_crossing(spec: RoadSpec, arm: Arm, along: float, side: Side) -> Path:
         along: Distance from the junction's middle, metres.
         side: Side on which the path begins, as a driver towards the junction sees it.
     """
-    out_x, out_y = OUTWARD[arm]
-    beside = spec.road_edge + _KERB_DISTANCE_M
+    half_length = spec.road_edge + _KERB_DISTANCE_M
     # The right of a driver inward is the left, seen outward.
-    sign = 1.0 if side == "right" else -1.0
-    left = np.array([-out_y, out_x], dtype=np.float64)
-    start = along * np.array([out_x, out_y]) + sign * beside * left
-    yaw = float(np.arctan2(-sign * left[1], -sign * left[0]))
-    start_point = (float(start[0]), float(start[1]))
-    return straight(start_point, yaw, 2 * beside)
-
-
-def shifted_path(path: Path, offset: float) -> Path:
-    """Return the same path, `offset` metres further to the left."""
-    left = np.stack([-np.sin(path.yaw), np.cos(path.yaw)], axis=1)
-    return through(path.xy + offset * left)
+    if side == "right":
+        sign = 1.0
+    else:
+        sign = -1.0
+    start = point_on_arm(arm, along, sign * half_length)
+    outward_x, outward_y = OUTWARD[arm]
+    yaw = float(np.arctan2(-sign * outward_x, sign * outward_y))
+    return straight(start, yaw, 2 * half_length)
 
 
 @lru_cache(maxsize=64)
-def _cyclist_path(spec: RoadSpec, from_arm: Arm, turn: Turn, lane: int) -> Path:
+def _make_cyclist_path(spec: RoadSpec, from_arm: Arm, turn: Turn, lane: int) -> Path:
     """Return the path of a cyclist, to the right of the lane's middle."""
-    path = Junction(spec).route(from_arm, turn, lane).path
-    return shifted_path(path, -_CYCLIST_OFFSET_M)
+    route = Junction(spec).route(from_arm, turn, lane)
+    return shift_path(route.path, -_CYCLIST_OFFSET_M)
 
 
 @dataclass(frozen=True, slots=True)
@@ -449,9 +452,9 @@ class RoadUser:
         span: Start and end of the part of its path that may cross others, metres; empty for a
             pedestrian who stays on the sidewalk.
         ignores: Rules that it breaks.
-        alert: Seconds before a contact at which it notices the other road user of the pair; 0 for
-            never.
-        pace: Stretches of its path where it is slow for reasons of its own.
+        alert: Seconds before a contact at which it notices the other of the pair; 0 if it never
+            does.
+        pace: Stretches of its path where it is slow although the path is free.
         brisk: Whether it drives with a style of `BRISK_STYLES`.
     """
 
@@ -480,7 +483,10 @@ class RoadUser:
     @property
     def style(self) -> DrivingStyle:
         """Its driving style."""
-        styles = BRISK_STYLES if self.brisk else DRIVING_STYLES
+        if self.brisk:
+            styles = BRISK_STYLES
+        else:
+            styles = DRIVING_STYLES
         return styles[self.body.category]
 
     @property
@@ -498,15 +504,18 @@ class RoadUser:
 def idm_parameters(users: Sequence[RoadUser]) -> IdmParameters:
     """Return the parameters of road users as arrays."""
     return IdmParameters(
-        max_speed=_gather(users, lambda user: user.max_speed),
-        acceleration=_gather(users, lambda user: user.style.acceleration),
-        braking=_gather(users, lambda user: user.style.braking),
-        slowing=_gather(users, lambda user: user.style.slowing),
-        time_gap=_gather(users, lambda user: user.style.time_gap),
-        min_gap=_gather(users, lambda user: user.style.min_gap),
+        max_speed=_gather_numbers(users, lambda user: user.max_speed),
+        acceleration=_gather_numbers(users, lambda user: user.style.acceleration),
+        braking=_gather_numbers(users, lambda user: user.style.braking),
+        slowing=_gather_numbers(users, lambda user: user.style.slowing),
+        time_gap=_gather_numbers(users, lambda user: user.style.time_gap),
+        min_gap=_gather_numbers(users, lambda user: user.style.min_gap),
     )
 
 
-def _gather(users: Sequence[RoadUser], value: Callable[[RoadUser], float]) -> FloatArray:
+def _gather_numbers(
+    users: Sequence[RoadUser], read_number: Callable[[RoadUser], float]
+) -> FloatArray:
     """Return a number of each road user as an array (A,)."""
-    return np.array([value(user) for user in users], dtype=np.float64)
+    numbers = [read_number(user) for user in users]
+    return np.array(numbers, dtype=np.float64)

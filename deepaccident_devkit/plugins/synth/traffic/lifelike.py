@@ -1,4 +1,6 @@
-"""Draws that make a designed scenario like one of the real release: colliders and drivers' errors.
+"""Random draws that make a designed scenario resemble the real release.
+
+They decide who collides, and which errors drivers make.
 
 Each kind of accident is a row of `ACCIDENT_KINDS`. All numbers were chosen so that a release has
 the shares and spans that others measured on the real one (docs/synth.md compares them).
@@ -28,22 +30,23 @@ _BACKGROUND_RANGES = {
     "walking": (0, 4),
     "crossing": (0, 3),
 }
-# Probability that the scenario of an accident folder, and of a normal one, is of the other sort.
+# Probability that the scenario in the folder of an accident is a normal one, and the reverse.
 MISFILED: Final = {True: 0.03, False: 0.02}
 # Share of strangers that are pedestrians.
 ON_FOOT: Final = 0.3
 NORMAL_FRAMES = (93, 101)
 """Smallest number of frames of a normal scenario, and one more than the largest."""
-# Quarter turns from the arm by which a driver comes to the arm by which it leaves.
+# Quarter turns from the arm where a driver comes from to the arm where it leaves.
 _QUARTERS_OF_TURN = {"right": 1, "straight": 2, "left": 3}
 # Smallest and largest distance from other to its follower, metres.
 _FOLLOWER_GAPS = (8.0, 16.0)
 # Height of a hump as a multiple of the design's hump.
 _HUMP_FACTORS = (0.8, 2.2)
-# Seconds before a contact at which a driver of the pair notices it; below 0 it never does.
+# Range of the times before a contact at which a driver of the pair notices the other, seconds; a
+# driver with a time below 0 never does.
 _ALERTS = (-0.3, 0.9)
-# Share of scenarios in which parked vehicles overlap; smallest number of vehicles that are added
-# there, and one more than the largest.
+# Fraction of scenarios in which parked vehicles overlap; and the smallest number of vehicles
+# that are then added, and one more than the largest.
 _OVERLAPPING_SHARE = 0.29
 _OVERLAPPING_COUNTS = (2, 5)
 # Smallest and largest distance between the middles of two of these vehicles, metres.
@@ -52,10 +55,10 @@ _OVERLAPPING_PITCHES = (3.2, 4.1)
 _KERB_SHIFT_M = 0.35
 # Smallest and largest time from the contact to the last frame, seconds.
 _TIMES_AFTER_CONTACT = (0.25, 0.395)
-# Range of the draws of the depth to which two are in each other, metres, and the depth's limit.
+# Range from which the depth to which the two overlap is drawn, metres, and the limit of the depth.
 _DEPTHS = (0.1, 1.5)
 _MAX_DEPTH_M = 0.76
-# Smallest share of their relative speed that two lose in a contact.
+# Smallest fraction of their relative speed that the two lose in a contact.
 _MIN_SPEED_LOSS = 0.4
 
 
@@ -68,8 +71,8 @@ class Traffic:
         frames: Median of the lengths of accidents, the spread of their logarithm, the smallest and
             the largest length, frames.
         slow: Share of the drivers of the pair that start slowly, among drivers that are not fast.
-        rolling: Speed at which they roll before they set off, as a share of their usual speed; with
-            0 they stand.
+        rolling: Speed at which they roll before they set off, as a fraction of their usual speed; 0
+            if they stand still.
         to_go: Smallest and largest distance from the point where they set off to the crossing of
             the paths, metres.
         fast: Share of drivers that are fast from the start.
@@ -78,8 +81,8 @@ class Traffic:
         waits: Shortest and longest time until they set off, from the beginning of the simulation,
             seconds.
         timed: Whether `waits` are from the time of the planned meeting instead.
-        grazes: Share of pairs of scenarios in which two others scrape along each other.
-        no_touch: Share of accidents that are recorded up to just before the contact.
+        grazes: Fraction of scenario pairs in which two other vehicles sideswipe each other.
+        no_touch: Share of accidents whose recording ends just before the contact.
     """
 
     # road users of the background, and length of the recording
@@ -141,15 +144,15 @@ class AccidentKind:
 
     Attributes:
         weight: Relative frequency of the kind.
-        pair: Roles that touch; None where one of ego and other touches a stranger: a pedestrian, or
+        pair: Roles that touch; None if `ego` or `other` touches another road user: a pedestrian or
             a vehicle of the background.
         late: Shortest and longest time by which the second (or its leader, or the driver that is
-            not run into) comes later to the crossing of the paths, seconds.
+            not run into) reaches the crossing of the paths later, seconds.
         gap: Smallest and largest distance from ego to its follower, where it is one of the pair,
             metres.
-        joins: Whether it needs paths that end in one road.
+        joins: Whether it needs paths that lead into the same road.
         stops: Whether the first of the pair, in front, brakes to a stop.
-        labelled: Whether labels name both.
+        labelled: Whether both are labelled.
         traffic: Version of the traffic around it.
     """
 
@@ -180,64 +183,74 @@ ACCIDENT_KINDS: Final[Mapping[str, AccidentKind]] = {
 
 
 def draw_kind(rng: np.random.Generator, spec: ScenarioSpec, traffic: Traffic) -> AccidentKind:
-    """Draw a kind of accident that is possible where ego and other go as in `spec`."""
-    possible = [kind for kind in ACCIDENT_KINDS.values() if not kind.joins or paths_join(spec)]
-    weights = np.array([kind.weight for kind in possible])
-    kind = possible[rng.choice(len(possible), p=weights / weights.sum())]
+    """Draw a kind of accident that is possible on the routes of `ego` and `other` in `spec`."""
+    has_joining_paths = paths_join(spec)
+    kinds = [kind for kind in ACCIDENT_KINDS.values() if has_joining_paths or not kind.joins]
+    weights = np.array([kind.weight for kind in kinds])
+    probabilities = weights / weights.sum()
+    kind = kinds[rng.choice(len(kinds), p=probabilities)]
     return replace(kind, traffic=traffic)
 
 
 def paths_join(spec: ScenarioSpec) -> bool:
     """Return whether ego and other leave the junction by the same arm."""
     exits = set()
-    for actor in (spec.actor("ego"), spec.actor("other")):
+    for role in ("ego", "other"):
+        actor = spec.actor(role)
         arm = ARMS.index(actor.from_arm or "west")
-        exits.add((arm + _QUARTERS_OF_TURN[actor.turn]) % len(ARMS))
+        exit_arm = (arm + _QUARTERS_OF_TURN[actor.turn]) % len(ARMS)
+        exits.add(exit_arm)
     return len(exits) == 1
 
 
-def as_kind(rng: np.random.Generator, spec: ScenarioSpec, kind: AccidentKind) -> ScenarioSpec:
+def apply_kind(rng: np.random.Generator, spec: ScenarioSpec, kind: AccidentKind) -> ScenarioSpec:
     """Turn a designed scenario into one with this kind of accident.
 
-    It has fewer road users on steeper roads.
+    On steeper roads, the scenario has fewer road users.
     """
-    counts = {name: int(rng.integers(*span)) for name, span in kind.traffic.background.items()}
+    counts = {}
+    for name, span in kind.traffic.background.items():
+        counts[name] = int(rng.integers(*span))
     meet = MeetSpec(actors=kind.pair or ("ego", "other"), offset=rng.uniform(*kind.late))
     other_gaps = kind.gap if kind.stops else _FOLLOWER_GAPS
-    gaps = {"ego_behind": rng.uniform(*kind.gap), "other_behind": rng.uniform(*other_gaps)}
-    # In the order of the ids.
+    gap_by_role = {"ego_behind": rng.uniform(*kind.gap), "other_behind": rng.uniform(*other_gaps)}
+    # Other gets the lowest id, and its follower the highest.
     ordered = sorted(
         spec.actors, key=lambda actor: (actor.role != "other", actor.role == "other_behind")
     )
+    actors = [replace(actor, gap=gap_by_role.get(actor.role)) for actor in ordered]
     return replace(
         spec,
-        road=_steeper(rng, spec.road),
-        actors=tuple(replace(actor, gap=gaps.get(actor.role)) for actor in ordered),
+        road=_draw_steepness(rng, spec.road),
+        actors=tuple(actors),
         meet=meet,
         background=BackgroundSpec(**counts),
     )
 
 
-def _steeper(rng: np.random.Generator, road: RoadSpec) -> RoadSpec:
+def _draw_steepness(rng: np.random.Generator, road: RoadSpec) -> RoadSpec:
     """Return a road with another height of its hump, within the steepest grade."""
     hump = road.hump
     if hump is None:
         return road
-    factor = min(rng.uniform(*_HUMP_FACTORS), 0.999 * MAX_GRADE / hump.grade)
-    return replace(road, hump=replace(hump, height=factor * hump.height))
+    max_factor = 0.999 * MAX_GRADE / hump.grade
+    factor = min(rng.uniform(*_HUMP_FACTORS), max_factor)
+    new_hump = replace(hump, height=factor * hump.height)
+    return replace(road, hump=new_hump)
 
 
-def accident_duration(rng: np.random.Generator, traffic: Traffic) -> float:
+def draw_accident_duration(rng: np.random.Generator, traffic: Traffic) -> float:
     """Draw the planned duration of an accident, seconds."""
     median, spread, min_frames, max_frames = traffic.frames
     frames = median * np.exp(spread * rng.standard_normal())
-    return int(np.clip(frames, min_frames, max_frames)) * FRAME_PERIOD
+    num_frames = int(np.clip(frames, min_frames, max_frames))
+    return num_frames * FRAME_PERIOD
 
 
-def erring(
+def add_driver_errors(
     rng: np.random.Generator, user: RoadUser, crossing: float, traffic: Traffic, *, stops: bool
 ) -> RoadUser:
-    """Return a driver of the pair, who brakes, hesitates or swerves shortly before the crossing.
+    """Let a driver of the pair brake, hesitate or swerve shortly before the crossing of the paths.
 
     Args:
         rng: Generator of random numbers.
@@ -262,23 +275,26 @@ def erring(
     error = rng.random()
     pace: tuple[Stretch, ...] = ()
     if rng.random() < 0.25:
-        pace = (_stop(rng, crossing - rng.uniform(25, 60), speed),)
+        stop_begin = crossing - rng.uniform(25, 60)
+        pace = (_draw_stop(rng, stop_begin, speed),)
     if distance_to_go and start_speed:
         pace = ((0.0, start, start_speed),)
-    end = crossing + 60.0
+    past_crossing = crossing + 60.0
     if stops:
-        pace += ((crossing - rng.uniform(4, 12), end, speed * rng.uniform(0.0, 0.85)),)
+        begin = crossing - rng.uniform(4, 12)
+        pace += ((begin, past_crossing, speed * rng.uniform(0.0, 0.85)),)
     elif error < 0.35:
-        pace += ((crossing - rng.uniform(1, 8), end, speed * rng.uniform(0.2, 0.6)),)
+        begin = crossing - rng.uniform(1, 8)
+        pace += ((begin, past_crossing, speed * rng.uniform(0.2, 0.6)),)
     elif error < 0.6:
-        pace += (
-            (crossing - rng.uniform(12, 30), crossing - rng.uniform(2, 9), rng.uniform(2.0, 5.0)),
-        )
+        begin = crossing - rng.uniform(12, 30)
+        end = crossing - rng.uniform(2, 9)
+        pace += ((begin, end, rng.uniform(2.0, 5.0)),)
     if rng.random() < 0.3:
-        begin = crossing - rng.uniform(8, 14)
-        length = rng.uniform(7, 10)
+        swerve_begin = crossing - rng.uniform(8, 14)
+        swerve_length = rng.uniform(7, 10)
         offset = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.4))
-        path = lane_change(path, begin, length, offset)
+        path = lane_change(path, swerve_begin, swerve_length, offset)
     return replace(
         user,
         path=path,
@@ -291,10 +307,12 @@ def erring(
     )
 
 
-def lively(rng: np.random.Generator, user: RoadUser, traffic: Traffic, begin: float) -> RoadUser:
-    """Return a driver who may start from rest, be fast or slow down on the way.
+def vary_driving(
+    rng: np.random.Generator, user: RoadUser, traffic: Traffic, begin: float
+) -> RoadUser:
+    """Let a driver start from rest, drive fast or slow down on the way, chosen at random.
 
-    Other road users stay as they are.
+    Road users that are not drivers are returned unchanged.
 
     Args:
         rng: Generator of random numbers.
@@ -319,46 +337,58 @@ def lively(rng: np.random.Generator, user: RoadUser, traffic: Traffic, begin: fl
         first_distance = user.start + rng.uniform(3, 40)
         distances = np.cumsum(rng.uniform(5, 30, size=2))
         begins = first_distance + distances + np.arange(2) * speed**2 / 4
-        pace = tuple(_stop(rng, float(begin), speed) for begin in begins)
+        pace = tuple(_draw_stop(rng, stop_begin, speed) for stop_begin in begins.tolist())
     return replace(
         user, start_speed=start_speed, max_speed=speed, delay=delay, pace=pace, brisk=True
     )
 
 
-def _stop(rng: np.random.Generator, begin: float, speed: float) -> Stretch:
+def _draw_stop(rng: np.random.Generator, begin: float, speed: float) -> Stretch:
     """Draw a stretch on which a driver nearly stops.
 
     It is long enough to brake to walking speed, or nearly to a standstill, and drive a little.
+
+    Args:
+        rng: Generator of random numbers.
+        begin: Start of the stretch along the path, metres.
+        speed: Usual speed of the driver, m/s.
     """
     braking_distance = speed**2 / 14
     end = begin + braking_distance + rng.uniform(0.5, 2.5)
-    return (begin, end, rng.uniform(0.3, 1.5))
+    max_speed = rng.uniform(0.3, 1.5)
+    return begin, end, max_speed
 
 
-def crowded(rng: np.random.Generator, parked: Sequence[ParkedVehicle]) -> tuple[ParkedVehicle, ...]:
-    """Move parked vehicles nearer to the kerb, and add a row of overlapping ones to some scenarios.
+def crowd_kerb(
+    rng: np.random.Generator, parked: Sequence[ParkedVehicle]
+) -> tuple[ParkedVehicle, ...]:
+    """Move parked vehicles nearer to the kerb, and in some scenarios add a row of vehicles.
 
     In such a row each vehicle overlaps the one before.
+
+    Args:
+        rng: Generator of random numbers.
+        parked: The parked vehicles.
     """
-    at_kerb = []
+    vehicles = []
     for vehicle in parked:
-        pose = _shifted_pose(vehicle.pose, 0.0, _KERB_SHIFT_M)
-        at_kerb.append(replace(vehicle, pose=pose))
+        pose = _shift_pose(vehicle.pose, 0.0, _KERB_SHIFT_M)
+        vehicles.append(replace(vehicle, pose=pose))
     if not parked or rng.random() >= _OVERLAPPING_SHARE:
-        return tuple(at_kerb)
-    row_pose = at_kerb[int(rng.integers(len(parked)))].pose
-    count = int(rng.integers(*_OVERLAPPING_COUNTS))
+        return tuple(vehicles)
+    first_pose = vehicles[rng.integers(len(parked))].pose
+    count = rng.integers(*_OVERLAPPING_COUNTS)
     shifts = np.cumsum(rng.uniform(*_OVERLAPPING_PITCHES, size=count))
-    x, y, yaw = row_pose
+    x, y, yaw = first_pose
     # The row grows away from the junction's middle.
     shifts *= np.sign(x * np.cos(yaw) + y * np.sin(yaw))
-    row = []
     for shift in shifts.tolist():
-        row.append(ParkedVehicle(random_body(rng, "car"), _shifted_pose(row_pose, shift, 0.0)))
-    return (*at_kerb, *row)
+        body = random_body(rng, "car")
+        vehicles.append(ParkedVehicle(body, _shift_pose(first_pose, shift, 0.0)))
+    return tuple(vehicles)
 
 
-def _shifted_pose(
+def _shift_pose(
     pose: tuple[float, float, float], ahead: float, right: float
 ) -> tuple[float, float, float]:
     """Return a pose x, y, yaw that is shifted ahead and to the right, metres."""
@@ -370,7 +400,7 @@ def _shifted_pose(
     return shifted_x, shifted_y, yaw
 
 
-def beyond_contact(
+def continue_past_contact(
     rng: np.random.Generator,
     simulation: Simulation,
     pair: tuple[int, int],
@@ -379,8 +409,8 @@ def beyond_contact(
 ) -> tuple[Simulation, float]:
     """Continue a simulation after its last step.
 
-    Everybody goes straight on, the pair with less relative speed, until the two are as deep in each
-    other as is drawn.
+    All road users go straight on, the pair with less relative speed, until the two overlap by a
+    drawn depth.
 
     Args:
         rng: Generator of random numbers.
@@ -393,30 +423,34 @@ def beyond_contact(
         The longer simulation, and the time by which its recording ends later (or earlier) than the
         contact, seconds.
     """
-    after = -0.02
+    time_after = -0.02
     if rng.random() >= traffic.no_touch:
-        after = rng.uniform(*_TIMES_AFTER_CONTACT)
+        time_after = rng.uniform(*_TIMES_AFTER_CONTACT)
     max_depth = min(rng.uniform(*_DEPTHS), _MAX_DEPTH_M)
-    period = float(simulation.time[-1] - simulation.time[-2])
-    steps = np.arange(1, int(max(after, 0.0) / period) + 2)
+    last_time = simulation.time[-1]
+    period = float(last_time - simulation.time[-2])
+    num_steps = int(max(time_after, 0.0) / period) + 1
+    steps = np.arange(1, num_steps + 1)
     rows = list(pair)
     velocity = simulation.velocities[-1].copy()
     mean = velocity[rows].mean(axis=0)
-    closing_distance = 2.0 * np.hypot(*(velocity[pair[0]] - mean)) * after
+    closing_distance = 2.0 * np.hypot(*(velocity[pair[0]] - mean)) * time_after
     depth_factor = 1.3 * max_depth / max(closing_distance, 1e-6)
     speed_factor = min(1.0 - _MIN_SPEED_LOSS, depth_factor)
     velocity[rows] = mean + speed_factor * (velocity[rows] - mean)
     states = np.repeat(simulation.states[-1:], len(steps), axis=0)
     states[..., :2] += steps[:, None, None] * period * velocity
-    depth = -separation(states[:, pair[0], :3], size[0], states[:, pair[1], :3], size[1])
+    poses = states[:, pair[0], :3]
+    other_poses = states[:, pair[1], :3]
+    depth = -separation(poses, size[0], other_poses, size[1])
     num_shallow = int((depth < max_depth + 0.01).cumprod().sum())
     count = max(num_shallow, 1)
-    times = simulation.time[-1] + period * steps[:count]
-    velocities = np.repeat(velocity[None], count, axis=0)
-    longer = replace(
+    new_times = last_time + period * steps[:count]
+    new_velocities = np.repeat(velocity[None], count, axis=0)
+    longer_simulation = replace(
         simulation,
-        time=np.concatenate([simulation.time, times]),
+        time=np.concatenate([simulation.time, new_times]),
         states=np.concatenate([simulation.states, states[:count]]),
-        velocities=np.concatenate([simulation.velocities, velocities]),
+        velocities=np.concatenate([simulation.velocities, new_velocities]),
     )
-    return longer, min(after, (count - 1) * period)
+    return longer_simulation, min(time_after, (count - 1) * period)

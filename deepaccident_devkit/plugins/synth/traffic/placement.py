@@ -1,6 +1,6 @@
-"""The moving road users of a scenario file, placed so that the timed pair meets.
+"""The moving road users of a scenario file, placed so that the pair that should collide meets.
 
-`unplanned` draws accidents that differ from the designs.
+`replan_accident` draws accidents that differ from the designs.
 """
 
 from collections.abc import Sequence
@@ -28,32 +28,38 @@ from deepaccident_devkit.plugins.synth.traffic.driving import (
     PERIOD,
     RoadUser,
     Tracks,
+    distance_to_middle,
     free_acceleration,
     idm_parameters,
     lane_path,
     lane_span,
-    middle_of,
     road_crossing,
 )
-from deepaccident_devkit.plugins.synth.traffic.lifelike import AccidentKind, erring, lively
+from deepaccident_devkit.plugins.synth.traffic.lifelike import (
+    AccidentKind,
+    add_driver_errors,
+    vary_driving,
+)
 from deepaccident_devkit.support.arrays import FloatArray
 
-# Shortest and longest drive on a free road; the slowest cyclist needs about 210 s to the junction.
+# Shortest and longest drive on a free road; the slowest cyclist reaches the junction after about
+# 210 s.
 _MIN_DRIVE_S = 24.0
 _MAX_DRIVE_S = 300.0
 WARM_UP = 1.0
 """Seconds that are simulated before the first recorded frame."""
-# Smallest and largest gap between leader and follower, bumper to bumper, if the file does not give
-# it, metres.
+# Smallest and largest gap between leader and follower, bumper to bumper, where the file does not
+# give the gap, metres.
 _FOLLOWER_GAPS = (8.0, 16.0)
-# Seconds before a contact at which one of the pair notices it; below 0 it never does.
+# Range of the times before a contact at which one of the pair notices the other, seconds; below 0
+# it never does.
 _ALERTS = (-0.3, 0.3)
 # Smallest and largest distance from the start to the junction's middle, if the file does not give
 # it, metres.
 _START_DISTANCES = (35.0, 75.0)
 _LANE_CHANGE_LENGTH_M = 28.0
-# Distance between a follower that meets somebody and its leader: a vehicle's length, and this share
-# of the first gap.
+# Distance between a leader and its follower that collides with another road user: the length of
+# a vehicle, and a share of the gap at the start.
 _VEHICLE_LENGTH_M = 4.6
 _GAP_SHARE = 0.9
 # Target speed of a follower as a multiple of its leader's, so that the gap does not grow.
@@ -69,8 +75,8 @@ _STEP_OUT_DISTANCES = (24.0, 45.0)
 # Distance from a hump's crest to a pedestrian behind it, metres; the hump hides the pedestrian
 # until the victim is about 40 m away.
 _CREST_DISTANCES = (15.0, 22.0)
-# Share of third vehicles that come by the victim's arm and change into its lane, if the arm has two
-# lanes.
+# Share of third vehicles that come from the victim's arm and change into its lane, if the arm
+# has two lanes.
 _CUT_IN_SHARE = 0.5
 # Smallest and largest distance from the junction's middle at which this change of lanes begins,
 # metres.
@@ -81,7 +87,7 @@ _STRANGER_OFFSETS = (-0.2, 0.2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """A drive over a free road, from standing or from a given speed.
+    """A drive on a free road, from rest or from a certain speed.
 
     Attributes:
         user: The road user at the start of the drive.
@@ -95,32 +101,39 @@ class Approach:
     speed: FloatArray
 
     def time_to(self, position: float) -> float:
-        """Return the seconds until the centre is at a position along the path, in metres.
+        """Return the time until the centre is at a position along the path, seconds.
 
-        If it never is, the drive's end counts.
+        If the centre never gets there, the time is the duration of the drive.
+
+        Args:
+            position: Position along the path, metres.
         """
-        row = min(int(np.searchsorted(self.along, position)), len(self.along) - 1)
+        last_row = len(self.along) - 1
+        row = min(int(np.searchsorted(self.along, position)), last_row)
         return row * PERIOD
 
     def at(self, time: float) -> RoadUser:
-        """Return the road user `time` seconds into the drive.
+        """Return the road user `time` seconds after the start of the drive.
 
-        Before the drive, a road user that stands waits, others are farther back.
+        Before the drive, a road user that starts from rest waits; any other one is farther back.
         """
-        if time < 0 and self.user.start_speed == 0:
-            return replace(self.user, delay=-time)
+        user = self.user
+        if time < 0 and user.start_speed == 0:
+            return replace(user, delay=-time)
         if time < 0:
-            return replace(self.user, start=self.user.start + self.user.start_speed * time)
+            return replace(user, start=user.start + user.start_speed * time)
         row = min(round(time / PERIOD), len(self.along) - 1)
         start = float(self.along[row])
         speed = float(self.speed[row])
-        return replace(self.user, start=start, start_speed=speed, delay=0.0)
+        return replace(user, start=start, start_speed=speed, delay=0.0)
 
 
-def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
-    """Simulate the drive of a road user on its path with nobody else on the road.
+def drive_alone(user: RoadUser, min_end: float = 0.0) -> Approach:
+    """Simulate a road user's drive along its path on an otherwise empty road.
 
-    The drive lasts at least until the centre is `to` metres along the path.
+    Args:
+        user: The road user.
+        min_end: Position along the path that the drive reaches at least, metres.
     """
     lateral = np.array([user.style.lateral])
     tracks = Tracks([user.path], lateral, np.array([user.walks]), [user.pace])
@@ -135,12 +148,13 @@ def drive_alone(user: RoadUser, to: float = 0.0) -> Approach:
     min_decisions = round(_MIN_DRIVE_S / decision_period)
     max_decisions = round(_MAX_DRIVE_S / decision_period)
     for count in range(max_decisions):
-        if count >= min_decisions and along[0] + axle_to_center >= to:
+        if count >= min_decisions and along[0] + axle_to_center >= min_end:
             break
         acceleration = free_acceleration(parameters, speed, tracks.allowed_speed(along))
         speeds = np.maximum(speed + acceleration * times, 0.0)
         previous_speeds = np.append(speed, speeds[:-1])
-        positions = along + PERIOD * np.cumsum((previous_speeds + speeds) / 2)
+        mean_speeds = (previous_speeds + speeds) / 2
+        positions = along + PERIOD * np.cumsum(mean_speeds)
         all_positions.append(positions)
         all_speeds.append(speeds)
         along = positions[-1:]
@@ -155,9 +169,9 @@ class Cast:
 
     Attributes:
         users: Road users; leaders are before their followers.
-        begin: Time at which the simulation starts, seconds; at time 0 the first of the pair is
+        begin: Start time of the simulation, seconds. At time 0, the first road user of the pair is
             where the paths cross.
-        pair: Rows of the two that are timed to meet; None if nobody is.
+        pair: Rows of the two road users that are timed to meet; None if there is no such pair.
     """
 
     users: tuple[RoadUser, ...]
@@ -165,8 +179,9 @@ class Cast:
     pair: tuple[int, int] | None
 
     def row_of(self, role: Role) -> int:
-        """Return the row of the first road user of a role."""
-        return next(row for row, user in enumerate(self.users) if user.role == role)
+        """Return the row of the first road user with a role."""
+        roles = [user.role for user in self.users]
+        return roles.index(role)
 
 
 def cast_actors(
@@ -176,50 +191,49 @@ def cast_actors(
     duration: float,
     kind: AccidentKind | None = None,
 ) -> Cast:
-    """Place the moving road users that a file names, so that the timed pair meets.
+    """Place the moving road users that a scenario file names.
 
-    If a follower is one of the pair, its leader is timed.
+    The two road users of the planned meeting are timed so that they meet at time 0. If one of them
+    follows a leader, the leader is timed instead.
 
     Args:
         rng: Generator of random numbers.
         spec: The scenario.
-        junction: Its junction.
+        junction: Junction of the scenario.
         duration: Time from the first recorded frame to the meeting, seconds.
-        kind: Kind of accident, with which drivers err; None if they do not.
+        kind: Kind of accident, which sets the driving errors; None for drivers without errors.
     """
     begin = -(duration + WARM_UP)
     moving_actors = [actor for actor in spec.actors if actor.role != "parked"]
     leading_actors = [actor for actor in moving_actors if actor.role not in LEADERS]
-    pair = _pair_rows(spec, leading_actors)
+    pair = _find_timed_rows(spec, leading_actors)
+    timed_rows = pair or ()
     users = []
     for row, actor in enumerate(leading_actors):
-        users.append(_drawn(rng, actor, junction, timed=row in (pair or ())))
+        users.append(_draw_leader(rng, actor, junction, timed=row in timed_rows))
     meet = spec.meet
     if pair is not None and meet is not None:
-        meeting = crossing(users[pair[0]].path, users[pair[1]].path)
+        row, other_row = pair
+        meeting = crossing(users[row].path, users[other_row].path)
         if meeting is None:
             pair = None
         else:
             if kind is not None:
-                _make_erring(rng, users, pair, meeting, meet, kind, begin)
-            _time_pair(users, pair, meeting, spec, meet, begin)
+                _make_drivers_err(rng, users, pair, meeting, meet, kind, begin)
+            _time_pair(users, pair, meeting, spec, begin)
     for actor in moving_actors:
         if actor.role in LEADERS:
             leader = next(user for user in users if user.role == LEADERS[actor.role])
-            # A follower does not change lanes with its leader, or it would collide with a vehicle
-            # beside it.
-            path = leader.path
             keeps_path = kind is None and spec.actor(leader.role).lane_change is None
-            if leader.route is not None and not keeps_path:
-                path = leader.route.path
-            users.append(_follower(rng, actor, leader, path))
+            users.append(_draw_follower(rng, actor, leader, keeps_path=keeps_path))
     if pair is not None and meet is not None:
         roles = [user.role for user in users]
-        pair = (roles.index(meet.actors[0]), roles.index(meet.actors[1]))
+        role, other_role = meet.actors
+        pair = (roles.index(role), roles.index(other_role))
     return Cast(users=tuple(users), begin=begin, pair=pair)
 
 
-def _make_erring(
+def _make_drivers_err(
     rng: np.random.Generator,
     users: list[RoadUser],
     pair: tuple[int, int],
@@ -228,23 +242,24 @@ def _make_erring(
     kind: AccidentKind,
     begin: float,
 ) -> None:
-    """Let the drivers of the pair err and all others be lively, in place.
+    """Add driving errors to the pair, and vary the driving of all others, in place.
 
     Args:
         rng: Generator of random numbers.
         users: The road users.
         pair: Rows of the pair.
-        meeting: Positions of the crossing of the paths along the path of each, metres.
+        meeting: Position of the crossing of the two paths along each path, metres.
         meet: The planned meeting.
         kind: Kind of accident.
-        begin: Time from which drivers act, seconds.
+        begin: Start time of the simulation, seconds.
     """
     for row, user in enumerate(users):
         if row not in pair:
-            users[row] = lively(rng, user, kind.traffic, begin)
+            users[row] = vary_driving(rng, user, kind.traffic, begin)
     for row, position in zip(pair, meeting, strict=True):
-        stops = kind.stops and meet.actors[0] == users[row].role
-        users[row] = erring(rng, users[row], position, kind.traffic, stops=stops)
+        user = users[row]
+        stops = kind.stops and meet.actors[0] == user.role
+        users[row] = add_driver_errors(rng, user, position, kind.traffic, stops=stops)
 
 
 def _time_pair(
@@ -252,47 +267,50 @@ def _time_pair(
     pair: tuple[int, int],
     meeting: tuple[float, float],
     spec: ScenarioSpec,
-    meet: MeetSpec,
     begin: float,
 ) -> None:
-    """Place the pair so that it meets at time 0, the second later by the offset; in place."""
-    targets = []
-    for position, role in zip(meeting, meet.actors, strict=True):
-        targets.append(position + _leader_distance(spec, role))
-    approaches = []
-    for row, target in zip(pair, targets, strict=True):
-        approaches.append(drive_alone(users[row], to=target))
+    """Place the pair in `users` so that the first road user is at the meeting point at time 0.
+
+    The second road user gets there later by the offset of the planned meeting.
+
+    Args:
+        users: The road users.
+        pair: Rows of the pair.
+        meeting: Position of the crossing of the two paths along each path, metres.
+        spec: The scenario, with a planned meeting.
+        begin: Start time of the simulation, seconds.
+    """
+    meet = spec.meet
+    if meet is None:
+        return
     delays = (0.0, meet.offset)
-    for row, target, delay, approach in zip(pair, targets, delays, approaches, strict=True):
+    for row, position, role, delay in zip(pair, meeting, meet.actors, delays, strict=True):
+        target = position + _estimate_leader_distance(spec, role)
+        approach = drive_alone(users[row], target)
         users[row] = approach.at(approach.time_to(target) + begin - delay)
 
 
-def _pair_rows(spec: ScenarioSpec, actors: Sequence[ActorSpec]) -> tuple[int, int] | None:
-    """Return the rows of the two that are timed to meet; None if there are none."""
+def _find_timed_rows(spec: ScenarioSpec, actors: Sequence[ActorSpec]) -> tuple[int, int] | None:
+    """Return the rows of the two road users that are timed to meet; None if there are none.
+
+    A leader is timed instead of its follower. If one of the two follows the other, `ego` and
+    `other` are timed.
+    """
     if spec.meet is None:
         return None
+    role, other_role = (LEADERS.get(actor, actor) for actor in spec.meet.actors)
+    if role == other_role:
+        other_role = "ego" if role == "other" else "other"
     roles = [actor.role for actor in actors]
-    role, other_role = _timed_roles(spec.meet)
     if role not in roles or other_role not in roles:
         return None
     return roles.index(role), roles.index(other_role)
 
 
-def _timed_roles(meet: MeetSpec) -> tuple[Role, Role]:
-    """Return the roles that are timed: leaders instead of their followers.
+def _estimate_leader_distance(spec: ScenarioSpec, role: Role) -> float:
+    """Estimate how far the leader is ahead of a follower that meets another road user, metres.
 
-    If one of the two follows the other, they are ego and other.
-    """
-    role, other_role = (LEADERS.get(actor, actor) for actor in meet.actors)
-    if role == other_role:
-        other_role = "ego" if role == "other" else "other"
-    return role, other_role
-
-
-def _leader_distance(spec: ScenarioSpec, role: Role) -> float:
-    """Return about how far its leader is ahead of a follower that meets a stranger, metres.
-
-    It is 0 for others.
+    The result is 0 for road users that do not follow a leader.
     """
     if role not in LEADERS or spec.meet is None or LEADERS[role] in spec.meet.actors:
         return 0.0
@@ -300,12 +318,17 @@ def _leader_distance(spec: ScenarioSpec, role: Role) -> float:
     return _VEHICLE_LENGTH_M + max(gap, _FOLLOWER_GAPS[0])
 
 
-def _drawn(
+def _draw_leader(
     rng: np.random.Generator, actor: ActorSpec, junction: Junction, *, timed: bool
 ) -> RoadUser:
-    """Draw a road user that follows nobody.
+    """Draw a road user that does not follow another one.
 
-    If `timed`, it starts far away and standing, unless the file gives its start.
+    Args:
+        rng: Generator of random numbers.
+        actor: The road user in the file.
+        junction: The junction.
+        timed: Whether it is timed to meet another one; then it starts far away and from rest,
+            unless the file gives its start.
     """
     body = random_body(rng, actor.category)
     max_speed = actor.max_speed
@@ -331,36 +354,58 @@ def _drawn(
     start = _QUEUE_START_M + 2 * _FOLLOWER_GAPS[1] + body.size[0]
     speed = 0.0
     if actor.start_distance is not None:
-        start = middle_of(route) - actor.start_distance
+        start = distance_to_middle(route) - actor.start_distance
         speed = max_speed
     elif not timed:
-        start = middle_of(route) - rng.uniform(*_START_DISTANCES)
+        start = distance_to_middle(route) - rng.uniform(*_START_DISTANCES)
         speed = 0.8 * max_speed
+    alert = 0.0
+    if timed:
+        alert = max(rng.uniform(*_ALERTS), 0.0)
     return RoadUser(
         role=actor.role,
         body=body,
-        path=_path_of(junction, route, actor),
+        path=_plan_path(junction, route, actor),
         start=start,
         start_speed=speed,
         max_speed=max_speed,
         route=route,
         span=lane_span(route),
         ignores=actor.ignores,
-        alert=max(rng.uniform(*_ALERTS), 0.0) if timed else 0.0,
+        alert=alert,
     )
 
 
-def _path_of(junction: Junction, route: Route, actor: ActorSpec) -> Path:
-    """Return the actor's path, with its change of lanes if it makes one."""
+def _plan_path(junction: Junction, route: Route, actor: ActorSpec) -> Path:
+    """Return the path of a driver on a route, with its change of lanes if it makes one."""
     path = lane_path(junction, route, actor.category)
     if actor.lane_change is None:
         return path
-    offset = LANE_WIDTH if actor.lane == 0 else -LANE_WIDTH
-    return lane_change(path, middle_of(route) - actor.lane_change, _LANE_CHANGE_LENGTH_M, offset)
+    start = distance_to_middle(route) - actor.lane_change
+    if actor.lane == 0:
+        offset = LANE_WIDTH
+    else:
+        offset = -LANE_WIDTH
+    return lane_change(path, start, _LANE_CHANGE_LENGTH_M, offset)
 
 
-def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path: Path) -> RoadUser:
-    """Draw a road user behind its leader, as fast, on a path that begins like the leader's."""
+def _draw_follower(
+    rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, *, keeps_path: bool
+) -> RoadUser:
+    """Draw a road user behind its leader, with the leader's speed.
+
+    Args:
+        rng: Generator of random numbers.
+        actor: The follower in the file.
+        leader: The leader.
+        keeps_path: Whether the follower drives along the leader's path even where that path leaves
+            the leader's route.
+    """
+    path = leader.path
+    # A follower does not change lanes with its leader, or it would collide with a vehicle next to
+    # it.
+    if leader.route is not None and not keeps_path:
+        path = leader.route.path
     body = random_body(rng, actor.category)
     gap = actor.gap
     if gap is None:
@@ -368,20 +413,21 @@ def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path
     own_speed = actor.max_speed
     if own_speed is None:
         own_speed = rng.uniform(*DRIVING_STYLES[actor.category].max_speed)
-    leader_speed = leader.max_speed if leader.brisk else _FOLLOWER_SPEED_FACTOR * leader.max_speed
+    min_speed = leader.max_speed
+    if not leader.brisk:
+        min_speed = _FOLLOWER_SPEED_FACTOR * leader.max_speed
     start = leader.start - (leader.body.size[0] + body.size[0]) / 2 - gap
-    pace = [
-        (begin, end - leader.start + start, speed)
-        for begin, end, speed in leader.pace
-        if begin == 0.0
-    ]
+    pace = []
+    for begin, end, speed in leader.pace:
+        if begin == 0.0:
+            pace.append((begin, end - leader.start + start, speed))
     return RoadUser(
         role=actor.role,
         body=body,
         path=path,
         start=start,
         start_speed=leader.start_speed,
-        max_speed=max(own_speed, leader_speed),
+        max_speed=max(own_speed, min_speed),
         delay=leader.delay,
         route=leader.route,
         span=leader.span,
@@ -391,34 +437,34 @@ def _follower(rng: np.random.Generator, actor: ActorSpec, leader: RoadUser, path
     )
 
 
-def unplanned(
+def replan_accident(
     rng: np.random.Generator, spec: ScenarioSpec, junction: Junction, *, on_foot: bool | None = None
 ) -> ScenarioSpec:
     """Turn a designed scenario into one with another accident.
 
-    Ego and other obey, and one of them meets a pedestrian or a third vehicle.
+    `ego` and `other` obey the rules, and one of them collides with a pedestrian or a third vehicle.
 
     Args:
         rng: Generator of random numbers.
         spec: The designed scenario.
-        junction: Its junction.
-        on_foot: Whether it is a pedestrian; drawn if None.
+        junction: Junction of the scenario.
+        on_foot: Whether that road user is a pedestrian; drawn if None.
     """
     victims: tuple[Role, ...] = ("ego", "other")
-    victim = spec.actor(victims[int(rng.integers(2))])
+    victim = spec.actor(victims[rng.integers(2)])
     used_arms = {spec.actor(role).from_arm for role in victims}
     free_arms = [arm for arm in junction.arms if arm not in used_arms]
     if on_foot is None:
         on_foot = rng.random() < _PEDESTRIAN_SHARE
     on_foot = on_foot or not free_arms
-    goes_on = "straight" in junction.turns(victim.from_arm or "west")
-    cuts_in = junction.spec.lanes == 2 and goes_on and rng.random() < _CUT_IN_SHARE
+    can_go_straight = "straight" in junction.turns(victim.from_arm or "west")
+    cuts_in = junction.spec.lanes == 2 and can_go_straight and rng.random() < _CUT_IN_SHARE
     if on_foot:
-        stranger = _pedestrian(rng, victim, spec)
+        stranger = _draw_pedestrian(rng, victim, spec)
     elif cuts_in:
-        stranger = _cutting_in(rng, victim)
+        stranger = _draw_lane_changer(rng, victim)
     else:
-        stranger = _third_vehicle(rng, junction, free_arms)
+        stranger = _draw_third_vehicle(rng, junction, free_arms)
     lawful_actors = [replace(actor, ignores=()) for actor in spec.actors]
     offset = rng.uniform(*_STRANGER_OFFSETS)
     return replace(
@@ -429,7 +475,7 @@ def unplanned(
     )
 
 
-def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec) -> ActorSpec:
+def _draw_pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec) -> ActorSpec:
     """Draw a pedestrian who steps onto the road in front of the victim.
 
     The pedestrian is behind the hump if there is one on the victim's arm.
@@ -450,9 +496,11 @@ def _pedestrian(rng: np.random.Generator, victim: ActorSpec, spec: ScenarioSpec)
     )
 
 
-def _third_vehicle(rng: np.random.Generator, junction: Junction, free_arms: list[Arm]) -> ActorSpec:
-    """Draw a vehicle that comes by an arm without ego and other, and reacts to nobody."""
-    arm = free_arms[int(rng.integers(len(free_arms)))]
+def _draw_third_vehicle(
+    rng: np.random.Generator, junction: Junction, free_arms: list[Arm]
+) -> ActorSpec:
+    """Draw a vehicle from an arm without ego and other that does not react to others."""
+    arm = free_arms[rng.integers(len(free_arms))]
     turn: Turn = "straight" if "straight" in junction.turns(arm) else "left"
     return ActorSpec(
         role="background",
@@ -465,8 +513,8 @@ def _third_vehicle(rng: np.random.Generator, junction: Junction, free_arms: list
     )
 
 
-def _cutting_in(rng: np.random.Generator, victim: ActorSpec) -> ActorSpec:
-    """Draw a vehicle beside the victim that changes into the victim's lane without looking."""
+def _draw_lane_changer(rng: np.random.Generator, victim: ActorSpec) -> ActorSpec:
+    """Draw a vehicle next to the victim that changes into the victim's lane without looking."""
     return ActorSpec(
         role="background",
         category=rng.choice(["car", "car", "van"]).item(),

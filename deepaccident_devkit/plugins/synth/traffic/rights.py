@@ -1,7 +1,8 @@
-"""Traffic lights, and the rights of way between all pairs of road users with paths that meet."""
+"""Traffic lights, and the right of way between all pairs of road users whose paths cross."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,8 @@ from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 
 RED, AMBER, GREEN = range(3)
 _RoadAxis = Literal["west-east", "south-north"]
+# Start and end of the part of a path that is near another path, metres along it.
+_Zone = tuple[float, float]
 AXIS_OF_ARM: dict[Arm, _RoadAxis] = {
     "west": "west-east",
     "east": "west-east",
@@ -22,33 +25,35 @@ AXIS_OF_ARM: dict[Arm, _RoadAxis] = {
 }
 AMBER_TIME = 3.0
 CLEARANCE_TIME = 1.5
-"""Seconds of red for all between one axis' amber and the other's green."""
-# Distance between the points of a path at which meetings are looked for.
+"""Time with red for all between one axis's amber and the other's green, seconds."""
+# Distance between the points of a path at which crossings are searched for.
 _SPACING_M = 0.5
-# Distance between two bodies that pass each other in a zone.
+# Distance between two bodies that pass each other in a zone, at least.
 _PASSING_MARGIN_M = 0.5
-# Acceleration that a road user expects of others towards a zone, and its own to leave it, m/s².
+# Acceleration that a road user expects of others that approach a zone, and its own acceleration to
+# leave the zone, m/s².
 _ENTERING_ACCELERATION = 1.5
 _LEAVING_ACCELERATION = 1.0
-# Shortest time from leaving a zone until the other comes, and from the other's leaving until the
-# road user comes itself.
+# Shortest time between a road user that leaves a zone and the other that enters it after it, and
+# between the other that leaves it and the road user that enters after the other.
 _GAP_BEFORE_OTHER_S = 1.2
 _GAP_AFTER_OTHER_S = 0.6
-# A slower road user counts as this fast, m/s.
+# A slower road user counts as if it had this speed, m/s.
 _CREEPING_SPEED = 0.5
-# A road user that would have to brake harder than this before a zone does not stop, m/s².
+# A road user that would have to brake harder than this to stop before a zone does not stop, m/s².
 _HARD_BRAKING = 4.5
-# Distance from a waiting road user to the zone.
+# Distance from a waiting road user to the zone, and the smallest one after hard braking.
 _WAITING_DISTANCE_M = 1.0
+_MIN_WAITING_DISTANCE_M = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SignalPlan:
-    """Two phases that alternate without end: one axis has green, then the other.
+    """Traffic lights with two phases that alternate without end, one for each axis.
 
     Attributes:
         first: Axis that gets green at `start`.
-        start: Time at which it gets green, seconds since the first recorded frame.
+        start: Time at which that axis gets green, seconds since the first recorded frame.
         green: Duration of green for each axis, seconds.
     """
 
@@ -58,26 +63,28 @@ class SignalPlan:
 
     def state(self, arm: Arm, times: ArrayLike) -> IntArray:
         """Return `RED`, `AMBER` or `GREEN` of an arm at times (…), seconds."""
-        half = self.green + AMBER_TIME + CLEARANCE_TIME
-        shift = 0.0 if AXIS_OF_ARM[arm] == self.first else half
-        phase = (np.asarray(times, dtype=np.float64) - self.start - shift) % (2 * half)
+        half_period = self.green + AMBER_TIME + CLEARANCE_TIME
+        shift = 0.0 if AXIS_OF_ARM[arm] == self.first else half_period
+        elapsed = np.asarray(times, dtype=np.float64) - self.start - shift
+        phase = elapsed % (2 * half_period)
         amber_or_red = np.where(phase < self.green + AMBER_TIME, AMBER, RED)
         colors = np.where(phase < self.green, GREEN, amber_or_red)
         return np.asarray(colors, dtype=np.int64)
 
     def shifted(self, seconds: float) -> "SignalPlan":
-        """Return the same plan, some seconds later."""
-        return replace(self, start=self.start + seconds)
+        """Return the same plan, moved later by some seconds."""
+        start = self.start + seconds
+        return replace(self, start=start)
 
 
 def plan_with_green(axis: _RoadAxis, time: float, green: float, share: float) -> SignalPlan:
-    """Make a plan in which an axis has green at a time.
+    """Make a plan in which an axis has a green light at a certain time.
 
     Args:
         axis: The axis.
-        time: Time at which it has green, seconds.
+        time: Time at which the axis has green, seconds.
         green: Duration of green, seconds.
-        share: Share of the green, 0 to 1, that is over at that time.
+        share: Fraction of the green phase that has passed at that time, 0 to 1.
     """
     start = time - share * green
     return SignalPlan(first=axis, start=start, green=green)
@@ -102,7 +109,7 @@ def find_zones(
     paths: Sequence[Path],
     spans: Sequence[tuple[float, float]],
     widths: FloatArray,
-    together: BoolArray,
+    excluded: BoolArray,
 ) -> Zones:
     """Find the zones of all pairs of road users.
 
@@ -110,30 +117,32 @@ def find_zones(
         paths: Path of each road user.
         spans: Start and end of the part of each path that can meet others, metres.
         widths: Widths of the bodies, shape (A,), metres.
-        together: Truth values, shape (A, A): pairs to leave out, which follow each other or do not
-            react to each other.
+        excluded: Pairs to leave out, because they follow each other or do not react to each other,
+            shape (A, A), bool.
     """
     count = len(paths)
     enter = np.full((count, count), np.inf)
     leave = np.full((count, count), np.inf)
-    known: dict[tuple[int, int, float], tuple[tuple[float, float], tuple[float, float]] | None] = {}
-    points = [_points(path, span) for path, span in zip(paths, spans, strict=True)]
-    for i in range(count):
-        for j in range(i + 1, count):
-            if together[i, j]:
-                continue
-            reach = round(float(widths[i] + widths[j]) / 2 + _PASSING_MARGIN_M, 1)
-            key = (id(paths[i]), id(paths[j]), reach)
-            if key not in known:
-                known[key] = _meeting(points[i], points[j], reach)
-            zone = known[key]
-            if zone is not None:
-                (enter[i, j], leave[i, j]), (enter[j, i], leave[j, i]) = zone
+    zones_by_key: dict[tuple[int, int, float], tuple[_Zone, _Zone] | None] = {}
+    points = [_sample_points(path, span) for path, span in zip(paths, spans, strict=True)]
+    for i, j in combinations(range(count), 2):
+        if excluded[i, j]:
+            continue
+        half_widths = float(widths[i] + widths[j]) / 2
+        max_distance = round(half_widths + _PASSING_MARGIN_M, 1)
+        key = (id(paths[i]), id(paths[j]), max_distance)
+        if key not in zones_by_key:
+            zones_by_key[key] = _find_zone(points[i], points[j], max_distance)
+        zone_pair = zones_by_key[key]
+        if zone_pair is not None:
+            zone, other_zone = zone_pair
+            enter[i, j], leave[i, j] = zone
+            enter[j, i], leave[j, i] = other_zone
     return Zones(enter, leave)
 
 
-def _points(path: Path, span: tuple[float, float]) -> FloatArray:
-    """Return points x, y and distance along the path, shape (K, 3), metres."""
+def _sample_points(path: Path, span: tuple[float, float]) -> FloatArray:
+    """Return points x, y, and their distance along the path, shape (K, 3), metres."""
     start = max(span[0], 0.0)
     end = min(span[1], path.length)
     along = np.arange(start, end, _SPACING_M)
@@ -141,28 +150,26 @@ def _points(path: Path, span: tuple[float, float]) -> FloatArray:
     return np.stack([x, y, along], axis=-1)
 
 
-def _meeting(
-    points: FloatArray, other_points: FloatArray, reach: float
-) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Find where two lines of points (K, 3) are within `reach` of each other.
+def _find_zone(
+    points: FloatArray, other_points: FloatArray, max_distance: float
+) -> tuple[_Zone, _Zone] | None:
+    """Find the zones of two lines of points (K, 3) in which they are near each other.
 
     Returns:
-        Start and end on each line, metres; None if they never are.
+        Zone on each of the two; None if they never come nearer than `max_distance`, metres.
     """
     if not len(points) or not len(other_points):
         return None
     x_offsets = points[:, None, 0] - other_points[None, :, 0]
     y_offsets = points[:, None, 1] - other_points[None, :, 1]
-    near = x_offsets**2 + y_offsets**2 < reach**2
-    rows = near.any(axis=1)
-    columns = near.any(axis=0)
-    if not rows.any():
+    is_near = x_offsets**2 + y_offsets**2 < max_distance**2
+    if not is_near.any():
         return None
-    along = points[rows, 2]
-    other_along = other_points[columns, 2]
-    span = (float(along[0]), float(along[-1]))
-    other_span = (float(other_along[0]), float(other_along[-1]))
-    return span, other_span
+    along = points[is_near.any(axis=1), 2]
+    other_along = other_points[is_near.any(axis=0), 2]
+    zone = (float(along[0]), float(along[-1]))
+    other_zone = (float(other_along[0]), float(other_along[-1]))
+    return zone, other_zone
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,10 +178,8 @@ class Rights:
 
     Attributes:
         zones: Zones in which their paths meet.
-        waits: Truth values, shape (A, A): whether the road user of the row has to let the one of
-            the column go first.
-        sees: Truth values, shape (A, A): whether the road user of the row brakes if the one of the
-            column is in its way.
+        waits: Whether the row's road user has to give way to the column's, shape (A, A), bool.
+        sees: Whether the row's road user brakes if the column's is in its way, shape (A, A), bool.
     """
 
     zones: Zones
@@ -194,48 +199,41 @@ def find_rights(
     Args:
         users: The road users.
         minor: Arms that give way to the others (none at a junction with lights).
-        blind: Rows of a pair that sees only the others on their own arm; all others let them go
-            first, so that they meet.
-        pushing: Rows of road users that wait for nobody, if there is a blind pair.
+        blind: Rows of a pair that sees only road users on its own arm; all others let the pair go
+            first, so that it meets.
+        pushing: Rows of road users that do not give way, if there is a blind pair.
     """
     count = len(users)
-    together = np.zeros((count, count), dtype=bool)
+    excluded = np.zeros((count, count), dtype=bool)
     waits = np.zeros((count, count), dtype=bool)
     sees = ~np.eye(count, dtype=bool)
     for i, user in enumerate(users):
         for j, other in enumerate(users):
-            together[i, j] = _go_together(user, other)
-            waits[i, j] = _waits(user, other, minor)
+            excluded[i, j] = _share_arm(user, other) or (user.walks and other.walks)
+            waits[i, j] = _has_to_wait(user, other, minor)
     if blind is not None:
         pair = list(blind)
         waits[:, pair] = True
         for row in blind:
             waits[row] = False
-            sees[row] = [_same_arm(users[row], other) for other in users]
+            sees[row] = [_share_arm(users[row], other) for other in users]
             sees[row, pair] = False
         waits[list(pushing)] = False
     paths = [user.path for user in users]
     spans = [user.span for user in users]
     widths = np.array([user.body.size[1] for user in users])
-    zones = find_zones(paths, spans, widths, together)
+    zones = find_zones(paths, spans, widths, excluded)
     return Rights(zones, waits, sees)
 
 
-def _go_together(user: RoadUser, other: RoadUser) -> bool:
-    """Return whether two come from the same arm, where one follows the other, or both walk."""
-    return _same_arm(user, other) or (user.walks and other.walks)
+def _share_arm(user: RoadUser, other: RoadUser) -> bool:
+    """Return whether two drivers come from the same arm, where one follows the other."""
+    if user.route is None or other.route is None:
+        return False
+    return user.route.from_arm == other.route.from_arm
 
 
-def _same_arm(user: RoadUser, other: RoadUser) -> bool:
-    """Return whether two drivers come from the same arm."""
-    return (
-        user.route is not None
-        and other.route is not None
-        and user.route.from_arm == other.route.from_arm
-    )
-
-
-def _waits(user: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
+def _has_to_wait(user: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
     """Return whether a road user has to let another go first."""
     if user.route is None:
         return False
@@ -245,10 +243,13 @@ def _waits(user: RoadUser, other: RoadUser, minor: Sequence[Arm]) -> bool:
         return False
     own_arm = user.route.from_arm
     other_arm = other.route.from_arm
-    if (own_arm in minor) != (other_arm in minor):
-        return own_arm in minor
-    opposite = OUTWARD[own_arm] == tuple(-value for value in OUTWARD[other_arm])
-    return opposite and user.route.turn == "left" and other.route.turn != "left"
+    is_minor = own_arm in minor
+    if is_minor != (other_arm in minor):
+        return is_minor
+    if user.route.turn != "left" or other.route.turn == "left":
+        return False
+    other_x, other_y = OUTWARD[other_arm]
+    return OUTWARD[own_arm] == (-other_x, -other_y)
 
 
 def waiting_gap(
@@ -266,9 +267,8 @@ def waiting_gap(
         front: Positions of the fronts along each path, shape (A,), metres.
         rear: Positions of the rears along each path, shape (A,), metres.
         speed: Speeds, shape (A,), m/s.
-        top_speed: Speeds that nobody exceeds, shape (A,), m/s.
-        faces_red: Truth values, shape (A,): whether a road user stands or will stand before a red
-            light.
+        top_speed: Speed that each road user does not exceed, shape (A,), m/s.
+        faces_red: Whether each road user stands or will stand at a red light, shape (A,), bool.
 
     Returns:
         Distances (A,), metres; infinite for road users that may go.
@@ -277,34 +277,45 @@ def waiting_gap(
     to_leave = rights.zones.leave - rear[:, None]
     own_speed = speed[:, None]
     own_top_speed = top_speed[:, None]
-    crawl_speed = np.maximum(own_speed, _CREEPING_SPEED)
+    steady_speed = np.maximum(own_speed, _CREEPING_SPEED)
     with np.errstate(invalid="ignore"):
         enter_distance = np.maximum(to_enter, 0.0)
         leave_distance = np.maximum(to_leave, 0.0)
-        time_to_enter = _min_time(enter_distance, own_speed, own_top_speed, _ENTERING_ACCELERATION)
-        time_to_leave = _min_time(leave_distance, own_speed, own_top_speed, _LEAVING_ACCELERATION)
-        steady_time_to_leave = leave_distance / crawl_speed
-    in_zone = (to_enter <= 0) & (to_leave > 0)
-    stopping_distance = np.maximum(to_enter - 0.3, 0.0)
-    cannot_stop = (to_enter > 0) & (own_speed**2 > 2 * _HARD_BRAKING * stopping_distance)
-    other_comes = (to_leave.T > 0) & (np.isfinite(to_enter.T)) & ~faces_red[None, :]
+        time_to_enter = _compute_min_time(
+            enter_distance, own_speed, own_top_speed, _ENTERING_ACCELERATION
+        )
+        time_to_leave = _compute_min_time(
+            leave_distance, own_speed, own_top_speed, _LEAVING_ACCELERATION
+        )
+        steady_time_to_leave = leave_distance / steady_speed
+    is_before_zone = to_enter > 0
+    is_in_zone = ~is_before_zone & (to_leave > 0)
+    max_stopping_distance = np.maximum(to_enter - _MIN_WAITING_DISTANCE_M, 0.0)
+    needs_hard_braking = own_speed**2 > 2 * _HARD_BRAKING * max_stopping_distance
+    cannot_stop = is_before_zone & needs_hard_braking
+    other_comes = (to_leave.T > 0) & np.isfinite(to_enter.T) & ~faces_red[None, :]
     goes_first = time_to_leave + _GAP_BEFORE_OTHER_S < time_to_enter.T
-    steady_time_to_enter = to_enter / crawl_speed
+    steady_time_to_enter = to_enter / steady_speed
     goes_second = steady_time_to_enter > steady_time_to_leave.T + _GAP_AFTER_OTHER_S
-    conflict = other_comes & ~goes_first & ~goes_second
-    conflict = conflict & (to_enter > 0) & ~cannot_stop & rights.sees
-    must_wait = rights.waits | in_zone.T | (cannot_stop & ~in_zone).T
+    conflicts = other_comes & ~goes_first & ~goes_second
+    conflicts = conflicts & is_before_zone & ~cannot_stop & rights.sees
+    must_wait = rights.waits | is_in_zone.T | cannot_stop.T
     stop_distance = np.maximum(to_enter - _WAITING_DISTANCE_M, 0.0)
-    gap = np.where(conflict & must_wait, stop_distance, np.inf)
+    gap = np.where(conflicts & must_wait, stop_distance, np.inf)
     return np.asarray(gap.min(axis=1))
 
 
-def _min_time(
+def _compute_min_time(
     distance: FloatArray, speed: FloatArray, top_speed: FloatArray, acceleration: float
 ) -> FloatArray:
-    """Return the shortest times, seconds, for distances, metres.
+    """Return the shortest times for distances, seconds.
 
-    The road users accelerate up to a top speed.
+    Args:
+        distance: Distances, metres.
+        speed: Speeds at the start, m/s.
+        top_speed: Speeds up to which the road users accelerate, m/s.
+        acceleration: Acceleration, m/s².
     """
-    speeding_up = (np.sqrt(speed**2 + 2 * acceleration * distance) - speed) / acceleration
-    return np.asarray(np.maximum(speeding_up, distance / top_speed))
+    end_speed = np.sqrt(speed**2 + 2 * acceleration * distance)
+    accelerating_time = (end_speed - speed) / acceleration
+    return np.maximum(accelerating_time, distance / top_speed)

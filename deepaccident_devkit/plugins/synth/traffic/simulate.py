@@ -1,4 +1,4 @@
-"""The simulation: all road users together, step by step, and what each of them notices."""
+"""The simulation of all road users together, step by step, and what each of them notices."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
+from deepaccident_devkit.plugins.synth.roads import Arm
+from deepaccident_devkit.plugins.synth.roads.paths import ahead_and_left
 from deepaccident_devkit.plugins.synth.traffic.driving import (
     DECISION_STEPS,
     HARDEST_BRAKING,
@@ -34,15 +36,15 @@ from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArra
 _POINT_SPACING_M = 2.0
 # Positions ahead along a road user's own path, metres.
 _LOOK_AHEAD_POSITIONS = np.arange(0.0, 44.0, _POINT_SPACING_M)
-# Free space at each side that drivers keep.
+# Lateral clearance that drivers keep on each side.
 _SIDE_MARGIN_M = 0.25
-# A road user that is farther back than this does not count as ahead.
+# A road user farther behind than this does not count as ahead.
 _MAX_DISTANCE_BEHIND_M = 2.0
-# Time between the future moments that are checked for a contact.
+# Time from one future moment that is checked for a contact to the next.
 _ALARM_STEP_S = 0.05
-# Angle to each side of straight ahead within which a driver looks, radians.
-_FIELD_OF_VIEW = np.deg2rad(80.0)
-# Drivers stop for a line until their front is this far past it.
+# Half of a driver's field of view: the angle to each side of straight ahead, radians.
+_HALF_FIELD_OF_VIEW = np.deg2rad(80.0)
+# Drivers whose front is farther past a stop line than this do not stop for it.
 _STOP_LINE_TOLERANCE_M = 0.5
 
 
@@ -63,83 +65,96 @@ class Bodies:
     width: FloatArray
 
 
-def leaders(
+def find_leaders(
     bodies: Bodies, tracks: Tracks, centers: FloatArray, sees: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gap and speed of the nearest road user ahead on each path.
+    """Find the nearest road user ahead on each path.
 
     Args:
         bodies: Positions and sizes of the road users.
         tracks: Table of their paths.
         centers: Positions of the centres along each path, shape (A,), metres.
-        sees: Truth values, shape (A, A): whether the row's road user reacts to the column's.
+        sees: Whether the row's road user reacts to the column's, shape (A, A), bool.
 
     Returns:
-        Gaps (A,), metres, infinite if there is nobody ahead, and speeds (A,) along the path, m/s.
+        Gaps (A,), metres, infinite if there is no road user ahead; and the leaders' speeds (A,)
+        along the path, m/s.
     """
-    rows, others = _candidates(bodies, sees)
+    rows, others = _find_candidates(bodies, sees)
     gaps = np.full(len(centers), np.inf)
     speeds = np.zeros(len(centers))
     if not len(rows):
         return gaps, speeds
-    ahead, lateral, turn = _in_path_frame(bodies, tracks, centers, rows, others)
-    cos = np.abs(np.cos(turn))
-    sin = np.abs(np.sin(turn))
+    ahead, lateral, angle = _locate_on_paths(bodies, tracks, centers, rows, others)
+    cos = np.abs(np.cos(angle))
+    sin = np.abs(np.sin(angle))
     other_length = bodies.length[others]
     other_width = bodies.width[others]
-    half_along = (cos * other_length + sin * other_width) / 2
-    half_across = (sin * other_length + cos * other_width) / 2
-    free_width = bodies.width[rows] / 2 + half_across + _SIDE_MARGIN_M
+    half_length_along = (cos * other_length + sin * other_width) / 2
+    half_width_across = (sin * other_length + cos * other_width) / 2
+    free_width = bodies.width[rows] / 2 + half_width_across + _SIDE_MARGIN_M
     blocking = (np.abs(lateral) < free_width) & (ahead > 0)
     rows = rows[blocking]
     others = others[blocking]
-    gap = (ahead - half_along)[blocking] - bodies.length[rows] / 2
+    gap = (ahead - half_length_along)[blocking] - bodies.length[rows] / 2
+    speed_along = bodies.speed[others] * np.cos(angle[blocking])
     order = np.argsort(-gap, kind="stable")  # the nearest is written last
-    gaps[rows[order]] = gap[order]
-    along_path = np.maximum(bodies.speed[others] * np.cos(turn[blocking]), 0.0)
-    speeds[rows[order]] = along_path[order]
+    ordered_rows = rows[order]
+    gaps[ordered_rows] = gap[order]
+    speeds[ordered_rows] = np.maximum(speed_along, 0.0)[order]
     return gaps, speeds
 
 
-def _candidates(bodies: Bodies, sees: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return pairs of rows: a road user that looks, and another one near and not behind it."""
-    delta = bodies.poses[None, :, :2] - bodies.poses[:, None, :2]
-    heading = bodies.poses[:, 2]
-    dx = delta[..., 0]
-    dy = delta[..., 1]
-    forward = np.cos(heading)[:, None] * dx + np.sin(heading)[:, None] * dy
-    half_reach = (_LOOK_AHEAD_POSITIONS[-1] + bodies.length)[:, None] / 2
-    reach = half_reach + 2.0 * bodies.speed[:, None]
-    near = dx**2 + dy**2 < reach**2
-    ahead = forward > -_MAX_DISTANCE_BEHIND_M
-    rows, others = np.nonzero(near & ahead & sees)
-    return rows, others
-
-
-def _in_path_frame(
-    bodies: Bodies, tracks: Tracks, centers: FloatArray, rows: IntArray, others: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Locate other road users along the paths of `rows`, for pairs of rows (P,).
+def _find_candidates(bodies: Bodies, sees: BoolArray) -> tuple[IntArray, IntArray]:
+    """Find the pairs of a road user that looks, and another one near it and not behind it.
 
     Returns:
-        Distances ahead (P,), distances to the left (P,), metres, and turns (P,), radians.
+        Rows of the first and of the second of each pair, shape (P,) each.
+    """
+    offsets = bodies.poses[None, :, :2] - bodies.poses[:, None, :2]
+    dx = offsets[..., 0]
+    dy = offsets[..., 1]
+    ahead, _ = ahead_and_left(dx, dy, bodies.poses[:, 2:])
+    half_reach = (_LOOK_AHEAD_POSITIONS[-1] + bodies.length)[:, None] / 2
+    reach = half_reach + 2.0 * bodies.speed[:, None]
+    is_near = dx**2 + dy**2 < reach**2
+    is_ahead = ahead > -_MAX_DISTANCE_BEHIND_M
+    rows, other_rows = np.nonzero(is_near & is_ahead & sees)
+    return rows, other_rows
+
+
+def _locate_on_paths(
+    bodies: Bodies, tracks: Tracks, centers: FloatArray, rows: IntArray, others: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Locate other road users along the paths of the road users that look, for P pairs.
+
+    Args:
+        bodies: Positions and sizes of the road users.
+        tracks: Table of their paths.
+        centers: Positions of the centres along each path, shape (A,), metres.
+        rows: Rows of the road users that look, shape (P,).
+        others: Rows of the other road users, shape (P,).
+
+    Returns:
+        Distances ahead (P,), distances to the left (P,), metres, and angles from the direction of
+        the path (P,), radians.
     """
     points, along = tracks.points_near(rows, centers[rows, None] + _LOOK_AHEAD_POSITIONS)
-    delta = bodies.poses[others, None, :2] - points[..., :2]
-    nearest = (delta**2).sum(axis=-1).argmin(axis=1)
+    offsets = bodies.poses[others, None, :2] - points[..., :2]
+    nearest_points = (offsets**2).sum(axis=-1).argmin(axis=1)
     pairs = np.arange(len(rows))
-    dx = delta[pairs, nearest, 0]
-    dy = delta[pairs, nearest, 1]
-    yaw = points[pairs, nearest, 2]
+    dx, dy = offsets[pairs, nearest_points].T
+    yaw = points[pairs, nearest_points, 2]
     cos = np.cos(yaw)
     sin = np.sin(yaw)
-    ahead = along[pairs, nearest] - centers[rows] + cos * dx + sin * dy
+    point_ahead = along[pairs, nearest_points] - centers[rows]
+    ahead = point_ahead + cos * dx + sin * dy
     lateral = cos * dy - sin * dx
     return ahead, lateral, bodies.poses[others, 2] - yaw
 
 
 class ContactAlarm:
-    """Alarm of a pair for its coming contact; a driver that noticed it brakes until the end.
+    """The alarm of a pair before its contact; a driver that noticed it brakes until the end.
 
     Args:
         rows: Rows of the pair, shape (2,).
@@ -151,11 +166,12 @@ class ContactAlarm:
         self._rows = rows
         self._size = size
         self._alert = alert
-        self._ahead = np.arange(0.0, alert.max() + _ALARM_STEP_S / 2, _ALARM_STEP_S)
+        end = alert.max() + _ALARM_STEP_S / 2
+        self._times_ahead = np.arange(0.0, end, _ALARM_STEP_S)
         self._noticed = np.zeros(2, dtype=bool)
 
     def rows(self, poses: FloatArray, velocities: FloatArray) -> IntArray:
-        """Return the rows of 0 to 2 drivers that brake; call it for one moment after the other.
+        """Return the rows of the drivers that brake (0 to 2); call it for successive moments.
 
         Args:
             poses: x, y (metres), yaw (radians) of the centres, shape (A, 3).
@@ -163,25 +179,29 @@ class ContactAlarm:
         """
         pair_poses = poses[self._rows]
         pair_velocities = velocities[self._rows]
-        expected = np.repeat(pair_poses[:, None], len(self._ahead), axis=1)
-        expected[..., :2] += self._ahead[:, None] * pair_velocities[:, None]
-        touching = separation(expected[0], self._size[0], expected[1], self._size[1]) <= 0
+        expected_poses = np.repeat(pair_poses[:, None], len(self._times_ahead), axis=1)
+        expected_poses[..., :2] += self._times_ahead[:, None] * pair_velocities[:, None]
+        pose, other_pose = expected_poses
+        touching = separation(pose, self._size[0], other_pose, self._size[1]) <= 0
         if touching.any():
-            time_to_contact = self._ahead[touching.argmax()]
-            self._noticed |= (time_to_contact < self._alert) & _looks_at(pair_poses)
+            time_to_contact = self._times_ahead[touching.argmax()]
+            is_due = time_to_contact < self._alert
+            self._noticed |= is_due & _see_each_other(pair_poses)
         return self._rows[self._noticed]
 
 
-def _looks_at(poses: FloatArray) -> BoolArray:
-    """Return whether each of two, with poses (2, 3), has the other in its field of view."""
-    delta = poses[::-1, :2] - poses[:, :2]
-    bearing = np.arctan2(delta[:, 1], delta[:, 0]) - poses[:, 2]
-    return np.asarray(np.cos(bearing) > np.cos(_FIELD_OF_VIEW))
+def _see_each_other(poses: FloatArray) -> BoolArray:
+    """Return whether each of a pair sees the other, for poses (2, 3: x, y, yaw)."""
+    positions = poses[:, :2]
+    dx, dy = (positions[::-1] - positions).T
+    bearing = np.arctan2(dy, dx) - poses[:, 2]
+    min_cosine = np.cos(_HALF_FIELD_OF_VIEW)
+    return np.asarray(np.cos(bearing) > min_cosine)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Simulation(FrozenArrays):
-    """The course of all road users; arrays are read-only.
+    """The motion of all road users over time; arrays are read-only.
 
     Attributes:
         time: Times, shape (S,), seconds, in steps of `driving.PERIOD`.
@@ -202,6 +222,11 @@ class Simulation(FrozenArrays):
         """x, y (metres), yaw (radians) of the boxes' centres, shape (S, A, 3)."""
         return self.states[..., :3]
 
+    @property
+    def speeds(self) -> FloatArray:
+        """Speeds of the rear axles, shape (S, A), m/s."""
+        return self.states[..., 3]
+
 
 def simulate(
     users: Sequence[RoadUser],
@@ -212,35 +237,39 @@ def simulate(
     signals: SignalPlan | None = None,
     watched: tuple[int, int] | None = None,
 ) -> Simulation:
-    """Let road users drive and walk until the end, or until the watched pair touches.
+    """Simulate road users until the end, or until the watched pair touches.
 
     Args:
         users: The road users.
         begin: Time of the first step, seconds.
         end: Time of the last step, seconds.
-        rights: Rules between all pairs; without them nobody reacts to anybody.
+        rights: Rules between all pairs; if None, road users do not react to each other.
         signals: Traffic lights; None if there are none.
-        watched: Rows of the watched pair, which brakes for each other at the last moment, or not.
+        watched: Rows of the watched pair; each of the two brakes for the other only at the last
+            moment, or never.
     """
     run = _SimulationRun(users, rights, signals, watched)
-    count = round((end - begin) / PERIOD) + 1
-    time = begin + PERIOD * np.arange(count, dtype=np.float64)
-    states = np.empty((count, len(users), 5))
-    velocities = np.empty((count, len(users), 2))
+    num_steps = round((end - begin) / PERIOD) + 1
+    times = begin + PERIOD * np.arange(num_steps, dtype=np.float64)
+    states = np.empty((num_steps, len(users), 5))
+    velocities = np.empty((num_steps, len(users), 2))
     contact = None
-    for row in range(count):
+    for row in range(num_steps):
         run.write_state(states[row], velocities[row])
         if row % DECISION_STEPS == 0:
-            run.decide(states[row], velocities[row], float(time[row]) - begin, float(time[row]))
+            run.decide(states[row], velocities[row], float(times[row]) - begin, float(times[row]))
             if watched is not None:
                 start = max(row - DECISION_STEPS, 0)
-                contact = _first_contact(states, run.size, watched, start, row + 1)
+                contact = _find_contact(states, run.size, watched, start, row + 1)
                 if contact is not None:
-                    count = contact + 1
+                    num_steps = contact + 1
                     break
         run.advance()
     return Simulation(
-        time=time[:count], states=states[:count], velocities=velocities[:count], contact=contact
+        time=times[:num_steps],
+        states=states[:num_steps],
+        velocities=velocities[:num_steps],
+        contact=contact,
     )
 
 
@@ -292,40 +321,46 @@ class _SimulationRun:
         velocities[:, 0] = state.speed * cos - across * sin
         velocities[:, 1] = state.speed * sin + across * cos
 
-    def decide(self, states: FloatArray, velocities: FloatArray, since: float, time: float) -> None:
-        """Choose everyone's acceleration, `since` seconds after the start."""
+    def decide(
+        self, states: FloatArray, velocities: FloatArray, elapsed: float, time: float
+    ) -> None:
+        """Choose the acceleration of each road user.
+
+        Args:
+            states: States at the moment, shape (A, 5), as in `Simulation`.
+            velocities: Velocities, shape (A, 2), m/s.
+            elapsed: Time since the first step, seconds.
+            time: Time, seconds.
+        """
         state = self._state
-        parameters = self._parameters
         allowed = self._tracks.allowed_speed(state.along)
-        acceleration = free_acceleration(parameters, state.speed, allowed)
+        acceleration = free_acceleration(self._parameters, state.speed, allowed)
         if self._rights is not None:
-            acceleration = acceleration + self._for_others(self._rights, states, time)
-        hardest = -hardest_braking(state.speed)
-        acceleration[since < self._delay] = -HARDEST_BRAKING
+            acceleration = acceleration + self._compute_reaction(self._rights, states, time)
+        acceleration[elapsed < self._delay] = -HARDEST_BRAKING
         if self._alarm is not None:
-            acceleration[self._alarm.rows(states[:, :3], velocities)] = -HARDEST_BRAKING
-        self._acceleration = np.maximum(acceleration, hardest)
+            braking_rows = self._alarm.rows(states[:, :3], velocities)
+            acceleration[braking_rows] = -HARDEST_BRAKING
+        self._acceleration = np.maximum(acceleration, -hardest_braking(state.speed))
 
     def advance(self) -> None:
-        """Move everyone by one step."""
+        """Move all road users by one step."""
         step_motion(self._state, self._acceleration, self._on_path, self._wheelbase)
         self._on_path = self._tracks.at(self._state.along)
         state = self._state
         walkers = self._walkers
         state.x[walkers], state.y[walkers], state.yaw[walkers] = self._on_path[:3, walkers]
 
-    def _for_others(self, rights: Rights, states: FloatArray, time: float) -> FloatArray:
+    def _compute_reaction(self, rights: Rights, states: FloatArray, time: float) -> FloatArray:
         """Return the accelerations (A,), m/s², 0 or less, that others and red lights cause."""
-        state = self._state
         parameters = self._parameters
         length = self.size[:, 0]
-        width = self.size[:, 1]
-        speed = state.speed
-        centers = state.along + self._axle_to_center
+        speed = self._state.speed
+        centers = self._state.along + self._axle_to_center
         front = centers + length / 2
         rear = centers - length / 2
-        bodies = Bodies(states[:, :3], speed, length, width)
-        gap, leader_speed = leaders(bodies, self._tracks, centers, rights.sees)
+        bodies = Bodies(states[:, :3], speed, length, self.size[:, 1])
+        gap, leader_speed = find_leaders(bodies, self._tracks, centers, rights.sees)
         red_gap = self._lights.gap(time, front, speed, parameters)
         faces_red = red_gap < np.inf
         crossing_gap = waiting_gap(rights, front, rear, speed, parameters.max_speed, faces_red)
@@ -341,19 +376,23 @@ class _Lights:
 
     def __init__(self, users: Sequence[RoadUser], signals: SignalPlan | None) -> None:
         self._signals = signals
-        self._arms = [user.route.from_arm if user.route else None for user in users]
+        self._arms: list[Arm | None] = []
         stop_lines = []
         for user in users:
-            if user.route and "signal" not in user.ignores:
-                stop_lines.append(user.route.stop_s)
-            else:
-                stop_lines.append(-np.inf)
+            arm = None
+            stop_line = -np.inf
+            if user.route is not None:
+                arm = user.route.from_arm
+                if "signal" not in user.ignores:
+                    stop_line = user.route.stop_s
+            self._arms.append(arm)
+            stop_lines.append(stop_line)
         self._stop_lines = np.array(stop_lines)
 
     def gap(
         self, time: float, front: FloatArray, speed: FloatArray, parameters: IdmParameters
     ) -> FloatArray:
-        """Return the metres (A,) to the stop line; infinite for drivers that need not stop there.
+        """Return the distances (A,) to the stop lines, metres; infinite for drivers that may go.
 
         Args:
             time: Time, seconds.
@@ -363,28 +402,37 @@ class _Lights:
         """
         if self._signals is None:
             return np.full(len(front), np.inf)
-        arms = set(self._arms) - {None}
-        colors = {arm: int(self._signals.state(arm, time)) for arm in arms if arm}
-        color = np.array([colors[arm] if arm else GREEN for arm in self._arms])
+        arms = {arm for arm in self._arms if arm is not None}
+        color_by_arm = {arm: int(self._signals.state(arm, time)) for arm in arms}
+        color = np.array([color_by_arm[arm] if arm else GREEN for arm in self._arms])
         gap = self._stop_lines - front
-        stops = (color != GREEN) & (gap > -_STOP_LINE_TOLERANCE_M)
-        stops &= (color != AMBER) | can_stop(parameters, speed, gap)
-        return np.where(stops, np.maximum(gap, 0.0), np.inf)
+        has_to_stop = (color != GREEN) & (gap > -_STOP_LINE_TOLERANCE_M)
+        has_to_stop &= (color != AMBER) | can_stop(parameters, speed, gap)
+        return np.where(has_to_stop, np.maximum(gap, 0.0), np.inf)
 
 
-def _first_contact(
+def _find_contact(
     states: FloatArray, size: FloatArray, pair: tuple[int, int], start: int, stop: int
 ) -> int | None:
-    """Return the first row from `start` to before `stop` at which the boxes of a pair touch.
+    """Return the first step at which the boxes of a pair touch.
+
+    Args:
+        states: States as in `Simulation`, shape (S, A, 5).
+        size: Lengths and widths, shape (A, 2), metres.
+        pair: Rows of the pair.
+        start: First step to look at.
+        stop: Step after the last one to look at.
 
     Returns:
-        None if there is no such row.
+        None if they do not touch.
     """
     row, other_row = pair
     poses = states[start:stop, row, :3]
     other_poses = states[start:stop, other_row, :3]
     touching: BoolArray = separation(poses, size[row], other_poses, size[other_row]) <= 0
-    return start + int(touching.argmax()) if touching.any() else None
+    if not touching.any():
+        return None
+    return start + int(touching.argmax())
 
 
 def separation(
@@ -403,11 +451,11 @@ def separation(
     Returns:
         Gaps (…), metres: 0 where rectangles just touch, negative if they overlap.
     """
-    turn = poses_b[..., 2] - poses_a[..., 2]
-    cos = np.abs(np.cos(turn))
-    sin = np.abs(np.sin(turn))
-    offset_a = np.abs(relative(poses_a, poses_b[..., :2]))
-    offset_b = np.abs(relative(poses_b, poses_a[..., :2]))
+    angle = poses_b[..., 2] - poses_a[..., 2]
+    cos = np.abs(np.cos(angle))
+    sin = np.abs(np.sin(angle))
+    offset_a = np.abs(to_pose_frame(poses_a, poses_b[..., :2]))
+    offset_b = np.abs(to_pose_frame(poses_b, poses_a[..., :2]))
     half_length_a = size_a[..., 0] / 2
     half_width_a = size_a[..., 1] / 2
     half_length_b = size_b[..., 0] / 2
@@ -430,22 +478,22 @@ def gap(
     The arguments are as in `separation`. Two disjoint rectangles are nearest at a corner of one of
     them.
     """
-    return gaps_of_pairs(_footprints(poses_a, size_a), _footprints(poses_b, size_b))
+    return gaps_of_pairs(_stack_footprints(poses_a, size_a), _stack_footprints(poses_b, size_b))
 
 
-def relative(poses: FloatArray, points: FloatArray) -> FloatArray:
+def to_pose_frame(poses: FloatArray, points: FloatArray) -> FloatArray:
     """Return points (…, 2) in the frames of poses (…, 3)."""
-    delta = points - poses[..., :2]
-    dx = delta[..., 0]
-    dy = delta[..., 1]
-    cos = np.cos(poses[..., 2])
-    sin = np.sin(poses[..., 2])
-    ahead = cos * dx + sin * dy
-    lateral = cos * dy - sin * dx
+    offsets = points - poses[..., :2]
+    dx = offsets[..., 0]
+    dy = offsets[..., 1]
+    ahead, lateral = ahead_and_left(dx, dy, poses[..., 2])
     return np.stack([ahead, lateral], axis=-1)
 
 
-def _footprints(poses: FloatArray, size: FloatArray) -> FloatArray:
+def _stack_footprints(poses: FloatArray, size: FloatArray) -> FloatArray:
     """Return rectangles (…, 5) as for `geometry.box_arrays`: x, y, length, width, yaw."""
-    sizes = np.broadcast_to(size, (*poses.shape[:-1], 2))
-    return np.concatenate([poses[..., :2], sizes, poses[..., 2:]], axis=-1)
+    leading_shape = poses.shape[:-1]
+    sizes = np.broadcast_to(size, (*leading_shape, 2))
+    xy = poses[..., :2]
+    yaw = poses[..., 2:]
+    return np.concatenate([xy, sizes, yaw], axis=-1)

@@ -12,6 +12,14 @@ export function channelsOf(color) {
 }
 
 /**
+ * Return a lighter colour, for thin lines and points on a dark ground.
+ * @param {Color} color
+ */
+export function lightened(color) {
+  return changed(color, (channel) => 0.3 + 0.7 * channel);
+}
+
+/**
  * Return the colour at a share of the way through several colours.
  * @param {Color[]} colors
  * @param {number} share below 0 the first, above 1 the last colour

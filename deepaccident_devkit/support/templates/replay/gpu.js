@@ -254,12 +254,18 @@ export class Numbers {
 
   /** @param {number[]} values */
   add(...values) {
-    if (this.count + values.length > this.array.length) {
-      const larger = new Float32Array(2 * this.array.length);
+    this.addAll(values);
+  }
+
+  /** @param {ArrayLike<number>} values */
+  addAll(values) {
+    const count = this.count + values.length;
+    if (count > this.array.length) {
+      const larger = new Float32Array(Math.max(count, 2 * this.array.length));
       larger.set(this.array);
       this.array = larger;
     }
     this.array.set(values, this.count);
-    this.count += values.length;
+    this.count = count;
   }
 }

@@ -1,6 +1,7 @@
 // The scene from above, on a canvas.
 
 import { actorOf, agentByNumber, alarmColor, isSeen, joinedAlarms, seersOf } from "./actors.js";
+import { channelsOf, lightened } from "./colors.js";
 import { data, pair, sources } from "./data.js";
 import { byId } from "./elements.js";
 import { placeBeside } from "./labels.js";
@@ -18,6 +19,11 @@ const FONT = "600 11px system-ui, sans-serif";
 const INK = "#1c1c1c";
 const CHIP = "#ffffffe6";
 const CASING = "#ffffff";
+const PAPER = { light: "#ffffff", dark: "#181818" };
+const ROAD_ON_DARK = 0.3; // share of the road's pale colours
+const MAP_POINTS = 4000; // of a cloud
+
+const darkScheme = matchMedia("(prefers-color-scheme: dark)");
 
 /** The picture of the road, if there is one. */
 export const roadImage = data.road && Object.assign(new Image(), { src: `data:image/png;base64,${data.road.png}` });
@@ -34,6 +40,7 @@ class SceneMap {
     /** @type {Rectangle[]} where a label would hide something */
     this.occupied = [];
     roadImage?.addEventListener("load", () => this.draw());
+    darkScheme.addEventListener("change", () => this.draw());
     this.showWhole();
   }
 
@@ -74,7 +81,7 @@ class SceneMap {
     this.fit();
     this.follow();
     this.canvas.dataset.view = this.view.numbers.join(" ");
-    this.pen.fillStyle = "#fff";
+    this.pen.fillStyle = darkScheme.matches ? PAPER.dark : PAPER.light;
     this.pen.fillRect(0, 0, this.view.width, this.view.height);
     const { layers } = state;
     const actors = this.annotated();
@@ -121,14 +128,16 @@ class SceneMap {
     if (!data.road || !roadImage) return;
     const { left, top, width, height } = data.road;
     const scale = this.view.scale / 100;
+    this.pen.globalAlpha = darkScheme.matches ? ROAD_ON_DARK : 1;
     this.pen.drawImage(roadImage, ...this.view.pixel([left, top]), width * scale, height * scale);
+    this.pen.globalAlpha = 1;
   }
 
   drawGrid() {
     const { pen, view } = this;
     pen.lineWidth = 1;
     pen.strokeStyle = data.colors.grid;
-    pen.globalAlpha = 0.5;
+    pen.globalAlpha = darkScheme.matches ? 0.25 : 0.5;
     pen.beginPath();
     const [halfWidth, halfHeight] = [view.width / 2 / view.scale, view.height / 2 / view.scale];
     const step = gridStep(GRID_METRES, view.scale);
@@ -159,9 +168,9 @@ class SceneMap {
     for (const agent of state.clouds) {
       const cloud = sources.points(agent, state.frame);
       if (!cloud) continue;
-      this.pen.fillStyle = state.clouds.length > 1 ? data.agents[agent].color : data.colors.points;
-      for (let index = 0; index < cloud.length; index += 3) {
-        const [x, y] = this.view.pixel([cloud[index] * 10, cloud[index + 1] * 10]);
+      this.pen.fillStyle = state.clouds.length > 1 ? thin(data.agents[agent].color) : data.colors.points;
+      for (let index = 0; index < Math.min(cloud.length, 3 * MAP_POINTS); index += 3) {
+        const [x, y] = this.view.pixel([cloud[index], cloud[index + 1]]);
         this.pen.fillRect(x - 0.75, y - 0.75, 1.5, 1.5);
       }
     }
@@ -171,7 +180,7 @@ class SceneMap {
   drawTrail(actor) {
     const last = state.frame;
     const pen = this.pen;
-    pen.strokeStyle = actor.color;
+    pen.strokeStyle = thin(actor.color);
     pen.lineWidth = actor.role === "other" ? 1.5 : 2.5;
     for (let frame = Math.max(1, last - TRAIL_FRAMES + 1); frame <= last; frame += 1) {
       const [before, after] = [actor.states[frame - 1], actor.states[frame]];
@@ -193,7 +202,7 @@ class SceneMap {
     pen.globalAlpha = 0.55;
     for (const [number, agent] of data.agents.entries()) {
       const isChosen = state.sight === "all" || state.sight === String(number);
-      pen.strokeStyle = agent.color;
+      pen.strokeStyle = thin(agent.color);
       pen.beginPath();
       for (const [actor, now] of this.annotated()) {
         if (!isChosen && actor.id !== state.lit) continue;
@@ -393,6 +402,15 @@ class SceneMap {
     pen.fillText(words, x + wide / 2, y + tall / 2 + 0.5);
     return label;
   }
+}
+
+/**
+ * Return the colour of thin lines and points; on a dark page it is lighter. Boxes keep their colours.
+ * @param {string} color
+ */
+function thin(color) {
+  if (!darkScheme.matches) return color;
+  return `rgb(${lightened(channelsOf(color)).map((channel) => Math.round(255 * channel)).join(" ")})`;
 }
 
 /**

@@ -38,8 +38,8 @@ export class Sources {
   }
 
   /**
-   * Return an agent's points, x, y, z, x, y, z, … in decimetres; null where there are none, undefined while they are
-   * loaded.
+   * Return an agent's points, x, y, z, x, y, z, … in centimetres; null where there are none, undefined while they are
+   * loaded. Any first part of them is spread over the whole cloud.
    * @param {number} agent its number
    * @param {number} frame
    */

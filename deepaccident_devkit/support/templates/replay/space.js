@@ -3,7 +3,7 @@
 import { actorOf, agentByNumber, alarmColor, isSeen } from "./actors.js";
 import { centreInMetres, cornersOf, EDGES, FACES, GroundPlane } from "./boxes.js";
 import { cameraOf, cards } from "./cameras.js";
-import { changed, channelsOf, mixed } from "./colors.js";
+import { changed, channelsOf, lightened, mixed } from "./colors.js";
 import { data, last, pair, sources } from "./data.js";
 import { byId, made } from "./elements.js";
 import { Gpu, Numbers } from "./gpu.js";
@@ -38,6 +38,8 @@ class Space {
     this.kinds = { points: new Numbers(), lines: new Numbers(), faces: new Numbers(), picture: new Numbers() };
     /** @type {Map<number, Int16Array | null>} the cloud of each agent that is shown while the next one is loaded */
     this.lastClouds = new Map();
+    /** @type {Map<number, { cloud: Int16Array, look: string, points: Float32Array }>} what is drawn of each agent's cloud */
+    this.drawnClouds = new Map();
     /** @type {Gpu | null} */
     this.gpu = null;
     this.isWaiting = false; // for the screen's next picture
@@ -177,7 +179,7 @@ class Space {
    * @param {string} color
    */
   thin(color) {
-    return changed(channelsOf(color), (channel) => (this.isDark ? 0.3 + 0.7 * channel : channel));
+    return this.isDark ? lightened(channelsOf(color)) : channelsOf(color);
   }
 
   /**
@@ -226,24 +228,33 @@ class Space {
     for (const number of state.clouds) {
       const cloud = this.cloud(number);
       const agent = data.agents[number];
-      if (cloud) this.addCloud(cloud, this.thin(agent.color), heights);
+      if (cloud) this.kinds.points.addAll(this.drawnCloud(number, cloud, this.thin(agent.color), heights));
       else if (cloud === null) missing.push(agent.title);
     }
     byId("space-note").textContent = missing.length ? `No LiDAR at this frame: ${missing.join(", ")}` : "";
   }
 
   /**
+   * Return the places and colours of a cloud's points; they are kept, since the scene is drawn often at one frame.
+   * @param {number} agent
    * @param {Int16Array} cloud
    * @param {Color} color
    * @param {Color[]} heights
    */
-  addCloud(cloud, color, heights) {
-    for (let index = 0; index < cloud.length; index += 3) {
-      const [x, y, z] = [cloud[index] / 10, cloud[index + 1] / 10, cloud[index + 2] / 10];
+  drawnCloud(agent, cloud, color, heights) {
+    const look = `${state.pointsBy} ${this.isDark}`;
+    const drawn = this.drawnClouds.get(agent);
+    if (drawn?.cloud === cloud && drawn.look === look) return drawn.points;
+    const points = new Float32Array((cloud.length / 3) * 7);
+    for (let index = 0, at = 0; index < cloud.length; index += 3, at += 7) {
+      const [x, y, z] = [cloud[index] / 100, cloud[index + 1] / 100, cloud[index + 2] / 100];
       const share = (z - this.ground.heightAt(x, y) - HEIGHTS[0]) / (HEIGHTS[1] - HEIGHTS[0]);
-      const [red, green, blue] = state.pointsBy === "height" ? mixed(heights, share) : color;
-      this.kinds.points.add(x, y, z, red, green, blue, 1);
+      points.set([x, y, z], at);
+      points.set(state.pointsBy === "height" ? mixed(heights, share) : color, at + 3);
+      points[at + 6] = 1;
     }
+    this.drawnClouds.set(agent, { cloud, look, points });
+    return points;
   }
 
   /**

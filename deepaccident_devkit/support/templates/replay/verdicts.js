@@ -43,6 +43,11 @@ if (data.prediction) {
   byId("samples").append(made("table", {}, made("thead", {}, heading), made("tbody", {}, ...body)));
 }
 
+function nothingYet() {
+  const [first] = [...samplesAt.keys()].sort((one, other) => one - other);
+  return `No prediction yet${first === undefined ? "" : ` (first at frame ${first + 1})`}.`;
+}
+
 /** Show what was predicted at the last evaluated frame. */
 export function showForeseen() {
   if (!data.prediction) return;
@@ -51,9 +56,9 @@ export function showForeseen() {
   const lines = state.foreseen.flatMap((sample) => [
     made("p", {}, verdictBadge(sample), sample.text),
     ...sample.alarms.map((alarm) => smallText(alarm.text, alarm.right ? "right" : "")),
-    ...(sample.more ? [smallText(`and ${sample.more} more, less sure`)] : []),
+    ...(sample.more ? [smallText(`and ${sample.more} more with lower scores`)] : []),
   ]);
-  byId("foreseen").replaceChildren(...(lines.length ? lines : [smallText("Nothing was evaluated yet.")]));
+  byId("foreseen").replaceChildren(...(lines.length ? lines : [smallText(nothingYet())]));
   for (const row of byId("samples").querySelectorAll("tr")) {
     if (row.dataset.frame) row.className = row.dataset.frame === String(frame) ? "now" : "";
   }

@@ -1,11 +1,17 @@
-"""What the accident evaluator takes, what it refuses, and which accidents a protocol compares."""
+"""Which inputs the accident evaluator takes, and which accidents a protocol compares."""
 
 from functools import partial
 
 import numpy as np
 import pytest
-from accident_scenes import as_heads, as_maps, scene, standing
-from refusals import assert_refused
+from support.accident_scenes import (
+    motion_labels_of,
+    parked_path,
+    shift_cars,
+    to_heads_output,
+    to_instance_output,
+)
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation import Accident, MotionOutput
@@ -17,9 +23,9 @@ from deepaccident_devkit.evaluation.accident import (
     compared_accidents,
 )
 
-CARS = {1: standing(20, 10), 2: [(15.5 - gap, 10) for gap in (4, 3, 2, 0, 0)]}
-APPROACH = {1: standing(20, 10), 2: [(x, 10.0) for x in (4, 8, 12, 15, 17)]}
-CRASH = {1: standing(20, 10), 2: [(16.0 - gap, 10.5) for gap in (10, 7.5, 5, 2.5, 0)]}
+CARS = {1: parked_path(20, 10), 2: [(15.5 - gap, 10) for gap in (4, 3, 2, 0, 0)]}
+APPROACH = {1: parked_path(20, 10), 2: [(x, 10.0) for x in (4, 8, 12, 15, 17)]}
+CRASH = {1: parked_path(20, 10), 2: [(16.0 - gap, 10.5) for gap in (10, 7.5, 5, 2.5, 0)]}
 PAIR = Accident(positions=np.array([[20.0, 10], [16, 10]]), time=2.0, ids=(1, 2))
 TRUTH = BoxTruth(
     time=np.arange(21) / 10,
@@ -28,59 +34,59 @@ TRUTH = BoxTruth(
     accident=PAIR,
     horizon=2.0,
 )
-KNOWN = AccidentContext(truth=TRUTH)
+BOX_CONTEXT = AccidentContext(truth=TRUTH)
 
 
 def test_the_protocols_and_their_choices() -> None:
     choices = {"reading": {"danger_distance": 1.0}}
-    assert {name: AccidentEvaluator(name).settings for name in PROTOCOLS} == {
+    settings = {name: AccidentEvaluator(name).settings for name in PROTOCOLS}
+    assert settings == {
         "released": {"protocol": "ReleasedAccidents", "choices": {}},
         "paper": {"protocol": "PaperAccidents", "choices": choices | {"sample_choice": "best"}},
         "boxes": {"protocol": "BoxAccidents", "choices": choices},
     }
     released = PROTOCOLS["released"]
-    assert (
-        released.labels,
-        released.truth_gap,
-        released.prediction_gap,
-        PROTOCOLS["paper"].labels,
-    ) == (
-        "released",
-        0.001,
-        5.0,
-        "released",
-    )
+    assert released.labels == PROTOCOLS["paper"].labels == "released"
+    assert (released.truth_gap, released.prediction_gap) == (0.001, 5.0)
     assert (AccidentEvaluator().protocol, released.maps_alone) == (released, True)
 
 
 def test_boxes_take_their_truth_from_the_context_and_alarms_from_a_generator() -> None:
     evaluator = AccidentEvaluator(protocol="boxes")
-    evaluator.update("alone", [PAIR], None, KNOWN)
-    evaluator.update("both", (each for each in [PAIR]), scene(CARS), KNOWN)
+    evaluator.update("alone", [PAIR], None, BOX_CONTEXT)
+    evaluator.update(
+        "both",
+        iter([PAIR]),
+        motion_labels_of(CARS),
+        BOX_CONTEXT,
+    )
     result = evaluator.compute()
     assert (result.apa, result.positives) == (1, 2)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_other_predictions_and_labels_are_refused(protocol: str) -> None:
-    label = scene(CARS)
-    evaluator, maps = AccidentEvaluator(protocol=protocol), as_maps(label)
-    assert_refused(
+    label = motion_labels_of(CARS)
+    maps = to_instance_output(label)
+    evaluator = AccidentEvaluator(protocol=protocol)
+    update = partial(evaluator.update, "one")
+
+    assert_raises(
         *(
             (
-                lambda given=given: evaluator.update("one", given, label, KNOWN),
+                partial(update, prediction, label, BOX_CONTEXT),
                 EvaluationError,
                 "list of Accidents",
             )
-            for given in (None, label.instance, PAIR, "alarm", [PAIR, None])
+            for prediction in (None, label.instance, PAIR, "alarm", [PAIR, None])
         ),
         (
-            lambda: evaluator.update("one", maps, label.instance),
+            partial(update, maps, label.instance),
             EvaluationError,
             ("label", "MotionLabels", "ndarray"),
         ),
         (
-            lambda: evaluator.update("one", maps, label, TRUTH),
+            partial(update, maps, label, TRUTH),
             EvaluationError,
             ("context", "AccidentContext"),
         ),
@@ -89,22 +95,31 @@ def test_other_predictions_and_labels_are_refused(protocol: str) -> None:
 
 
 @pytest.mark.parametrize("protocol", [3, None, "papr"])
-def test_a_protocol_that_is_none(protocol) -> None:
-    assert_refused(
+def test_an_unknown_protocol_is_refused(protocol) -> None:
+    assert_raises(
         (lambda: AccidentEvaluator(protocol=protocol), ChoiceError, ("released, paper, boxes",))
     )
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-@pytest.mark.parametrize("names", [{2: 70_000}, {2: 2_000_000_000}, {0: -1}])
-def test_ids_may_be_large_and_below_1_is_background(protocol: str, names: dict[int, int]) -> None:
-    label = scene(CARS)
-    [(old, new)] = names.items()
+@pytest.mark.parametrize(("old_id", "new_id"), [(2, 70_000), (2, 2_000_000_000), (0, -1)])
+def test_ids_may_be_large_and_below_1_is_background(
+    protocol: str, old_id: int, new_id: int
+) -> None:
+    label = motion_labels_of(CARS)
+    renamed = np.where(
+        label.instance == old_id,
+        new_id,
+        label.instance,
+    )
     counts = []
-    for maps in (label.instance, np.where(label.instance == old, new, label.instance)):
+    for instances in (label.instance, renamed):
         evaluator = AccidentEvaluator(protocol=protocol)
         evaluator.update(
-            "one", MotionOutput(grid=label.config.grid, instances=maps[None]), label, KNOWN
+            "one",
+            MotionOutput(grid=label.config.grid, instances=instances[None]),
+            label,
+            BOX_CONTEXT,
         )
         counts.append(dict(evaluator.counts))
         assert evaluator.compute().positives == 1
@@ -113,19 +128,22 @@ def test_ids_may_be_large_and_below_1_is_background(protocol: str, names: dict[i
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_pooled_counts_are_exact_and_can_be_pooled_again(protocol: str) -> None:
-    """Sums of floats that only add up to the same in exact arithmetic."""
-    evaluator, label = AccidentEvaluator(protocol=protocol), scene(CARS)
+    """The sums of these floats agree only in exact arithmetic."""
+    label = motion_labels_of(CARS)
+    evaluator = AccidentEvaluator(protocol=protocol)
     for number, shift in enumerate(np.random.default_rng(5).uniform(0, 2, 10)):
-        alarms = [
-            Accident(positions=PAIR.positions + shift, time=2.0 - shift, score=round(shift, 1))
-        ]
-        cars = {name: [(x, y + shift) for x, y in path] for name, path in CARS.items()}
-        evaluator.update(
-            str(number), alarms if protocol == "boxes" else as_maps(scene(cars)), label, KNOWN
-        )
+        prediction = to_instance_output(motion_labels_of(shift_cars(CARS, y=shift)))
+        if protocol == "boxes":
+            prediction = [
+                Accident(positions=PAIR.positions + shift, time=2.0 - shift, score=round(shift, 1))
+            ]
+        evaluator.update(str(number), prediction, label, BOX_CONTEXT)
+
     counts = [*evaluator.counts.values()]
     parts = [
-        each for part in (counts[:2], counts[2:6], counts[6:]) for each in evaluator.pooled(part)
+        *evaluator.pooled(counts[:2]),
+        *evaluator.pooled(counts[2:6]),
+        *evaluator.pooled(counts[6:]),
     ]
     for pooled in (parts, evaluator.pooled(parts), evaluator.pooled(counts)):
         assert len(pooled) < len(counts)
@@ -134,27 +152,21 @@ def test_pooled_counts_are_exact_and_can_be_pooled_again(protocol: str) -> None:
 
 
 def test_protocols_that_compare_with_nothing_are_refused() -> None:
-    label = scene({1: standing(20, 10)})
-    assert_refused(
-        *(
-            (
-                partial(compared_accidents, given, beside, AccidentContext(), PROTOCOLS[name]),
-                EvaluationError,
-                words,
-            )
-            for name, given, beside, words in (
-                ("released", [], None, ("compares motion",)),
-                ("released", [], label, ("compares motion",)),
-                ("released", as_maps(label), None, ("compares motion",)),
-                ("paper", [], None, ("motion labels",)),
-                ("boxes", [], None, ("needs its truth", "accident_context")),
-            )
-        )
-    )
+    label = motion_labels_of({1: parked_path(20, 10)})
+    cases = [
+        ("released", [], None, ("compares motion",)),
+        ("released", [], label, ("compares motion",)),
+        ("released", to_instance_output(label), None, ("compares motion",)),
+        ("paper", [], None, ("motion labels",)),
+        ("boxes", [], None, ("needs its truth", "accident_context")),
+    ]
+    for name, prediction, truth, words in cases:
+        compare = partial(compared_accidents, prediction, truth, AccidentContext(), PROTOCOLS[name])
+        assert_raises((compare, EvaluationError, words))
 
 
 SURE, LATE, UNSURE = (
-    Accident(positions=np.array([[20.0, 10], [16, 10]]), time=time, score=score)
+    Accident(positions=PAIR.positions, time=time, score=score)
     for time, score in ((2.25, 0.9), (2.26, 1.0), (0.5, 0.2))
 )
 
@@ -162,23 +174,34 @@ SURE, LATE, UNSURE = (
 @pytest.mark.parametrize(
     ("protocol", "form", "predicted", "label", "times"),
     [
-        ("paper", as_maps, [CRASH, {1: standing(20, 10)}], CRASH, [2.0]),
-        ("paper", as_maps, [{1: standing(20, 10)}], {1: standing(20, 10)}, []),
+        ("paper", to_instance_output, [CRASH, {1: parked_path(20, 10)}], CRASH, [2.0]),
+        ("paper", to_instance_output, [{1: parked_path(20, 10)}], {1: parked_path(20, 10)}, []),
         ("paper", None, [UNSURE, LATE, SURE], CRASH, [2.25]),
         ("boxes", None, [UNSURE, LATE, SURE], CRASH, [2.26, 2.25, 0.5]),
-        ("released", as_heads, [APPROACH, {}, APPROACH], APPROACH, [2.0, 2.0]),
-        ("released", as_heads, [{}, APPROACH], APPROACH, []),
+        ("released", to_heads_output, [APPROACH, {}, APPROACH], APPROACH, [2.0, 2.0]),
+        ("released", to_heads_output, [{}, APPROACH], APPROACH, []),
     ],
 )
 def test_which_accidents_are_compared(protocol, form, predicted, label, times) -> None:
-    """Of maps those of each prediction (as released none, if the first is empty); explicit ones by
-    the paper the surest up to the labels' end and half a step, by boxes all."""
-    given = form(*map(scene, predicted)) if form else predicted
-    made = compared_accidents(given, scene(label), KNOWN, PROTOCOLS[protocol])
-    assert [each.time for each in made.predicted] == times
-    assert (made.true and made.true.time, made.unplaced) == (2.0 if len(label) > 1 else None, None)
-    for accident in (made.true, *made.predicted) if len(label) > 1 else ():
-        ends = [path[-1] for path in label.values()]
+    """Maps give the accident of each prediction (as released none, if the first is empty). Of
+    explicit accidents `paper` compares the surest up to half a step after the labels' end, and
+    `boxes` all.
+    """
+    prediction = form(*map(motion_labels_of, predicted)) if form else predicted
+    has_accident = len(label) > 1
+
+    compared = compared_accidents(
+        prediction, motion_labels_of(label), BOX_CONTEXT, PROTOCOLS[protocol]
+    )
+
+    assert [accident.time for accident in compared.predicted] == times
+    assert compared.unplaced is None
+    if not has_accident:
+        assert compared.true is None
+        return
+    assert compared.true.time == 2.0
+    ends = [path[-1] for path in label.values()]
+    for accident in (compared.true, *compared.predicted):
         np.testing.assert_allclose(
             np.sort(accident.positions, axis=0), np.sort(ends, axis=0), atol=1.1
         )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, GeometryError, NotAvailableError
@@ -22,7 +22,8 @@ from deepaccident_devkit.evaluation.detection import (
 from deepaccident_devkit.geometry import SE3
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-PLAIN: dict[str, Any] = {
+# What a protocol chooses unless it states something else.
+DEFAULTS: dict[str, Any] = {
     "classes": tuple((name, (name,)) for name in CATEGORIES),
     "frame": "lidar",
     "label_velocity": False,
@@ -45,7 +46,7 @@ PLAIN: dict[str, Any] = {
     "orientation_unwrapped": False,
     "absent_class_is_zero": False,
 }
-"""What a protocol chooses that says nothing else."""
+
 RELEASED = {
     "truth": "label",
     "label_velocity": True,
@@ -67,7 +68,7 @@ RELEASED = {
     "orientation_unwrapped": True,
     "absent_class_is_zero": True,
 }
-CHOSEN: dict[str, dict[str, Any]] = {
+CHOICES: dict[str, dict[str, Any]] = {
     "released": RELEASED,
     "released_iou": RELEASED
     | {
@@ -106,21 +107,28 @@ CHOSEN: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", DETECTION_PROTOCOLS)
 def test_every_choice_of_the_published_procedures(name: str) -> None:
-    assert asdict(detection_protocol(name)) == PLAIN | CHOSEN[name]
+    assert asdict(detection_protocol(name)) == DEFAULTS | CHOICES[name]
 
 
-ONE = {"classes": [["car", ["car"]]], "thresholds": [2.0], "min_recall": 0, "min_precision": 0}
+ONE_CURVE = {
+    "classes": [["car", ["car"]]],
+    "thresholds": [2.0],
+    "min_recall": 0,
+    "min_precision": 0,
+}
 TWO_RINGS = {"ranges": [[0, 30], [30, 50]]}
 
 
-def test_the_edges_of_what_can_be() -> None:
-    """The last value that is taken, and the first one that is not."""
-    assert detection_protocol("paper", **ONE, points=10_000_000).points == 10_000_000
-    assert detection_protocol("paper", points=2, min_recall=0.99).points == 2
-    assert detection_protocol("paper", thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
+def test_the_limits_of_what_a_protocol_may_choose() -> None:
+    """The last value is accepted, the next one is refused."""
+    paper = partial(detection_protocol, "paper")
+    assert paper(**ONE_CURVE, points=10_000_000).points == 10_000_000
+    assert paper(points=2, min_recall=0.99).points == 2
+    assert paper(thresholds=[1, 2, 4]).thresholds == (1, 2, 4)
     released_iou = DETECTION_PROTOCOLS["released_iou"]
-    assert [released_iou.limits(name) for name in ("car", "cyclist")] == [(0.3, 0.15), (0.2, 0.1)]
-    assert_refused(
+    assert released_iou.limits("car") == (0.3, 0.15)
+    assert released_iou.limits("cyclist") == (0.2, 0.1)
+    assert_raises(
         (
             lambda: DetectionEvaluator("kitti"),
             ChoiceError,
@@ -133,22 +141,25 @@ def test_the_edges_of_what_can_be() -> None:
         ),
         *(
             (
-                partial(detection_protocol, "paper", **{name: "other"}),
+                partial(paper, **{name: "other"}),
                 ChoiceError,
                 (f"{name}: expected one of", "other"),
             )
             for name in ("truth", "measure", "matching", "area_of", "curve")
         ),
         *(
-            (partial(detection_protocol, "paper", **switches), ConfigError, words)
+            (partial(paper, **switches), ConfigError, words)
             for switches, words in (
                 ({"thresholds": (1.0,)}, ("error_threshold", "one of the thresholds")),
                 ({"thresholds": (), "error_threshold": None}, ("at least one",)),
                 ({"ranges": []}, ("at least one of each",)),
-                ({"frame": "world"}, ("frame", "lidar", "ego", "around the agent")),
-                ({"classes": [["road", ["lane"]]]}, ("expected names with categories",)),
-                ({"classes": [["car", ["car"]], ["all", ["car", "van"]]]}, ("each at most once",)),
-                ({"classes": []}, ("expected names with categories",)),
+                ({"frame": "world"}, ("frame", "lidar", "ego", "distances from the agent")),
+                ({"classes": [["road", ["lane"]]]}, ("expected names of classes with categories",)),
+                (
+                    {"classes": [["car", ["car"]], ["all", ["car", "van"]]]},
+                    ("each category at most once",),
+                ),
+                ({"classes": []}, ("expected names of classes with categories",)),
                 ({"small_thresholds": (1.0,)}, ("as many as thresholds",)),
                 ({"global_sort": False}, ("curve='voc'",)),
                 ({"curve": "voc"}, ("another curve than voc",)),
@@ -158,7 +169,7 @@ def test_the_edges_of_what_can_be() -> None:
                 ({"min_recall": 1.0}, ("below 1",)),
                 ({"min_recall": -0.01}, ("shares from 0",)),
                 ({"points": 1}, ("at least 2",)),
-                (ONE | {"points": 10_000_001}, ("10000001", "threshold (1)", "10,000,000")),
+                (ONE_CURVE | {"points": 10_000_001}, ("10000001", "threshold (1)", "10,000,000")),
                 ({"points": 555_556}, ("threshold (18)",)),
                 (TWO_RINGS | {"points": 300_000, "error_threshold": None}, ("threshold (36)",)),
             )
@@ -168,53 +179,67 @@ def test_the_edges_of_what_can_be() -> None:
 
 def test_the_truth_of_each_protocol(da: DeepAccident) -> None:
     sample = da.get_sample(da.scenario[0]["token"], "ego_vehicle", 3)
-    every = da.boxes(sample, "lidar")
+    own_id = da.get("agent", sample["agent_token"])["actor_id"]
+
     released = detection_truth(da, sample)
-    assert released.actor_id.tolist() == every.actor_id.tolist()
-    rows = da.annotation_rows(sample)
-    np.testing.assert_array_equal(
-        released.velocity[:, :2], da.columns("annotation")["velocity_label"][rows]
-    )
+    assert released.frame == "lidar"
+    assert released.actor_id.tolist() == da.boxes(sample, "lidar").actor_id.tolist()
+    velocities = da.columns("annotation")["velocity_label"][da.annotation_rows(sample)]
+    np.testing.assert_array_equal(released.velocity[:, :2], velocities)
+
     paper = detection_truth(da, sample, "paper")
+    assert paper.frame == "lidar"
     assert paper.actor_id.tolist() == da.boxes(sample, "lidar", "released").actor_id.tolist()
+
     cooperative = detection_truth(da, sample, "opencood")
-    alone = detection_truth(da, sample, "opencood", agents="single")
-    own = da.get("agent", sample["agent_token"])["actor_id"]
-    assert own not in cooperative.actor_id
-    assert own in detection_truth(da, sample, detection_protocol("opencood", own_box=True)).actor_id
-    assert set(alone.actor_id.tolist()) <= set(cooperative.actor_id.tolist())
-    assert {each.frame for each in (released, paper, cooperative)} == {"lidar"}
-    velocities = detection_protocol("opencood", label_velocity=True)
-    assert_refused(
+    single = detection_truth(da, sample, "opencood", agents="single")
+    with_own_box = detection_truth(da, sample, detection_protocol("opencood", own_box=True))
+    assert cooperative.frame == "lidar"
+    assert own_id not in cooperative.actor_id
+    assert own_id in with_own_box.actor_id
+    assert set(single.actor_id.tolist()) <= set(cooperative.actor_id.tolist())
+
+    label_velocities = detection_protocol("opencood", label_velocity=True)
+    assert_raises(
         (
             lambda: detection_truth(da, sample, "paper", agents="single"),
             ConfigError,
             ("truth='cooperative'", "visible"),
         ),
         (
-            lambda: detection_truth(da, sample, velocities),
+            lambda: detection_truth(da, sample, label_velocities),
             ConfigError,
             ("label_velocity", "choose False"),
         ),
     )
 
 
-def test_detected_boxes_say_their_frame_and_change_it() -> None:
-    arrays = [[1.0, 2.0, 3.0]], [[4.0, 2.0, 1.5]], [0.5], [0.9]
-    moved = DetectedBoxes.from_arrays(*arrays, frame="lidar").transform(
-        SE3.from_yaw(0, (10, 0, 0)), "world"
-    )
-    assert (moved.boxes.frame, moved.boxes.center.tolist(), moved.scores.tolist()) == (
-        "world",
-        [[11, 2, 3]],
+def test_detected_boxes_have_a_frame_and_change_it() -> None:
+    from_arrays = partial(
+        DetectedBoxes.from_arrays,
+        [[1.0, 2.0, 3.0]],
+        [[4.0, 2.0, 1.5]],
+        [0.5],
         [0.9],
+        frame="lidar",
     )
-    assert (len(moved), moved.scores.flags.writeable) == (1, False)
-    for velocity in ([[3.0, 4.0]], [[3.0, 4.0, 0.0]], None):
-        given = DetectedBoxes.from_arrays(*arrays, frame="lidar", velocity=velocity).boxes.velocity
-        np.testing.assert_array_equal(given, [[math.nan] * 3] if velocity is None else [[3, 4, 0]])
-    assert_refused(
-        (lambda: DetectedBoxes(boxes=moved.boxes, scores=[0.5, 0.6]), GeometryError, ("scores",)),
+    moved = from_arrays().transform(SE3.from_yaw(0, (10, 0, 0)), "world")
+    assert (len(moved), moved.boxes.frame) == (1, "world")
+    assert moved.boxes.center.tolist() == [[11, 2, 3]]
+    assert (moved.scores.tolist(), moved.scores.flags.writeable) == ([0.9], False)
+
+    for velocity, expected in (
+        ([[3.0, 4.0]], [[3, 4, 0]]),
+        ([[3.0, 4.0, 0.0]], [[3, 4, 0]]),
+        (None, [[math.nan] * 3]),
+    ):
+        np.testing.assert_array_equal(from_arrays(velocity=velocity).boxes.velocity, expected)
+    assert_raises(
+        (
+            lambda: DetectedBoxes(boxes=moved.boxes, scores=[0.5, 0.6]),
+            GeometryError,
+            ("scores",),
+        ),
         (
             lambda: DetectedBoxes(boxes=moved.boxes, scores=[math.nan]),
             GeometryError,
@@ -224,10 +249,13 @@ def test_detected_boxes_say_their_frame_and_change_it() -> None:
 
 
 def test_a_sample_without_label_has_no_truth(own_release: Path) -> None:
-    for path in own_release.rglob("label"):
-        for file in path.rglob("*.txt"):
-            file.unlink()
-    opened = DeepAccident("v1", own_release, verbose=False, on_error="skip")
-    assert_refused(
-        (lambda: detection_truth(opened, opened.sample[0]), NotAvailableError, ("has no label",))
+    for file in own_release.rglob("label/**/*.txt"):
+        file.unlink()
+    dataset = DeepAccident("v1", own_release, verbose=False, on_error="skip")
+    assert_raises(
+        (
+            lambda: detection_truth(dataset, dataset.sample[0]),
+            NotAvailableError,
+            ("has no label",),
+        )
     )

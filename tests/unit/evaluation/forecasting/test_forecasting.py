@@ -1,13 +1,13 @@
 """Every default and constant of forecasting, against what is written out here."""
 
-from written_out import written_out
+from support.default_values import package_values
 
 from deepaccident_devkit.evaluation.forecasting.evaluator import (
     FORECASTING_PROTOCOLS,
     ForecastingEvaluator,
 )
 
-WRITTEN = {
+EXPECTED_VALUES = {
     "evaluator.TOGETHER": "'together'",
     "evaluator.FORECASTING_PROTOCOLS": (
         "mappingproxy({'clean': ForecastingProtocol(horizons=(3.0, 1.0, 2.0, 5.0), "
@@ -42,10 +42,7 @@ WRITTEN = {
 
 
 def test_every_default_and_constant_written_out() -> None:
-    assert written_out("deepaccident_devkit.evaluation.forecasting") == WRITTEN
-    facts = (
-        ForecastingEvaluator.needs_whole_recordings,
-        ForecastingEvaluator.needs_meta,
-        [*FORECASTING_PROTOCOLS],
-    )
-    assert facts == (True, False, ["clean"])
+    assert package_values("deepaccident_devkit.evaluation.forecasting") == EXPECTED_VALUES
+    assert ForecastingEvaluator.needs_whole_recordings is True
+    assert ForecastingEvaluator.needs_meta is False
+    assert [*FORECASTING_PROTOCOLS] == ["clean"]

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from refusals import assert_refused
-from written_out import written_out
+from support.default_values import package_values
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.evaluation.results.records import json_meta
 
-WRITTEN = {
+EXPECTED_VALUES = {
     "motion.MEMBER": "'{}/{}.npy'",
     "motion.HEADS": "{'segmentation': 2, 'centerness': 1, 'offset': 2, 'flow': 2}",
     "motion.NOT_READ": "('trajectory_id', 'trajectory')",
@@ -35,9 +35,8 @@ WRITTEN = {
 
 
 def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
-    assert (written_out("deepaccident_devkit.evaluation.results"), json_meta({})) == (WRITTEN, {})
-    assert (
-        repr(ResultsWriter(tmp_path / "x", "motion"))
-        == f"ResultsWriter(motion to {tmp_path / 'x'}: 0 samples)"
-    )
-    assert_refused((lambda: read_results(tmp_path / "x"), ResultsError, ("x: no such file",)))
+    assert package_values("deepaccident_devkit.evaluation.results") == EXPECTED_VALUES
+    assert json_meta({}) == {}
+    path = tmp_path / "x"
+    assert repr(ResultsWriter(path, "motion")) == f"ResultsWriter(motion to {path}: 0 samples)"
+    assert_raises((lambda: read_results(path), ResultsError, ("x: no such file",)))

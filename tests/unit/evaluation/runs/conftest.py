@@ -20,15 +20,13 @@ SETUP = EvaluationSetup(task="accident", protocol="boxes")
 
 @pytest.fixture(scope="session")
 def release_root_b(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The labels-only release with half a second more: at the impact itself nothing can be
-    foreseen.
+    """Make the labels-only release with half a second more.
+
+    At the impact itself nothing can be foreseen.
     """
     root = tmp_path_factory.mktemp("runs") / "layout_b"
-    return make_release(
-        root,
-        SynthConfig(scenarios=6, frames=6, layout="B", seed=4, sensors=False, designed=True),
-        workers=1,
-    )
+    config = SynthConfig(scenarios=6, frames=6, layout="B", seed=4, sensors=False, designed=True)
+    return make_release(root, config, workers=1)
 
 
 @pytest.fixture(scope="session")
@@ -38,7 +36,7 @@ def da_b(release_root_b: Path) -> DeepAccident:
 
 @pytest.fixture(scope="session")
 def selection() -> SampleSelection:
-    """Two scenarios, an accident and its normal twin, of three agents: six samples."""
+    """Select an accident and its normal twin, as three agents see them: six samples."""
     return SampleSelection(
         split="val",
         samples="evaluate",
@@ -49,7 +47,7 @@ def selection() -> SampleSelection:
 
 @pytest.fixture(scope="session")
 def write_accidents(da_b: DeepAccident) -> WriteAccidents:
-    """Write the true accidents of samples, moved by some metres: `(path, tokens, moved=0.1)`."""
+    """Write the true accidents of samples, moved in metres: `(path, tokens, moved=0.1)`."""
     return partial(_write_accidents, da_b)
 
 
@@ -63,13 +61,13 @@ def write_motion(da_b: DeepAccident) -> WriteMotion:
 def results(
     da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: WriteAccidents
 ) -> Results:
-    """Accidents of just the samples of `selection`."""
+    """Write accidents of exactly the samples of `selection`."""
     return write_accidents(tmp_path / "accidents.json", selection.tokens(da_b))
 
 
 @pytest.fixture
 def run(da_b: DeepAccident, results: Results, selection: SampleSelection) -> EvaluationRun:
-    """Those, evaluated."""
+    """Evaluate `results`."""
     return evaluate_results(da_b, results, SETUP, selection, workers=1)
 
 
@@ -79,13 +77,12 @@ def _write_accidents(
     with ResultsWriter(path, "accident", meta={"method": "truth", "moved": moved}) as writer:
         for token in tokens:
             truth = accident_context(dataset, token, 2.0).truth
-            true = None if truth is None else truth.accident
-            writer.add(
-                token,
-                []
-                if true is None
-                else [Accident(positions=true.positions + moved, time=true.time, ids=true.ids)],
-            )
+            predictions = []
+            if truth is not None and truth.accident is not None:
+                accident = truth.accident
+                positions = accident.positions + moved
+                predictions = [Accident(positions=positions, time=accident.time, ids=accident.ids)]
+            writer.add(token, predictions)
     return read_results(path)
 
 

@@ -1,5 +1,5 @@
-"""Two evaluations side by side: which differences are real, which two cannot be compared; the
-permutation test.
+"""Two evaluations side by side: which differences are real, which evaluations cannot be compared,
+and the permutation test.
 """
 
 import csv
@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from generated_bundles import MAIN, write_bundle
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import assert_refused
 from scipy.stats import binom
+from support.expected_errors import assert_raises
+from support.generated_bundles import MAIN, change_json, write_bundle
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
@@ -48,18 +48,18 @@ pytestmark = pytest.mark.slow
 
 Write = Callable[..., Results]
 Save = Callable[..., Path]
-FEW = Resampling(resamples=40)
+FEW_RESAMPLES = Resampling(resamples=40)
 FIRST = "type1_subtype1_accident/Town03_000/ego_vehicle/001"
 COUNT_FAULTS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "nothing": (lambda counts: counts[FIRST].clear(), "KeyError: 'vpq'"),
-    "a text": (lambda counts: counts[FIRST].update(cells="x"), "ValueError"),
+    "a text": (lambda counts: counts[FIRST].update(cells="x"), "TypeError"),
     "a short list": (lambda counts: counts[FIRST].update(cells=[]), "IndexError"),
     "a number": (lambda counts: counts[FIRST].update(paths=1), "TypeError"),
     "giants": (lambda counts: counts[FIRST].update(vpq=[[[10**400]] * 4] * 2), "OverflowError"),
     "infinity": (lambda counts: counts[FIRST].update(vpq=[[[math.inf]] * 4] * 2), "OverflowError"),
     "no token": (
         lambda counts: counts.update({"x" * 10**6: counts[FIRST]}),
-        "expected a sample's token",
+        "expected a sample token",
     ),
 }
 
@@ -71,61 +71,64 @@ def motion_bundles(
     write_motion: Write,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, Path]:
-    """The labels moved by two cells, and by one: the second is better."""
-    folder, made = tmp_path_factory.mktemp("motion"), []
+    """Evaluate the labels moved by two cells, and by one: the second is better."""
+    folder = tmp_path_factory.mktemp("motion")
+    bundles = []
     for moved in (2, 1):
         results = write_motion(folder / f"results {moved}", selection.tokens(da_b), moved=moved)
         run = evaluate_results(da_b, results, EvaluationSetup(task="motion"), selection, workers=1)
-        made.append(save_run(run, folder / f"bundle {moved}"))
-    return made[0], made[1]
+        bundles.append(save_run(run, folder / f"bundle {moved}"))
+
+    return bundles[0], bundles[1]
 
 
 @pytest.fixture
-def saved(run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path) -> Save:
-    """Evaluate and save: `(name, moved, tokens, setup, **of the selection)`."""
+def save_bundle(
+    run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path
+) -> Save:
+    """Evaluate and save: `(name, moved, setup, **changes of the selection)`."""
 
     def save(
-        name: str, moved: float = 0.1, setup: EvaluationSetup = run.setup, **selection: Any
+        name: str, moved: float = 0.1, setup: EvaluationSetup = run.setup, **changes: Any
     ) -> Path:
-        chosen = replace(run.selection, **selection)
-        results = write_accidents(tmp_path / f"{name}.json", chosen.tokens(da_b), moved=moved)
-        return save_run(evaluate_results(da_b, results, setup, chosen, workers=1), tmp_path / name)
+        selection = replace(run.selection, **changes)
+        results = write_accidents(tmp_path / f"{name}.json", selection.tokens(da_b), moved=moved)
+        other_run = evaluate_results(da_b, results, setup, selection, workers=1)
+        return save_run(other_run, tmp_path / name)
 
     return save
 
 
-def by_name(comparison: Comparison) -> dict[str, Any]:
-    return {each.headline or each.number: each for each in comparison.numbers}
+def numbers_by_name(comparison: Comparison) -> dict[str, Any]:
+    return {number.headline or number.number: number for number in comparison.numbers}
 
 
 @pytest.fixture
-def generated(tmp_path: Path) -> Callable[..., Comparison]:
-    """Compare two runs of the given cells found, of 100 true ones a cluster."""
+def compare_cells(tmp_path: Path) -> Callable[..., Comparison]:
+    """Compare two runs by the cells that each hits, of 100 true ones in every cluster."""
 
     def compare(
-        a: Sequence[int], b: Sequence[int], resampling: Resampling | None = None, **how: Any
+        a: Sequence[int], b: Sequence[int], resampling: Resampling | None = None, **options: Any
     ) -> Comparison:
-        folders = [
-            write_bundle(
-                tmp_path / f"{name}{len(list(tmp_path.iterdir()))}",
-                [(each, 100 - each) for each in run],
-                **how,
-            )
-            for name, run in (("a", a), ("b", b))
-        ]
+        folders = []
+        for name, hit_cells in (("a", a), ("b", b)):
+            folder = tmp_path / f"{name}{len(list(tmp_path.iterdir()))}"
+            cells = [(hits, 100 - hits) for hits in hit_cells]
+            folders.append(write_bundle(folder, cells, **options))
+
         return compare_bundles(*folders, resampling)
 
     return compare
 
 
-HARD = [5 * number for number in range(16)]
-"""Cells found in clusters that differ by far more than two runs do."""
+HIT_CELLS = [5 * number for number in range(16)]
+"""Cells hit in each cluster: clusters differ by far more than two runs do."""
 
 
-def test_the_better_one_is_named(generated: Callable[..., Comparison]) -> None:
-    iou = by_name(generated(HARD, [each + 3 + number % 3 for number, each in enumerate(HARD)]))[
-        MAIN
-    ]
+def test_the_better_one_is_named(compare_cells: Callable[..., Comparison]) -> None:
+    better = [hits + 3 + number % 3 for number, hits in enumerate(HIT_CELLS)]
+    iou = numbers_by_name(compare_cells(HIT_CELLS, better))[MAIN]
+
     assert (iou.family, iou.real, iou.better, iou.decision) == ("main", True, "b", "b is better")
     assert iou.difference == pytest.approx(iou.b - iou.a)
     assert 3 < iou.low < iou.difference < iou.high < 5
@@ -133,121 +136,146 @@ def test_the_better_one_is_named(generated: Callable[..., Comparison]) -> None:
     assert iou.unit == "%"
 
 
-def test_pairs_are_compared(generated: Callable[..., Comparison]) -> None:
-    """Were the clusters of one run in another order, the same numbers would tell nothing."""
-    better = [each + 3 for each in HARD]
-    apart = by_name(generated(HARD, better[5:] + better[:5]))[MAIN]
-    assert apart.difference == pytest.approx(3)
-    assert not apart.real
-    assert apart.low < -5 < 10 < apart.high
+def test_pairs_are_compared(compare_cells: Callable[..., Comparison]) -> None:
+    """With the clusters of one run in another order, the same numbers show nothing."""
+    better = [hits + 3 for hits in HIT_CELLS]
+    reordered = better[5:] + better[:5]
+    iou = numbers_by_name(compare_cells(HIT_CELLS, reordered))[MAIN]
 
-
-def test_the_other_headlines_are_tested_together(generated: Callable[..., Comparison]) -> None:
-    """Both ranges have the same numbers: by itself one is real, of several it is not."""
-    numbers = by_name(
-        generated([50] * 10, [50 + each for each in [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]])
-    )
-    alone, together = numbers[MAIN], numbers["iou 100x100"]
-    assert alone.p == together.p == alone.adjusted_p <= 0.05 < together.adjusted_p
-    assert (alone.real, together.real, together.better) == (True, False, None)
-    tested = [
-        each for each in numbers.values() if each.family == "headlines" and each.p is not None
-    ]
-    assert together.adjusted_p == pytest.approx(min(len(tested) * together.p, 1))
-    others = [each for each in numbers.values() if each.family == "other"]
-    assert {each.decision for each in others} == {"for exploration"}
-    assert not any(each.real for each in others)
-
-
-def test_itself_differs_in_nothing(generated: Callable[..., Comparison]) -> None:
-    for each in generated(HARD, HARD).numbers:
-        assert (each.real, each.better, each.low) == (False, None, None)
-        assert each.difference in (0.0, None)
-        assert each.decision in ("the difference is 0", "nothing to compare", "for exploration")
-
-
-def test_what_would_decide(generated: Callable[..., Comparison]) -> None:
-    iou = by_name(generated([50] * 20, [50 + 3 * (-1) ** number + 1 for number in range(20)]))[MAIN]
+    assert iou.difference == pytest.approx(3)
     assert not iou.real
-    assert iou.decision == "not decided: about 75 scenarios would decide it"  # 7.849 · 9 · 20 / 19
+    assert iou.low < -5 < 10 < iou.high
 
 
-def test_without_resamples(generated: Callable[..., Comparison]) -> None:
-    comparison = generated(HARD, [each + 9 for each in HARD], Resampling(resamples=0))
-    assert {(each.p, each.low, each.real) for each in comparison.numbers} == {(None, None, False)}
-    assert comparison.notes() == ["no intervals and no tests: no resamples were asked for"]
+def test_the_other_headlines_are_tested_together(compare_cells: Callable[..., Comparison]) -> None:
+    """Both ranges have the same numbers, which are real as one test and not as one of several."""
+    gains = [1, -1, 2, -1, 3, 3, 1, 2, 2, 1]
+    numbers = numbers_by_name(compare_cells([50] * 10, [50 + gain for gain in gains]))
+    main, other = numbers[MAIN], numbers["iou 100x100"]
+    assert main.p == other.p == main.adjusted_p <= 0.05 < other.adjusted_p
+    assert (main.real, other.real, other.better) == (True, False, None)
+
+    headlines = [number for number in numbers.values() if number.family == "headlines"]
+    tests = sum(number.p is not None for number in headlines)
+    assert other.adjusted_p == pytest.approx(min(tests * other.p, 1))
+
+    exploratory = [number for number in numbers.values() if number.family == "other"]
+    assert {number.decision for number in exploratory} == {"for exploration"}
+    assert not any(number.real for number in exploratory)
 
 
-def test_all_of_a_small_one(generated: Callable[..., Comparison]) -> None:
-    """Of seven clusters all 64 swaps are tried: none of the others differs as much."""
-    made = generated(
-        HARD[:7], [each + 9 + number % 2 for number, each in enumerate(HARD[:7])], twins=True
-    )
-    row = "iou 30x30 (%)    15.000  24.429  +9.429  [+8.934, +9.923]  0.016          b is better"
-    assert row in made.to_text().splitlines()
-    told = made.to_dict()
-    assert (told["samples"], told["clusters"], told["swaps"], told["all_swaps"]) == (
-        14,
-        7,
-        64,
-        True,
-    )
-    assert (told["numbers"][1]["p"], told["numbers"][1]["adjusted_p"]) == (1 / 64, 3 / 64)
+def test_an_evaluation_differs_from_itself_in_nothing(
+    compare_cells: Callable[..., Comparison],
+) -> None:
+    decisions = ("equal", "nothing to compare", "for exploration")
+    for number in compare_cells(HIT_CELLS, HIT_CELLS).numbers:
+        assert (number.real, number.better, number.low) == (False, None, None)
+        assert number.difference in (0.0, None)
+        assert number.decision in decisions
+
+
+def test_what_would_decide(compare_cells: Callable[..., Comparison]) -> None:
+    alternating = [50 + 3 * (-1) ** number + 1 for number in range(20)]
+    iou = numbers_by_name(compare_cells([50] * 20, alternating))[MAIN]
+
+    assert not iou.real
+    assert iou.decision == "inconclusive (would need about 75 scenarios)"  # 7.849 · 9 · 20 / 19
+
+
+def test_without_resamples(compare_cells: Callable[..., Comparison]) -> None:
+    better = [hits + 9 for hits in HIT_CELLS]
+    comparison = compare_cells(HIT_CELLS, better, Resampling(resamples=0))
+
+    outcomes = {(number.p, number.low, number.real) for number in comparison.numbers}
+    assert outcomes == {(None, None, False)}
+    assert comparison.notes() == [
+        "no confidence intervals and no tests, since the resamples were set to 0"
+    ]
+
+
+def test_all_swaps_of_few_clusters_are_tried(compare_cells: Callable[..., Comparison]) -> None:
+    """Seven clusters have 64 swaps, and none of the others differs as much."""
+    hit_cells = HIT_CELLS[:7]
+    better = [hits + 9 + number % 2 for number, hits in enumerate(hit_cells)]
+    comparison = compare_cells(hit_cells, better, twins=True)
+
+    lines = [" ".join(line.split()) for line in comparison.to_text().splitlines()]
+    numbers = "15.000 24.429 +9.429 [+8.934, +9.923] 0.016"
+    assert f"IoU, 30 m × 30 m (%) {numbers} b is better" in lines
+
+    payload = comparison.to_dict()
+    assert (payload["samples"], payload["clusters"]) == (14, 7)
+    assert (payload["swaps"], payload["all_swaps"]) == (64, True)
+
+    second = payload["numbers"][1]
+    assert (second["p"], second["adjusted_p"]) == (1 / 64, 3 / 64)
 
 
 def test_json_and_csv_have_every_number(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
-    comparison = compare_bundles(*motion_bundles, FEW)
-    stated = json.loads(json.dumps(comparison.to_dict()))
+    comparison = compare_bundles(*motion_bundles, FEW_RESAMPLES)
+    payload = json.loads(json.dumps(comparison.to_dict()))
     (path,) = comparison.to_csv(tmp_path / "new")
     rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-    assert [float(rows[0]["a"]), len(rows)] == [stated["numbers"][0]["a"], len(comparison.numbers)]
+
+    assert float(rows[0]["a"]) == payload["numbers"][0]["a"]
+    assert len(rows) == len(comparison.numbers)
 
 
-def test_others_are_refused_or_left_out(saved: Save) -> None:
-    a, b = saved("a"), saved("b", 1.0, agents=("ego_vehicle", "infrastructure"))
-    assert_refused(
+def test_samples_of_one_evaluation_only_are_refused_or_left_out(save_bundle: Save) -> None:
+    a = save_bundle("a")
+    b = save_bundle("b", 1.0, agents=("ego_vehicle", "infrastructure"))
+    assert_raises(
         (
-            lambda: compare_bundles(a, b, FEW),
+            lambda: compare_bundles(a, b, FEW_RESAMPLES),
             EvaluationError,
             r"2 samples only in .*a \(type1.*\); evaluate both at the same",
         ),
     )
-    comparison = compare_bundles(a, b, FEW, common=True)
+
+    comparison = compare_bundles(a, b, FEW_RESAMPLES, common=True)
     assert (comparison.samples, comparison.left_out) == (4, 2)
-    assert "a, b: only the samples that both have; 2 left out" in comparison.to_text()
+    assert "excluded: 2 samples that only one of the two evaluations has" in comparison.to_text()
 
 
-def test_a_partial_one_is_marked(
-    saved: Save, run: EvaluationRun, da_b: DeepAccident, write_accidents: Write, tmp_path: Path
+def test_a_partial_evaluation_is_marked(
+    save_bundle: Save,
+    run: EvaluationRun,
+    da_b: DeepAccident,
+    write_accidents: Write,
+    tmp_path: Path,
 ) -> None:
-    results = write_accidents(tmp_path / "some.json", run.selection.tokens(da_b)[1:])
-    part = evaluate_results(da_b, results, run.setup, run.selection, allow_partial=True, workers=1)
-    comparison = compare_bundles(saved("a"), save_run(part, tmp_path / "part"), FEW, common=True)
+    tokens = run.selection.tokens(da_b)
+    results = write_accidents(tmp_path / "some.json", tokens[1:])
+    partial_run = evaluate_results(
+        da_b, results, run.setup, run.selection, allow_partial=True, workers=1
+    )
+    part = save_run(partial_run, tmp_path / "part")
+
+    comparison = compare_bundles(save_bundle("a"), part, FEW_RESAMPLES, common=True)
     assert comparison.partial == ("b: PARTIAL: 5 of 6 samples",)
 
 
-def changed(path: Path, change: Callable[[Any], object]) -> None:
-    """Another content of a file of JSON."""
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
-def test_other_samples_tasks_and_rules(
-    saved: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun
+def test_other_samples_tasks_and_rules_are_refused(
+    save_bundle: Save, motion_bundles: tuple[Path, Path], run: EvaluationRun
 ) -> None:
-    a, other = (
-        saved("a"),
-        saved("b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5})),
+    a = save_bundle("a")
+    other_rules = save_bundle(
+        "b", setup=replace(run.setup, switches={"reading.danger_distance": 0.5})
     )
-    assert_refused(
+    other_samples = save_bundle("c", split="train")
+
+    assert_raises(
         (
-            lambda: compare_bundles(a, motion_bundles[0], FEW),
+            lambda: compare_bundles(a, motion_bundles[0], FEW_RESAMPLES),
             EvaluationError,
-            ("of the task accident", "one of motion"),
+            (
+                "of the task accident",
+                "of the task motion",
+                "compare two evaluations of the same task",
+            ),
         ),
         (
-            lambda: compare_bundles(a, other, FEW),
+            lambda: compare_bundles(a, other_rules, FEW_RESAMPLES),
             EvaluationError,
             (
                 r"switches/reading.danger_distance 'absent' and 0.5; "
@@ -255,44 +283,48 @@ def test_other_samples_tasks_and_rules(
             ),
         ),
         (
-            lambda: compare_bundles(a, saved("c", split="train"), FEW, common=True),
+            lambda: compare_bundles(a, other_samples, FEW_RESAMPLES, common=True),
             EvaluationError,
             ("have no sample in common",),
         ),
     )
 
 
-def test_other_cells(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
+def test_other_cells_are_refused(motion_bundles: tuple[Path, Path], tmp_path: Path) -> None:
     """Labels are made on the predictions' own cells: other cells are another truth."""
-    small, axis = copytree(motion_bundles[1], tmp_path / "small"), [-25.0, 25.0, 0.5]
-    changed(
+    small = copytree(motion_bundles[1], tmp_path / "small")
+    axis = [-25.0, 25.0, 0.5]
+    change_json(
         small / "metrics_summary.json", lambda summary: summary["results"]["form"].update(x=axis)
     )
-    assert_refused(
+
+    assert_raises(
         (
-            lambda: compare_bundles(motion_bundles[0], small, FEW),
+            lambda: compare_bundles(motion_bundles[0], small, FEW_RESAMPLES),
             EvaluationError,
             ("rules: cells/x '[-50.0, 50.0, 0.5]' and '[-25.0, 25.0, 0.5]'",),
         ),
     )
 
 
-def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
-    a, b, c = map(saved, "abc")
-    token = min(results.tokens).rsplit("/", 2)[0]
-    changed(
-        b / "scenarios.json", lambda stored: stored["scenarios"][token].update(label="0", boxes="0")
+def test_other_labels_and_another_devkit_are_refused(save_bundle: Save, results: Results) -> None:
+    bundle, other_labels, other_devkit = map(save_bundle, "abc")
+    scenario = min(results.tokens).rsplit("/", 2)[0]
+    change_json(
+        other_labels / "scenarios.json",
+        lambda content: content["scenarios"][scenario].update(label="0", boxes="0"),
     )
-    path = c / "counts.json"
+    path = other_devkit / "counts.json"
     path.write_text(path.read_text().replace("of devkit ", "of devkit 9."))
-    assert_refused(
+
+    assert_raises(
         (
-            lambda: compare_bundles(a, b, FEW),
+            lambda: compare_bundles(bundle, other_labels, FEW_RESAMPLES),
             EvaluationError,
-            (f"calib files of 1 scenarios are not the same ({token})",),
+            (f"calib files differ in 1 scenario ({scenario})",),
         ),
         (
-            lambda: compare_bundles(a, c, FEW),
+            lambda: compare_bundles(bundle, other_devkit, FEW_RESAMPLES),
             EvaluationError,
             ("counts.json: was saved by AccidentEvaluator of devkit 9.",),
         ),
@@ -303,36 +335,35 @@ def test_other_labels_and_another_devkit(saved: Save, results: Results) -> None:
 def test_equally_good_runs_are_rarely_called_really_different(
     tmp_path: Path, clusters: int, pairs: int
 ) -> None:
-    """Of two runs of the same law, with clusters that are hard for both, at most 5 % but for
-    chance.
+    """Two runs of the same law differ in at most 5 % of the pairs, but for chance.
+
+    Clusters that are hard for one run are hard for the other, too.
     """
-    source, real = np.random.default_rng(clusters), 0
+    generator = np.random.default_rng(clusters)
+    real_differences = 0
     for pair in range(pairs):
-        hard, folders = source.normal(0, 1, clusters), []
+        difficulty = generator.normal(0, 1, clusters)
+        folders = []
         for name in "ab":
-            found = source.binomial(20, 1 / (1 + np.exp(hard + source.normal(0, 0.7, clusters))))
-            folders.append(
-                write_bundle(
-                    tmp_path / f"{pair}{name}",
-                    [(each, 20 - each) for each in found.tolist()],
-                    twins=True,
-                )
-            )
-        real += by_name(compare_bundles(*folders, Resampling(resamples=200, seed=pair)))[MAIN].real
-    assert real <= binom.ppf(0.995, pairs, 0.05)
-    assert real > 0
+            noise = generator.normal(0, 0.7, clusters)
+            hit_cells = generator.binomial(20, 1 / (1 + np.exp(difficulty + noise)))
+            cells = [(hits, 20 - hits) for hits in hit_cells.tolist()]
+            folders.append(write_bundle(tmp_path / f"{pair}{name}", cells, twins=True))
+        comparison = compare_bundles(*folders, Resampling(resamples=200, seed=pair))
+        real_differences += numbers_by_name(comparison)[MAIN].real
+
+    assert real_differences <= binom.ppf(0.995, pairs, 0.05)
+    assert real_differences > 0
 
 
 @pytest.mark.parametrize("fault", COUNT_FAULTS)
-def test_counts_that_are_none_are_a_fault_of_the_bundle(tmp_path: Path, fault: str) -> None:
-    change, told = COUNT_FAULTS[fault]
+def test_damaged_counts_are_a_fault_of_the_bundle(tmp_path: Path, fault: str) -> None:
+    change, reason = COUNT_FAULTS[fault]
     folder = write_bundle(tmp_path / "a", [(3, 1)] * 3)
-    state = json.loads((folder / "counts.json").read_text())
-    change(state["counts"])
-    (folder / "counts.json").write_text(json.dumps(state))
-    with pytest.raises(
-        ResultsError, match=rf"counts.json: does not hold counts of its protocol \(.*{told}"
-    ):
+    change_json(folder / "counts.json", lambda content: change(content["counts"]))
+
+    message = rf"counts.json: does not contain counts of its protocol \(.*{reason}"
+    with pytest.raises(ResultsError, match=message):
         compare_bundles(folder, folder)
 
 
@@ -347,7 +378,8 @@ def test_counts_of_detections_that_ask_for_memory() -> None:
         "excused": [[]] * 3,
     }
     evaluator.add("a", counts | columns | {"errors": [[]] * 6})
-    assert_refused(
+
+    assert_raises(
         (
             evaluator.compute,
             EvaluationError,
@@ -369,7 +401,8 @@ def test_counts_of_warnings_that_ask_for_memory() -> None:
     evaluator.add(
         "a", {"recording": "s/t/a", "frame": 10**9, "kind": "others", "beyond": 0} | nothing
     )
-    assert_refused(
+
+    assert_raises(
         (
             evaluator.compute,
             EvaluationError,
@@ -379,8 +412,7 @@ def test_counts_of_warnings_that_ask_for_memory() -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_counts_of_accidents_whose_remainders_never_end(value: float) -> None:
-    """Of which the remainders never end."""
+def test_counts_of_accidents_with_endless_remainders(value: float) -> None:
     assert len(exact_parts([[1.0, value]])) == 1
 
 
@@ -389,8 +421,8 @@ class Mean:
     mean: float
 
 
-class Means(Evaluator[Mean]):
-    """The mean of the values of samples."""
+class MeanEvaluator(Evaluator[Mean]):
+    """An evaluator of the mean of the samples' values."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -403,58 +435,85 @@ class Means(Evaluator[Mean]):
         return Mean(ratio(total(counts, "value"), total(counts, "count")))
 
 
-def paired(
+def compare_means(
     first: np.ndarray, second: np.ndarray, resampling: Resampling | None = None
 ) -> PairedTest:
-    """Of a value a cluster; NaN for none."""
-    runs = tuple(
-        [[{"value": float(v), "count": 1}] if np.isfinite(v) else [] for v in run]
-        for run in (first, second)
+    """Compare the means of two runs with one value in each cluster; NaN stands for no sample."""
+    runs: Any = tuple(
+        [[{"value": float(value), "count": 1}] if np.isfinite(value) else [] for value in values]
+        for values in (first, second)
     )
-    difference = float(np.nanmean(second) - np.nanmean(first))
-    return paired_test(Means(), runs, {"mean": difference}, resampling or Resampling())  # type: ignore[arg-type]
+    difference = {"mean": float(np.nanmean(second) - np.nanmean(first))}
+    return paired_test(MeanEvaluator(), runs, difference, resampling or Resampling())
 
 
-def by_hand(first: np.ndarray, second: np.ndarray) -> float:
-    """The share of all swaps after which the two differ as much."""
-    apart = second - first
-    sums = [abs(sum(signs * apart)) for signs in itertools.product((1, -1), repeat=len(apart))]
-    return float(np.mean([each > abs(apart.sum()) - 1e-9 for each in sums]))
+def share_of_swaps_by_hand(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the share of all swaps after which the two runs differ at least as much."""
+    differences = second - first
+    as_far = []
+    for signs in itertools.product((1, -1), repeat=len(differences)):
+        swapped = abs(sum(signs * differences))
+        as_far.append(swapped > abs(differences.sum()) - 1e-9)
+
+    return float(np.mean(as_far))
 
 
 @pytest.mark.parametrize("clusters", [2, 5, 8])
-def test_p_is_of_all_swaps(clusters: int) -> None:
-    source = np.random.default_rng(clusters)
+def test_p_is_the_share_of_all_swaps(clusters: int) -> None:
+    generator = np.random.default_rng(clusters)
     for _ in range(5):
-        first, second = source.normal(0, 1, (2, clusters))
-        made = paired(first, second)
-        assert (made.swaps.complete, len(made.swaps.swapped)) == (True, 2 ** (clusters - 1))
-        assert made.p[0] == pytest.approx(by_hand(first, second))
-        first, second = source.integers(0, 3, (2, clusters)) * 1.0
-        assert paired(first, second).p[0] == pytest.approx(by_hand(first, second))  # with ties
+        first, second = generator.normal(0, 1, (2, clusters))
+        test = compare_means(first, second)
+        assert (test.swaps.complete, len(test.swaps.swapped)) == (True, 2 ** (clusters - 1))
+        assert test.p[0] == pytest.approx(share_of_swaps_by_hand(first, second))
+
+        first, second = generator.integers(0, 3, (2, clusters)) * 1.0  # with ties
+        test = compare_means(first, second)
+        assert test.p[0] == pytest.approx(share_of_swaps_by_hand(first, second))
 
 
 def test_random_swaps_are_near_all_of_them() -> None:
     first, second = np.random.default_rng(3).normal((0, 0.8), 1, (10, 2)).T
-    exact = paired(first, second).p[0]
-    made = [paired(first, second, Resampling(resamples=500, seed=seed)) for seed in (1, 1, 2)]
-    assert not made[0].swaps.complete
-    assert [abs(each.p[0] - exact) < 0.05 for each in made] == [True] * 3
-    assert made[0].p[0] == made[1].p[0] != made[2].p[0]
-    assert all(each.p[0] >= 1 / 501 for each in made)
+    exact_p = compare_means(first, second).p[0]
+    tests = [
+        compare_means(first, second, Resampling(resamples=500, seed=seed)) for seed in (1, 1, 2)
+    ]
+
+    assert not tests[0].swaps.complete
+
+    ps = [test.p[0] for test in tests]
+    for p in ps:
+        assert abs(p - exact_p) < 0.05
+        assert p >= 1 / 501
+
+    assert ps[0] == ps[1] != ps[2]
 
 
 def test_half_of_the_ties_of_random_swaps_count() -> None:
     swaps = Swaps(swapped=np.zeros((9, 12), dtype=bool), complete=False)
     swapped = np.array([3, -2, 2, -2, 2, 1, 1, 0, 0])[:, None]
-    assert p_values(np.array([2.0]), swapped, swaps)[0] == pytest.approx((1 + 1 + 4 / 2) / 10)
-    assert p_values(np.array([3.0]), swapped, swaps)[0] == pytest.approx(2 / 10)  # none differ more
-    assert p_values(np.array([0.0]), swapped, swaps)[0] == 1
+
+    (p,) = p_values(np.array([2.0]), swapped, swaps)
+    assert p == pytest.approx((1 + 1 + 4 / 2) / 10)
+
+    (p,) = p_values(np.array([3.0]), swapped, swaps)
+    assert p == pytest.approx(2 / 10)  # no swap differs more
+
+    (p,) = p_values(np.array([0.0]), swapped, swaps)
+    assert p == 1
 
 
 def test_a_swap_without_the_number_counts_as_more() -> None:
     swaps = Swaps(swapped=np.zeros((4, 3), dtype=bool), complete=True)
-    swapped = np.array([[2.0, 2.0], [1.0, math.nan], [-2.0, 0.0], [0.5, 1.0]])
+    swapped = np.array(
+        [
+            [2.0, 2.0],
+            [1.0, math.nan],
+            [-2.0, 0.0],
+            [0.5, 1.0],
+        ]
+    )
+
     assert_allclose(p_values(np.array([2.0, math.nan]), swapped, swaps), [0.5, math.nan])
     assert_allclose(p_values(np.array([1.5, 2.0]), swapped, swaps)[1], 0.5)
 
@@ -466,59 +525,57 @@ def test_holm() -> None:
 
 
 def test_the_interval_is_students() -> None:
-    """Of differences of ± 1 around 3: 19 degrees of freedom, and t = 2.093 at 95 % and 1.729 at 90
-    %.
-    """
-    first, second = np.zeros(20), 3 + np.tile([1.0, -1.0], 10)
+    """Differences of ± 1 around 3 have 19 degrees of freedom: t = 2.093 at 95 %, 1.729 at 90 %."""
+    first = np.zeros(20)
+    second = 3 + np.tile([1.0, -1.0], 10)
     error = math.sqrt(20 / 19) / math.sqrt(20)
     for confidence, t in ((0.95, 2.093), (0.9, 1.729)):
-        made = paired(first, second, Resampling(confidence=confidence))
-        assert_allclose([made.low[0], made.high[0]], [3 - t * error, 3 + t * error], atol=1e-3)
-    assert_allclose(made.errors, error)
+        test = compare_means(first, second, Resampling(confidence=confidence))
+        assert_allclose([test.low[0], test.high[0]], [3 - t * error, 3 + t * error], atol=1e-3)
+
+    assert_allclose(test.errors, error)
 
 
 def test_clusters_that_are_too_few() -> None:
-    made = paired(np.zeros(5), np.arange(5) + 1.0)
-    assert (
-        undecided_text(made, 0, 1, 5)
-        == "no decision is possible with 5 clusters; at least 6 are needed"
-    )
-    assert (
-        undecided_text(made, 0, 4, 5)
-        == "no decision is possible with 5 clusters; at least 8 are needed"
-    )
-    few = paired(np.zeros(30), np.eye(30)[0])
+    test = compare_means(np.zeros(5), np.arange(5) + 1.0)
+    text = "no decision is possible with 5 clusters; at least 6 are needed"
+    assert undecided_text(test, 0, 1, 5) == text
+
+    text = "no decision is possible with 5 clusters; at least 8 are needed"
+    assert undecided_text(test, 0, 4, 5) == text
+
+    test = compare_means(np.zeros(30), np.eye(30)[0])
     text = (
         "no decision is possible with 1 of 30 clusters in which the two differ; "
         "at least 6 are needed"
     )
-    assert undecided_text(few, 0, 1, 30) == text
+    assert undecided_text(test, 0, 1, 30) == text
 
 
 def test_resamples_that_are_too_few() -> None:
-    made = paired(np.zeros(30), np.arange(30) + 1.0, Resampling(resamples=10))
-    assert (
-        undecided_text(made, 0, 1, 30)
-        == "no decision is possible with 10 resamples; at least 19 are needed"
-    )
-    assert undecided_text(
-        paired(np.zeros(9), np.ones(9), Resampling(resamples=0)), 0, 1, 9
-    ).startswith("not tested: ")
+    test = compare_means(np.zeros(30), np.arange(30) + 1.0, Resampling(resamples=10))
+    text = "no decision is possible with 10 resamples; at least 19 are needed"
+    assert undecided_text(test, 0, 1, 30) == text
+
+    untested = compare_means(np.zeros(9), np.ones(9), Resampling(resamples=0))
+    assert undecided_text(untested, 0, 1, 9).startswith("not tested: ")
 
 
 def test_no_difference_decides_nothing() -> None:
-    assert (
-        undecided_text(paired(np.zeros(8), np.tile([1.0, -1.0], 4)), 0, 1, 8)
-        == "the difference is 0"
-    )
-    nothing = np.full(8, math.nan)
+    test = compare_means(np.zeros(8), np.tile([1.0, -1.0], 4))
+    assert undecided_text(test, 0, 1, 8) == "equal"
+
+    unknown = np.full(8, math.nan)
     with np.errstate(all="ignore"), pytest.warns(RuntimeWarning):
-        assert undecided_text(paired(np.zeros(8), nothing), 0, 1, 8) == "nothing to compare"
+        assert undecided_text(compare_means(np.zeros(8), unknown), 0, 1, 8) == "nothing to compare"
 
 
 def test_all_swaps_or_random_ones() -> None:
     assert swaps_of(3, Resampling()).swapped.tolist() == [
-        [a, b, c] for c in (0, 1) for b in (0, 1) for a in (0,)
+        [0, 0, 0],
+        [0, 1, 0],
+        [0, 0, 1],
+        [0, 1, 1],
     ]
     assert swaps_of(0, Resampling()).swapped.shape == (1, 0)
     assert swaps_of(11, Resampling(resamples=1000)).swapped.shape == (1000, 11)
@@ -538,27 +595,31 @@ def test_all_swaps_or_random_ones() -> None:
         (11, 1024, True),
     ],
 )
-def test_up_to_which_number_all_swaps_are_taken(
+def test_all_swaps_are_taken_up_to_the_number_of_resamples(
     clusters: int, resamples: int, *, complete: bool
 ) -> None:
-    made = swaps_of(clusters, Resampling(resamples=resamples))
+    swaps = swaps_of(clusters, Resampling(resamples=resamples))
     number = 2 ** max(clusters - 1, 0) if complete else resamples
-    assert (made.complete, made.swapped.shape) == (complete, (number, clusters))
-    assert made.least_p == (1 / number if complete else 1 / (number + 1))
-    assert not complete or not made.swapped[:, :1].any()
+
+    assert (swaps.complete, swaps.swapped.shape) == (complete, (number, clusters))
+    assert swaps.least_p == (1 / number if complete else 1 / (number + 1))
+    assert not complete or not swaps.swapped[:, :1].any()
 
 
 @pytest.mark.parametrize(
     ("observed", "complete", "p"),
     [(1.0, True, 3 / 4), (1 + 5e-10, True, 3 / 4), (1 + 3e-9, True, 1 / 4), (2.0, True, 1 / 4)],
 )
-def test_equal_but_for_rounding(observed: float, p: float, *, complete: bool) -> None:
+def test_differences_equal_but_for_rounding_are_ties(
+    observed: float, p: float, *, complete: bool
+) -> None:
     swaps = Swaps(swapped=np.zeros((4, 3), dtype=bool), complete=complete)
-    assert p_values(np.array([observed]), np.array([[2.0], [1.0], [-1.0], [0.0]]), swaps)[0] == p
+    swapped = np.array([[2.0], [1.0], [-1.0], [0.0]])
+    assert p_values(np.array([observed]), swapped, swaps)[0] == p
 
 
 @pytest.mark.parametrize(
-    ("error", "scenarios", "told"),
+    ("error", "scenarios", "number_text"),
     [
         (0.0, 9, None),
         (0.1, 9, "9"),
@@ -569,16 +630,17 @@ def test_equal_but_for_rounding(observed: float, p: float, *, complete: bool) ->
         (1.0, 64, "510"),
     ],
 )
-def test_how_many_scenarios_would_decide(error: float, scenarios: int, told: str | None) -> None:
-    """At least those that there are; in two digits, rounded up."""
-    made = replace(paired(np.zeros(8), np.tile([3.0, -1.0], 4)), errors=np.array([error]))
-    other = replace(made, differences=-made.differences)
-    assert (
-        undecided_text(made, 0, 1, scenarios)
-        == undecided_text(other, 0, 1, scenarios)
-        == (
-            "not decided"
-            if told is None
-            else f"not decided: about {told} scenarios would decide it"
-        )
-    )
+def test_how_many_scenarios_would_decide(
+    error: float, scenarios: int, number_text: str | None
+) -> None:
+    """The number is at least that of the scenarios, and rounded up to two digits."""
+    test = compare_means(np.zeros(8), np.tile([3.0, -1.0], 4))
+    better = replace(test, errors=np.array([error]))
+    worse = replace(better, differences=-better.differences)
+
+    if number_text is None:
+        text = "inconclusive"
+    else:
+        text = f"inconclusive (would need about {number_text} scenarios)"
+    assert undecided_text(better, 0, 1, scenarios) == text
+    assert undecided_text(worse, 0, 1, scenarios) == text

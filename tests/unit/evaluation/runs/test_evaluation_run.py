@@ -1,4 +1,4 @@
-"""From a results file to an evaluation: refusals, partial and broken-off runs, workers and
+"""From a results file to an evaluation: refusals, partial and interrupted runs, workers and
 executors.
 """
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, ResultsError
@@ -28,7 +28,6 @@ from deepaccident_devkit.evaluation.runs import (
     SampleSelection,
     evaluate_results,
     evaluation_run,
-    save_run,
     scenario_hashes,
 )
 from deepaccident_devkit.evaluation.runs.evaluation_run import (
@@ -52,42 +51,44 @@ Write = Callable[..., Results]
 
 
 @pytest.fixture
-def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails a test that comes to the long work."""
+def no_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail a test that comes to the long work."""
 
-    def refused(*_arguments: Any, **_named: Any) -> None:
+    def refuse(*_arguments: Any, **_options: Any) -> None:
         pytest.fail("was evaluated")
 
-    monkeypatch.setattr(evaluation_run, "evaluate_samples", refused)
+    monkeypatch.setattr(evaluation_run, "evaluate_samples", refuse)
 
 
-def test_equals_the_evaluator_by_hand(
+def test_a_run_equals_the_evaluator_by_hand(
     da_b: DeepAccident, results: Results, run: EvaluationRun
 ) -> None:
     by_hand = AccidentEvaluator("boxes")
     for token in results.tokens:
         by_hand.update(token, results.prediction(token), None, accident_context(da_b, token, 2.0))
+
     assert (run.result, run.result.positives, run.partial) == (by_hand.compute(), 3, None)
-    assert (run.attributes, set(run.times_to_impact.values())) == (
-        sample_attributes(da_b, results.tokens),
-        {0.5, None},
-    )
+    assert run.attributes == sample_attributes(da_b, results.tokens)
+    assert set(run.times_to_impact.values()) == {0.5, None}
 
 
-def test_says_what_it_depends_on(da_b: DeepAccident, results: Results, run: EvaluationRun) -> None:
+def test_a_run_names_its_release_and_results(
+    da_b: DeepAccident, results: Results, run: EvaluationRun
+) -> None:
     assert run.release.scenarios == scenario_hashes(da_b, da_b.split_scenarios("val"))
     assert (run.results.fingerprint, run.results.form) == (results.fingerprint, None)
     assert run.results.meta == {"method": "truth", "moved": 0.1}
 
 
-def test_breakdowns(run: EvaluationRun) -> None:
-    broken = run.broken_down(["agent", "all", "agent"], Resampling(resamples=5))
-    assert [each.by for each in broken.breakdowns] == ["agent", "all"]
-    assert broken.breakdowns[1].groups[0].result == run.result
-    assert [
-        each.by for each in run.broken_down(resampling=Resampling(resamples=0)).breakdowns
-    ] == list(BREAKDOWNS)
-    assert_refused(
+def test_breakdowns_are_made_once_each_in_the_order_asked(run: EvaluationRun) -> None:
+    some = run.broken_down(["agent", "all", "agent"], Resampling(resamples=5)).breakdowns
+    assert [breakdown.by for breakdown in some] == ["agent", "all"]
+    assert some[1].groups[0].result == run.result
+
+    every = run.broken_down(resampling=Resampling(resamples=0)).breakdowns
+    assert [breakdown.by for breakdown in every] == list(BREAKDOWNS)
+
+    assert_raises(
         (
             lambda: run.broken_down(["wether"]),
             ChoiceError,
@@ -96,9 +97,9 @@ def test_breakdowns(run: EvaluationRun) -> None:
     )
 
 
-@pytest.mark.usefixtures("nothing_long")
+@pytest.mark.usefixtures("no_evaluation")
 class TestRefused:
-    def test_results_that_do_not_fit(
+    def test_results_that_do_not_fit_are_refused(
         self,
         da_b: DeepAccident,
         selection: SampleSelection,
@@ -106,19 +107,21 @@ class TestRefused:
         write_motion: Write,
         write_accidents: Write,
     ) -> None:
-        """Of another kind, of too short a look ahead, with a damaged shard, missing samples,
-        nothing in common.
+        """Results of another kind, with too short a horizon, with a damaged shard, without all
+        samples, and with none of them.
         """
-        tokens, motion = selection.tokens(da_b), EvaluationSetup(task="motion")
+        tokens = selection.tokens(da_b)
         accidents = write_accidents(tmp_path / "some.json", tokens[1:])
-        others = write_accidents(
-            tmp_path / "other.json", replace(selection, split="train").tokens(da_b)
-        )
-        maps, damaged = (write_motion(tmp_path / name, tokens) for name in ("motion", "damaged"))
+        train_tokens = replace(selection, split="train").tokens(da_b)
+        train_accidents = write_accidents(tmp_path / "other.json", train_tokens)
+        maps = write_motion(tmp_path / "motion", tokens)
+        damaged = write_motion(tmp_path / "damaged", tokens)
         shard = next((tmp_path / "damaged" / "shards").iterdir())
         shard.write_bytes(shard.read_bytes()[:-100])
+
+        motion = EvaluationSetup(task="motion")
         evaluate = partial(evaluate_results, da_b)
-        assert_refused(
+        assert_raises(
             (
                 partial(evaluate, accidents, motion, selection),
                 EvaluationError,
@@ -136,9 +139,9 @@ class TestRefused:
                 (f"some.json: without a prediction: 1 of 6 samples ({tokens[0]})",),
             ),
             (
-                partial(evaluate, others, SETUP, selection, allow_partial=True),
+                partial(evaluate, train_accidents, SETUP, selection, allow_partial=True),
                 ResultsError,
-                ("of --split train", "nothing is left to evaluate"),
+                ("made with --split train", "no sample is left to evaluate"),
             ),
         )
 
@@ -146,161 +149,176 @@ class TestRefused:
     def test_scenarios_without_meta_are_counted_before_the_start(
         self, da_b: DeepAccident, own_release: Path, tmp_path: Path, task: str, protocol: str
     ) -> None:
-        every = SampleSelection(split="train", samples="all", scope="all")
-        silent = [scenario["token"] for scenario in da_b.find(split="train")][:1]
-        for token in silent:
-            (own_release / "train" / token.replace("/", "/meta/")).with_suffix(".txt").unlink()
+        scenario = da_b.find(split="train")[0]["token"]
+        meta = own_release / "train" / scenario.replace("/", "/meta/")
+        meta.with_suffix(".txt").unlink()
         release = DeepAccident(dataroot=own_release, verbose=False)
-        with ResultsWriter(tmp_path / "none.json", "accident") as writer:
-            for sample in every.tokens(release):
+        selection = SampleSelection(split="train", samples="all", scope="all")
+        path = tmp_path / "none.json"
+        with ResultsWriter(path, "accident") as writer:
+            for sample in selection.tokens(release):
                 writer.add(sample, [])
-        assert_refused(
+
+        setup = EvaluationSetup(task=task, protocol=protocol)
+        assert_raises(
             (
-                lambda: evaluate_results(
-                    release,
-                    tmp_path / "none.json",
-                    EvaluationSetup(task=task, protocol=protocol),
-                    every,
-                ),
+                lambda: evaluate_results(release, path, setup, selection),
                 EvaluationError,
-                r"1 of 2 scenarios have no meta file, .*--where 'weather!=unknown'",
+                r"no meta file, .* for 1 of 2 scenarios, .*--where 'weather!=unknown'",
             ),
         )
-        save_selection(release.find("weather!=unknown", split="train"), tmp_path / "mine.txt")
-        chosen = replace(every, split=str(tmp_path / "mine.txt"))
-        check_metas(release, chosen.tokens(release), chosen.split)
+
+        list_path = tmp_path / "mine.txt"
+        save_selection(release.find("weather!=unknown", split="train"), list_path)
+        remaining = replace(selection, split=str(list_path))
+        check_metas(release, remaining.tokens(release), remaining.split)
 
 
-def test_only_what_is_in_both_and_marked(
+def test_only_common_samples_are_evaluated_and_the_run_is_marked(
     da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
 ) -> None:
     tokens = selection.tokens(da_b)
     extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
     results = write_accidents(tmp_path / "some.json", [*tokens[2:], *extra])
+
     run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
     assert run.evaluator.tokens == set(tokens[2:])
     assert run.summary()["partial"]["mark"] == "PARTIAL: 4 of 6 samples, 2 predictions left out"
 
 
-def test_other_predictions_alone_do_not_mark(
+def test_extra_predictions_do_not_mark_a_run(
     da_b: DeepAccident, selection: SampleSelection, tmp_path: Path, write_accidents: Write
 ) -> None:
     tokens = selection.tokens(da_b)
     extra = replace(selection, agents=("other_vehicle_behind",)).tokens(da_b)
     results = write_accidents(tmp_path / "more.json", [*tokens, *extra])
-    assert_refused(
+
+    assert_raises(
         (
             lambda: evaluate_results(da_b, results, SETUP, selection),
             ResultsError,
-            r"; leave them out with --allow-partial .*; no sample",
+            r"; ignore them with --allow-partial .*; every evaluated sample",
         ),
     )
+
     run = evaluate_results(da_b, results, SETUP, selection, allow_partial=True, workers=1)
     assert (run.evaluator.tokens, run.partial) == (set(tokens), None)
 
 
-class TestBrokenOff:
+class TestInterrupted:
     @pytest.fixture
-    def broken_after(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], list[str]]:
-        """Break a run off after so many samples; gives the tokens that were loaded."""
-        original = evaluation_run.SampleLoader.__call__
+    def interrupt_after(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], list[str]]:
+        """Interrupt a run after a number of samples; returns the tokens as they are loaded."""
+        load_sample = evaluation_run.SampleLoader.__call__
 
         def start(count: int | None) -> list[str]:
-            loaded: list[str] = []
+            loaded_tokens: list[str] = []
 
             def load(loader: Any, token: str) -> tuple[Any, ...]:
-                if len(loaded) == count:
+                if len(loaded_tokens) == count:
                     raise KeyboardInterrupt
-                loaded.append(token)
-                return original(loader, token)
+                loaded_tokens.append(token)
+                return load_sample(loader, token)
 
             monkeypatch.setattr(evaluation_run.SampleLoader, "__call__", load)
-            return loaded
+            return loaded_tokens
 
         return start
 
-    def run_of(
+    def evaluate_train(
         self, dataset: DeepAccident, results: Results, out: Path, **changes: Any
     ) -> EvaluationRun:
         setup = EvaluationSetup(task="accident", protocol="boxes", **changes)
-        every = SampleSelection(split="train", samples="evaluate", scope="all")
-        return evaluate_results(dataset, results, setup, every, workers=1, out=out)
+        selection = SampleSelection(split="train", samples="evaluate", scope="all")
+        return evaluate_results(dataset, results, setup, selection, workers=1, out=out)
 
     @pytest.fixture
-    def ten(self, da_b: DeepAccident, tmp_path: Path, write_accidents: Write) -> Results:
-        """Results of ten samples, of which eight are one batch."""
+    def ten_results(self, da_b: DeepAccident, tmp_path: Path, write_accidents: Write) -> Results:
+        """Write results of ten samples: a batch of eight, and two more."""
         tokens = SampleSelection(split="train", samples="evaluate", scope="all").tokens(da_b)
         return write_accidents(tmp_path / "accidents.json", tokens)
 
-    def test_goes_on_where_it_stopped(
+    def test_a_run_goes_on_where_it_stopped(
         self,
         da_b: DeepAccident,
-        ten: Results,
+        ten_results: Results,
         tmp_path: Path,
-        broken_after: Callable[[int | None], list[str]],
+        interrupt_after: Callable[[int | None], list[str]],
     ) -> None:
-        first = broken_after(9)
+        first_tokens = interrupt_after(9)
         with pytest.raises(KeyboardInterrupt):
-            self.run_of(da_b, ten, tmp_path / "out")
-        then, run = broken_after(None), self.run_of(da_b, ten, tmp_path / "out")
-        assert [*first[:8], *then] == list(ten.tokens)
-        assert run.summary() == self.run_of(da_b, ten, tmp_path / "elsewhere").summary()
+            self.evaluate_train(da_b, ten_results, tmp_path / "out")
 
-    def test_other_rules_or_results_or_labels_begin_anew(
+        later_tokens = interrupt_after(None)
+        run = self.evaluate_train(da_b, ten_results, tmp_path / "out")
+        assert [*first_tokens[:8], *later_tokens] == list(ten_results.tokens)
+
+        whole_run = self.evaluate_train(da_b, ten_results, tmp_path / "elsewhere")
+        assert run.summary() == whole_run.summary()
+
+    def test_other_rules_or_results_begin_anew(
         self,
         da_b: DeepAccident,
-        ten: Results,
+        ten_results: Results,
         tmp_path: Path,
-        broken_after: Callable[[int | None], list[str]],
+        interrupt_after: Callable[[int | None], list[str]],
         write_accidents: Write,
     ) -> None:
         out = tmp_path / "out"
-        self.run_of(da_b, ten, out)
-        loaded = broken_after(None)
-        self.run_of(da_b, ten, out)
-        assert loaded == []
-        self.run_of(da_b, ten, out, switches={"reading.danger_distance": 0.5})
-        assert len(loaded) == 10
-        self.run_of(da_b, write_accidents(tmp_path / "more.json", ten.tokens, moved=3.0), out)
-        assert len(loaded) == 20
+        self.evaluate_train(da_b, ten_results, out)
+        loaded_tokens = interrupt_after(None)
+        self.evaluate_train(da_b, ten_results, out)
+        assert loaded_tokens == []
 
-    def test_removing_leaves_what_is_not_its_own(self, tmp_path: Path) -> None:
+        self.evaluate_train(da_b, ten_results, out, switches={"reading.danger_distance": 0.5})
+        assert len(loaded_tokens) == 10
+
+        moved_results = write_accidents(tmp_path / "more.json", ten_results.tokens, moved=3.0)
+        self.evaluate_train(da_b, moved_results, out)
+        assert len(loaded_tokens) == 20
+
+    def test_removing_checkpoints_leaves_other_files(self, tmp_path: Path) -> None:
         folder = tmp_path / "out.unfinished"
         checkpoint_path(tmp_path / "out", SETUP, ["x"], {}).mkdir(parents=True)
         (folder / "mine.txt").touch()
         remove_checkpoints(tmp_path / "out")
-        assert [each.name for each in folder.iterdir()] == ["mine.txt"]
+        assert [path.name for path in folder.iterdir()] == ["mine.txt"]
+
         (folder / "mine.txt").unlink()
         remove_checkpoints(tmp_path / "out")
         assert not folder.exists()
 
 
-def test_warnings_are_broken_down_by_whole_recordings_alone() -> None:
+def test_warnings_are_broken_down_only_by_whole_recordings() -> None:
     assert not {*breakdowns_of("warning")} & {*WITHIN_RECORDINGS}
     assert {*breakdowns_of("accident")} & {*WITHIN_RECORDINGS}
 
 
-def test_extra_samples_are_those_of_other_lists_and_those_of_no_release() -> None:
-    found = partial_of(Coverage(expected=5, missing=("a",), extra=("b", "c"), unknown=("d",)))
-    assert (found.missing, found.extra, found.expected, found.evaluated) == (1, 3, 5, 4)
+def test_extra_samples_are_of_other_selections_or_of_no_release() -> None:
+    coverage = Coverage(expected=5, missing=("a",), extra=("b", "c"), unknown=("d",))
+    part = partial_of(coverage)
+    assert (part.missing, part.extra, part.expected, part.evaluated) == (1, 3, 5, 4)
 
 
-FEW = Resampling(resamples=5)
+FEW_RESAMPLES = Resampling(resamples=5)
 
 
 @dataclass(frozen=True)
 class Job:
-    """An evaluation."""
+    """An evaluation that can be run several times."""
 
     dataset: DeepAccident
     results: Results
     selection: SampleSelection
     setup: EvaluationSetup = SETUP
 
-    def whole(self, out: Path | None = None, **how: Any) -> EvaluationRun:
+    def evaluate(self, out: Path | None = None, **options: Any) -> EvaluationRun:
         return evaluate_results(
-            *(self.dataset, self.results, self.setup, self.selection),
-            **{"workers": 1, **how},
+            self.dataset,
+            self.results,
+            self.setup,
+            self.selection,
+            **{"workers": 1, **options},
             out=out,
         )
 
@@ -309,70 +327,66 @@ class Job:
 def job(
     da_b: DeepAccident, write_accidents: Write, tmp_path_factory: pytest.TempPathFactory
 ) -> Job:
-    """All six scenarios: thirty samples."""
+    """Prepare an evaluation of all six scenarios: thirty samples."""
     folder = tmp_path_factory.mktemp("shards")
     save_selection(da_b.find(), folder / "all.txt")
-    every = SampleSelection(split=str(folder / "all.txt"), scope="all")
-    return Job(da_b, write_accidents(folder / "accidents.json", every.tokens(da_b)), every)
-
-
-@pytest.fixture(scope="module")
-def bundle(job: Job, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_run(
-        job.whole().broken_down(["all", "town"], FEW), tmp_path_factory.mktemp("bundle") / "whole"
-    )
+    selection = SampleSelection(split=str(folder / "all.txt"), scope="all")
+    results = write_accidents(folder / "accidents.json", selection.tokens(da_b))
+    return Job(da_b, results, selection)
 
 
 @pytest.fixture
-def loaded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The samples that are evaluated."""
+def loaded_tokens(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Collect the tokens of the samples that are evaluated."""
     tokens: list[str] = []
-    original = SampleLoader.__call__
+    load_sample = SampleLoader.__call__
 
     def load(loader: SampleLoader, token: str) -> tuple[Any, ...]:
         tokens.append(token)
-        return original(loader, token)
+        return load_sample(loader, token)
 
     monkeypatch.setattr(SampleLoader, "__call__", load)
     return tokens
 
 
-def test_processes_that_are_given_one_folder_share_the_samples(
-    job: Job, tmp_path: Path, loaded: list[str]
+def test_processes_with_the_same_folder_share_the_samples(
+    job: Job, tmp_path: Path, loaded_tokens: list[str]
 ) -> None:
     with ThreadPoolExecutor(3) as threads:
-        runs = list(threads.map(lambda _: job.whole(tmp_path / "out"), range(3)))
-    assert sorted(loaded) == sorted(job.results.tokens)
-    assert all(run.summary() == job.whole().summary() for run in runs)
+        runs = list(threads.map(lambda _: job.evaluate(tmp_path / "out"), range(3)))
+    assert sorted(loaded_tokens) == sorted(job.results.tokens)
+
+    summary = job.evaluate().summary()
+    assert all(run.summary() == summary for run in runs)
 
 
-class Counting(ThreadPoolExecutor):
-    """Threads that count what they are given."""
+class CountingExecutor(ThreadPoolExecutor):
+    """An executor that counts its tasks."""
 
-    given = 0
+    task_count = 0
 
-    def submit(self, *arguments: Any, **named: Any) -> Any:
-        self.given += 1
-        return super().submit(*arguments, **named)
+    def submit(self, *arguments: Any, **options: Any) -> Any:
+        self.task_count += 1
+        return super().submit(*arguments, **options)
 
 
 CALLS: dict[str, Callable[..., Any]] = {
-    "evaluate": lambda job, **how: job.whole(**how).summary(),
-    "hashes": lambda job, **how: scenario_hashes(
-        job.dataset, map(scenario_of, job.results.tokens), **how
+    "evaluate": lambda job, **options: job.evaluate(**options).summary(),
+    "hashes": lambda job, **options: scenario_hashes(
+        job.dataset, map(scenario_of, job.results.tokens), **options
     ),
-    "breakdowns": lambda job, **how: (
-        job.whole().broken_down(["agent", "all"], FEW, **how).summary()
+    "breakdowns": lambda job, **options: (
+        job.evaluate().broken_down(["agent", "all"], FEW_RESAMPLES, **options).summary()
     ),
-    "sanity": lambda job, **how: check_sanity(
-        job.dataset, job.results, SETUP, job.results.tokens, **how
+    "sanity": lambda job, **options: check_sanity(
+        job.dataset, job.results, SETUP, job.results.tokens, **options
     ),
 }
 
 
 @pytest.mark.parametrize("call", CALLS)
 def test_any_executor_gives_the_same(job: Job, call: str) -> None:
-    with Counting(2) as executor:
-        found = CALLS[call](job, executor=executor)
-        assert executor.given > 0
-    assert found == CALLS[call](job, workers=1)
+    with CountingExecutor(2) as executor:
+        by_executor = CALLS[call](job, executor=executor)
+        assert executor.task_count > 0
+    assert by_executor == CALLS[call](job, workers=1)

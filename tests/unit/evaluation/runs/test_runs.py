@@ -1,9 +1,9 @@
-"""Every default and constant of evaluation runs, against what is written out here."""
+"""Every default and constant of evaluation runs, against the values written out here."""
 
 from pathlib import Path
 
-from refusals import assert_refused
-from written_out import written_out
+from support.default_values import package_values
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.runs import compare_bundles
@@ -20,7 +20,7 @@ from deepaccident_devkit.evaluation.runs.setups import (
 from deepaccident_devkit.evaluation.runs.text import notes_of
 from deepaccident_devkit.evaluation.runs.verification import find_differences
 
-WRITTEN = {
+EXPECTED_VALUES = {
     "bundles.SUMMARY_FILE": "'metrics_summary.json'",
     "bundles.COUNTS_FILE": "'counts.json'",
     "bundles.ROWS_FILE": "'samples.parquet'",
@@ -32,6 +32,9 @@ WRITTEN = {
     "bundles.checksums_of": "listed=None",
     "bundles.save_run": "include_results=False, overwrite=False, extras=()",
     "bundles.checked_target": "overwrite=False, requested=None",
+    "comparison.ComparedNumber": "higher_is_better=None",
+    "comparison.decimal_text": "sign=''",
+    "comparison.interval_text": "sign=''",
     "comparison.compare_bundles": "resampling=None, common=False",
     "evaluation_run.SUMMARY_FORMAT": "'DeepAccident metrics summary'",
     "evaluation_run.SUMMARY_VERSION": "1",
@@ -67,7 +70,7 @@ WRITTEN = {
     "verification.verify_bundle": "results=None, split=None",
 }
 
-PROTOCOLS = {
+EXPECTED_PROTOCOLS = {
     "motion": ("released", "paper"),
     "accident": ("released", "paper", "boxes"),
     "detection": ("released", "released_iou", "paper", "opencood"),
@@ -81,29 +84,21 @@ PROTOCOLS = {
 
 
 def test_every_default_and_constant_written_out(tmp_path: Path) -> None:
-    assert written_out("deepaccident_devkit.evaluation.runs") == WRITTEN
-    assert {
-        task: tuple(evaluator_class.protocols) for task, evaluator_class in TASKS.items()
-    } == PROTOCOLS
-    setup = EvaluationSetup(task="motion")
-    assert (
-        default_selection(setup).text()
-        == "split val, samples evaluate (the last 2 s), scope accident, all agents"
-    )
+    protocols = {task: tuple(evaluator.protocols) for task, evaluator in TASKS.items()}
+    assert package_values("deepaccident_devkit.evaluation.runs") == EXPECTED_VALUES
+    assert protocols == EXPECTED_PROTOCOLS
+
+    text = "split val, samples evaluate (the last 2 s), scope accident, all agents"
+    assert default_selection(EvaluationSetup(task="motion")).text() == text
+
     write_rows(tmp_path / "rows", [], {})
-    assert (read_rows(tmp_path / "rows"), list(find_differences({}, {})), list(notes_of({}))) == (
-        ([], {}),
-        [],
-        [],
-    )
-    assert (checked_target(tmp_path / "new"), breakdowns_of("warning")[:2]) == (
-        tmp_path / "new",
-        ("all", "agent"),
-    )
-    assert (SanityReport(samples=0, warnings=()).sought, Coverage(expected=1).is_complete) == (
-        (),
-        True,
-    )
-    assert_refused(
+    assert read_rows(tmp_path / "rows") == ([], {})
+    assert list(find_differences({}, {})) == []
+    assert list(notes_of({})) == []
+    assert checked_target(tmp_path / "new") == tmp_path / "new"
+    assert breakdowns_of("warning")[:2] == ("all", "agent")
+    assert SanityReport(samples=0, warnings=()).sought == ()
+    assert Coverage(expected=1).is_complete is True
+    assert_raises(
         (lambda: compare_bundles(tmp_path / "a", tmp_path / "b"), ResultsError, ("no such folder",))
     )

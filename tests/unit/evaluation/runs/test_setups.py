@@ -1,6 +1,4 @@
-"""What is evaluated and by which rules: choices by their names, the samples, and what an evaluator
-is given.
-"""
+"""The samples and rules of an evaluation, and what a loader gives to its evaluator."""
 
 import pickle
 from dataclasses import replace
@@ -10,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, EvaluationError, ResultsError
@@ -41,10 +39,11 @@ from deepaccident_devkit.motion import MotionLabels
 
 
 class TestSetup:
-    def test_switches_come_to_the_evaluator_and_cannot_be_changed(self) -> None:
-        given = {"reading.danger_distance": 0.5}
-        setup = EvaluationSetup(task="accident", protocol="paper", switches=given)
-        given["reading.danger_distance"] = 2.0
+    def test_switches_reach_the_evaluator_and_cannot_be_changed(self) -> None:
+        switches = {"reading.danger_distance": 0.5}
+        setup = EvaluationSetup(task="accident", protocol="paper", switches=switches)
+        switches["reading.danger_distance"] = 2.0
+
         assert setup.evaluator().settings["choices"]["reading"]["danger_distance"] == 0.5
         assert setup.as_dict()["switches"] == {"reading.danger_distance": 0.5}
         assert pickle.loads(pickle.dumps(setup)) == setup
@@ -52,7 +51,7 @@ class TestSetup:
             setup.switches["x"] = 1  # type: ignore[index]
 
     @pytest.mark.parametrize(
-        ("named", "error", "sentence"),
+        ("options", "error", "message"),
         [
             (
                 {"task": "motions"},
@@ -80,9 +79,11 @@ class TestSetup:
             ),
         ],
     )
-    def test_refused(self, named: dict[str, Any], error: type[Exception], sentence: str) -> None:
-        assert_refused(
-            (lambda: EvaluationSetup(**named), error, sentence),
+    def test_wrong_choices_are_refused(
+        self, options: dict[str, Any], error: type[Exception], message: str
+    ) -> None:
+        assert_raises(
+            (lambda: EvaluationSetup(**options), error, message),
         )
 
 
@@ -93,48 +94,42 @@ class TestLoader:
 
     @pytest.fixture
     def motion(self, token: str, tmp_path: Path) -> Results:
-        """Nothing predicted, on cells of 1 m, every second of a second."""
+        """Write motion that predicts nothing, on cells of 1 m and once a second."""
         grid = BevGrid((-50, 50, 1.0), (-50, 50, 1.0), "fiery")
-        with ResultsWriter(
-            tmp_path / "motion", "motion", grid=grid, step=1.0, labels="clean"
-        ) as writer:
+        path = tmp_path / "motion"
+        with ResultsWriter(path, "motion", grid=grid, step=1.0, labels="clean") as writer:
             writer.add(token, instances_of(np.zeros((3, *grid.shape), int), grid))
-        return read_results(tmp_path / "motion")
+        return read_results(path)
 
     def test_motion_has_labels_of_its_form(
         self, da_motion: DeepAccident, motion: Results, token: str
     ) -> None:
         setup = EvaluationSetup(task="motion", switches={"labels": "clean"}, horizon=1.0)
         prediction, label = SampleLoader(da_motion, motion, setup)(token)
+
         assert isinstance(label, MotionLabels)
+
         config = label.config
         assert (config.grid, config.step, config.future_frames) == (motion.form.grid, 10, 1)
         assert config.grid == prediction.grid
 
-    def test_the_protocol_says_which_labels_and_else_the_results(self, motion: Results) -> None:
-        for task, protocol, expected in (
-            ("accident", "paper", "released"),
-            ("accident", "boxes", "clean"),
-        ):
-            assert (
-                label_config(
-                    EvaluationSetup(task=task, protocol=protocol).rules, motion.form, horizon=2.0
-                ).protocol
-                == expected
-            )
+    def test_labels_are_chosen_by_the_protocol_or_otherwise_by_the_results(
+        self, motion: Results
+    ) -> None:
+        for protocol, labels in (("paper", "released"), ("boxes", "clean")):
+            rules = EvaluationSetup(task="accident", protocol=protocol).rules
+            assert label_config(rules, motion.form, horizon=2.0).protocol == labels
 
     def test_accidents_have_their_context(
         self, da_motion: DeepAccident, token: str, tmp_path: Path
     ) -> None:
-        alarm = Accident(positions=np.zeros((2, 2)), time=1.0)
-        with ResultsWriter(tmp_path / "accidents.json", "accident") as writer:
-            writer.add(token, [alarm])
-        loader = SampleLoader(
-            da_motion,
-            read_results(tmp_path / "accidents.json"),
-            EvaluationSetup(task="accident", protocol="boxes", horizon=3.0),
-        )
-        prediction, label, context = loader(token)
+        path = tmp_path / "accidents.json"
+        with ResultsWriter(path, "accident") as writer:
+            writer.add(token, [Accident(positions=np.zeros((2, 2)), time=1.0)])
+
+        setup = EvaluationSetup(task="accident", protocol="boxes", horizon=3.0)
+
+        prediction, label, context = SampleLoader(da_motion, read_results(path), setup)(token)
         assert (len(prediction), label) == (1, None)
         assert isinstance(context, AccidentContext)
         assert context.truth is not None
@@ -142,36 +137,40 @@ class TestLoader:
     def test_boxes_come_from_world_into_the_protocols_frame(
         self, da_motion: DeepAccident, token: str, tmp_path: Path
     ) -> None:
+        path = tmp_path / "boxes.json"
         boxes = da_motion.boxes(token)
-        with ResultsWriter(tmp_path / "boxes.json", "detection") as writer:
+        with ResultsWriter(path, "detection") as writer:
             writer.add(token, DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes))))
-        setup = EvaluationSetup(task="detection", protocol="released")
-        found, truth = SampleLoader(da_motion, read_results(tmp_path / "boxes.json"), setup)(token)
-        assert found.boxes.frame == truth.frame == "lidar"
-        np.testing.assert_allclose(
-            found.boxes.center, da_motion.boxes(token, "lidar").center, atol=1e-6
-        )
-        assert (
-            truth.center.tolist() == detection_truth(da_motion, token, setup.rules).center.tolist()
-        )
 
-    def test_refused(
+        setup = EvaluationSetup(task="detection", protocol="released")
+        detected, truth = SampleLoader(da_motion, read_results(path), setup)(token)
+
+        assert detected.boxes.frame == truth.frame == "lidar"
+
+        lidar_boxes = da_motion.boxes(token, "lidar")
+        np.testing.assert_allclose(detected.boxes.center, lidar_boxes.center, atol=1e-6)
+
+        expected_truth = detection_truth(da_motion, token, setup.rules)
+        assert truth.center.tolist() == expected_truth.center.tolist()
+
+    def test_results_of_another_kind_or_shorter_horizon_are_refused(
         self, da_motion: DeepAccident, motion: Results, token: str, tmp_path: Path
     ) -> None:
         with ResultsWriter(tmp_path / "a.json", "accident") as writer:
             writer.add(token, [])
-        assert_refused(
+
+        accidents = read_results(tmp_path / "a.json")
+
+        assert_raises(
             (
-                lambda: SampleLoader(
-                    da_motion, read_results(tmp_path / "a.json"), EvaluationSetup(task="accident")
-                ),
+                lambda: SampleLoader(da_motion, accidents, EvaluationSetup(task="accident")),
                 EvaluationError,
-                ("a.json: holds explicit accidents", "protocol 'released'"),
+                ("a.json: contains explicit accidents", "protocol 'released'"),
             ),
             (
                 lambda: SampleLoader(da_motion, motion, EvaluationSetup(task="detection")),
                 EvaluationError,
-                r"holds motion results; detection is evaluated from detection results",
+                r"contains motion results; detection is evaluated from detection results",
             ),
             (
                 lambda: SampleLoader(
@@ -183,61 +182,60 @@ class TestLoader:
         )
 
 
-def test_scope_agents_and_horizon_choose(da_motion: DeepAccident) -> None:
-    one = SampleSelection(
-        split="train", scope="all", agents=("infrastructure",), horizon=1.0
-    ).tokens(da_motion)
-    both = {f"type1_subtype1_{end}" for end in ("accident", "normal")}
-    assert ({token.split("/")[0] for token in one}, {agent_of(token) for token in one}) == (
-        both,
-        {"infrastructure"},
-    )
-    assert [int(token[-3:]) for token in one] == [25, 30] * 2
+def test_scope_agents_and_horizon_choose_samples(da_motion: DeepAccident) -> None:
+    selection = SampleSelection(split="train", scope="all", agents=("infrastructure",), horizon=1.0)
+    tokens = selection.tokens(da_motion)
+
+    kinds = {token.split("/")[0] for token in tokens}
+    assert kinds == {"type1_subtype1_accident", "type1_subtype1_normal"}
+    assert {agent_of(token) for token in tokens} == {"infrastructure"}
+    assert [int(token[-3:]) for token in tokens] == [25, 30] * 2
 
 
-def test_whole_scenarios_of_accidents_alone(da_motion: DeepAccident) -> None:
-    every, accidents = (
-        SampleSelection(split="train", samples="all", scope=scope, horizon=0.3).tokens(da_motion)
-        for scope in ("all", "accident")
-    )
-    assert accidents == [token for token in every if "_accident/" in token]
-    assert len(every) == 2 * len(accidents) == 2 * 5 * 7
+def test_only_whole_scenarios_of_accidents(da_motion: DeepAccident) -> None:
+    every = SampleSelection(split="train", samples="all", scope="all", horizon=0.3)
+    every_token = every.tokens(da_motion)
+    accident_tokens = replace(every, scope="accident").tokens(da_motion)
+
+    assert accident_tokens == [token for token in every_token if "_accident/" in token]
+    assert len(every_token) == 2 * len(accident_tokens) == 2 * 5 * 7
 
 
 def test_defaults_by_task() -> None:
-    motion, warning = (
-        default_selection(EvaluationSetup(task=task, protocol=protocol, horizon=3.0))
-        for task, protocol in (("motion", "paper"), ("warning", "clean"))
+    motion = EvaluationSetup(task="motion", protocol="paper", horizon=3.0)
+    assert default_selection(motion) == SampleSelection(split="val", horizon=3.0)
+
+    warning = EvaluationSetup(task="warning", protocol="clean", horizon=3.0)
+    assert default_selection(warning) == SampleSelection(
+        split="val", samples="all", scope="all", horizon=3.0
     )
-    assert motion == SampleSelection(split="val", horizon=3.0)
-    assert warning == SampleSelection(split="val", samples="all", scope="all", horizon=3.0)
 
 
 def test_agents_are_put_in_order() -> None:
-    given = SampleSelection(split="val", agents=("infrastructure", "ego_vehicle"))
-    assert given.agents == ("ego_vehicle", "infrastructure")
+    selection = SampleSelection(split="val", agents=("infrastructure", "ego_vehicle"))
+    assert selection.agents == ("ego_vehicle", "infrastructure")
 
 
 def test_wrong_choices_and_a_horizon_between_samples(da_b: DeepAccident) -> None:
-    chosen = partial(SampleSelection, split="val")
-    assert_refused(
+    select = partial(SampleSelection, split="val")
+    assert_raises(
         (
-            partial(chosen, samples="some"),
+            partial(select, samples="some"),
             ChoiceError,
             ("samples: expected one of evaluate, all", "'some'"),
         ),
         (
-            partial(chosen, scope="normal"),
+            partial(select, scope="normal"),
             ChoiceError,
             ("scope: expected one of accident, all", "'normal'"),
         ),
         (
-            partial(chosen, agents=("ego",)),
+            partial(select, agents=("ego",)),
             ChoiceError,
             ("agents: expected one of", "did you mean 'ego_vehicle'"),
         ),
         (
-            partial(chosen, agents=()),
+            partial(select, agents=()),
             ChoiceError,
             (
                 "agents: expected some of ego_vehicle",
@@ -245,78 +243,82 @@ def test_wrong_choices_and_a_horizon_between_samples(da_b: DeepAccident) -> None
             ),
         ),
         (
-            lambda: chosen(horizon=1.2).tokens(da_b),
+            lambda: select(horizon=1.2).tokens(da_b),
             ConfigError,
-            ("horizon: ", "0.5 s apart", "1.2 s"),
+            ("horizon: ", "multiple of 0.5 s", "1.2 s"),
         ),
     )
 
 
 def test_a_horizon_may_be_rounded_a_little(da_motion: DeepAccident) -> None:
-    exact = SampleSelection(split="train", horizon=1.5).tokens(da_motion)
-    assert SampleSelection(split="train", horizon=1.5 - 1e-9).tokens(da_motion) == exact
+    exact = SampleSelection(split="train", horizon=1.5)
+    rounded = SampleSelection(split="train", horizon=1.5 - 1e-9)
+    assert rounded.tokens(da_motion) == exact.tokens(da_motion)
 
 
 MISSING, EXTRA, UNKNOWN = ({"missing": ("a", "b")}, {"extra": ("c",)}, {"unknown": ("d", "e", "f")})
 
 
 @pytest.mark.parametrize(
-    ("parts", "told"),
+    ("parts", "messages"),
     [
-        ([], ["all 6 samples have a prediction, and nothing else has"]),
+        ([], ["all 6 samples have a prediction, and no others do"]),
         ([MISSING], ["without a prediction: 2 of 6 samples (a, b)"]),
         (
             [EXTRA],
             [
-                "1 prediction of samples that are not evaluated (c)",
-                "leave them out with --allow-partial",
+                "1 prediction for samples that are not evaluated (c)",
+                "ignore them with --allow-partial",
             ],
         ),
-        ([UNKNOWN], ["3 predictions of no sample of this release (d, e, f)"]),
+        ([UNKNOWN], ["3 predictions for samples that are not in this release (d, e, f)"]),
         (
             [MISSING, EXTRA],
-            ["without a prediction: 2 of 6", "1 prediction of samples that are not evaluated (c)"],
+            ["without a prediction: 2 of 6", "1 prediction for samples that are not evaluated (c)"],
         ),
-        ([EXTRA, UNKNOWN], ["1 prediction of samples", "3 predictions of no sample"]),
+        ([EXTRA, UNKNOWN], ["1 prediction for samples", "3 predictions for samples"]),
         ([{"missing": tuple("abcd")}], ["without a prediction: 4 of 6 samples (a, b, c, …)"]),
         (
             [MISSING, {"splits": ("train", "val"), "agents": ("ego_vehicle",)}],
             [
                 "without a prediction: 2",
-                "the predictions are of --split train, val --agents ego_vehicle",
+                "the predictions cover --split train, val --agents ego_vehicle",
             ],
         ),
     ],
 )
-def test_what_is_told_of_the_coverage(parts: list[dict[str, Any]], told: list[str]) -> None:
-    found = Coverage(expected=6, **{name: each for part in parts for name, each in part.items()})
-    assert found.is_complete is (parts == [])
-    texts = found.to_text().replace("all; no", "all, no").split("; ")
-    assert [text[: len(start)] for text, start in zip(texts, told, strict=True)] == told
+def test_coverage_lists_missing_and_extra_samples(
+    parts: list[dict[str, Any]], messages: list[str]
+) -> None:
+    fields = {name: value for part in parts for name, value in part.items()}
+    samples = Coverage(expected=6, **fields)
+    assert samples.is_complete is (parts == [])
+
+    texts = samples.to_text().replace("all; every", "all, every").split("; ")
+    for text, message in zip(texts, messages, strict=True):
+        assert text.startswith(message)
 
 
 @pytest.fixture(scope="module")
-def expected(da_b: DeepAccident, selection: SampleSelection) -> list[str]:
+def expected_tokens(da_b: DeepAccident, selection: SampleSelection) -> list[str]:
     return selection.tokens(da_b)
 
 
 def test_missing_extra_and_unknown_three_of_each(
-    da_b: DeepAccident, selection: SampleSelection, expected: list[str]
+    da_b: DeepAccident, selection: SampleSelection, expected_tokens: list[str]
 ) -> None:
     extra = replace(selection, agents=("ego_vehicle_behind",)).tokens(da_b)
-    found = coverage(
-        da_b, [*expected[4:], *extra, "mine/1", "mine/2", "mine/3", "mine/4"], selection
-    )
-    assert (found.expected, found.missing, found.extra) == (
-        6,
-        tuple(expected[:4]),
-        tuple(sorted(extra)),
-    )
-    assert found.unknown == ("mine/1", "mine/2", "mine/3", "mine/4")
+    unknown = ["mine/1", "mine/2", "mine/3", "mine/4"]
+    samples = coverage(da_b, [*expected_tokens[4:], *extra, *unknown], selection)
+
+    assert samples.expected == 6
+    assert samples.missing == tuple(expected_tokens[:4])
+    assert samples.extra == tuple(sorted(extra))
+    assert samples.unknown == tuple(unknown)
 
 
 @pytest.mark.parametrize(
-    ("made", "asked", "options"),
+    ("predicted_by", "selected_by", "options"),
     [
         ({"scope": "all"}, {}, "--scope all"),
         ({"horizon": 3.0}, {}, "--horizon 3.0"),
@@ -346,27 +348,35 @@ def test_missing_extra_and_unknown_three_of_each(
         ({"agents": ("ego_vehicle",), "scope": "all"}, {"agents": ("ego_vehicle",)}, "--scope all"),
     ],
 )
-def test_the_options_that_are_missing(
-    da_motion: DeepAccident, made: dict[str, Any], asked: dict[str, Any], options: str
+def test_coverage_names_the_options_of_the_predictions(
+    da_motion: DeepAccident,
+    predicted_by: dict[str, Any],
+    selected_by: dict[str, Any],
+    options: str,
 ) -> None:
-    selection = SampleSelection(**{"split": "train", **asked})
-    predicted = SampleSelection(**{"split": "train", **made}).tokens(da_motion)
-    found = coverage(da_motion, predicted, selection)
-    assert (found.options, found.is_complete) == (options, False)
-    assert found.to_text().startswith(f"the predictions are of the samples of {options}: ") == bool(
-        options
-    )
-    some = coverage(da_motion, [*predicted[:1], *predicted[2:]], selection)  # of no list of options
-    assert (some.options, some.is_complete) == ("", False)
+    selection = SampleSelection(**{"split": "train", **selected_by})
+    predicted = SampleSelection(**{"split": "train", **predicted_by}).tokens(da_motion)
+    samples = coverage(da_motion, predicted, selection)
+
+    assert (samples.options, samples.is_complete) == (options, False)
+
+    start = f"the predictions were made with {options}: "
+    assert samples.to_text().startswith(start) == bool(options)
+
+    # no options give exactly these samples
+    gap = coverage(da_motion, [*predicted[:1], *predicted[2:]], selection)
+    assert (gap.options, gap.is_complete) == ("", False)
 
 
-def test_the_split_that_is_missing(da_b: DeepAccident, selection: SampleSelection) -> None:
+def test_coverage_names_the_split_of_the_predictions(
+    da_b: DeepAccident, selection: SampleSelection
+) -> None:
     other = replace(selection, split="train")
     assert coverage(da_b, other.tokens(da_b), selection).options == "--split train"
     assert coverage(da_b, [], selection).options == ""
 
 
-def results_of(dataset: DeepAccident, path: Path, note: object) -> Results:
+def write_noted_results(dataset: DeepAccident, path: Path, note: object) -> Results:
     with ResultsWriter(path, "accident", meta={"release": note}) as writer:
         writer.add(dataset.sample[0]["token"], [])
     return read_results(path)
@@ -375,29 +385,32 @@ def results_of(dataset: DeepAccident, path: Path, note: object) -> Results:
 def test_other_recordings_of_the_same_names_are_refused(
     da_b: DeepAccident, own_release: Path, tmp_path: Path
 ) -> None:
-    first, second, *_ = tokens = [each["token"] for each in da_b.scenario]
-    note = release_note(da_b, tokens)
-    assert {*note["recordings"]} == {*tokens}
-    assert len({*note["recordings"].values()}) == len(tokens)
-    results = results_of(da_b, tmp_path / "whole.json", note)
+    scenarios = [scenario["token"] for scenario in da_b.scenario]
+    note = release_note(da_b, scenarios)
+    assert {*note["recordings"]} == {*scenarios}
+    assert len({*note["recordings"].values()}) == len(scenarios)
+
+    results = write_noted_results(da_b, tmp_path / "whole.json", note)
     check_recordings(results, da_b)
+
     label = min(own_release.rglob(f"ego_vehicle/label/{da_b.scenario[0]['name']}/*_002.txt"))
-    label.write_text("".join(label.read_text().splitlines(keepends=True)[:-1]))  # one box fewer
-    other = DeepAccident("v1", own_release, verbose=False)
-    assert_refused(
+    lines = label.read_text().splitlines(keepends=True)
+    label.write_text("".join(lines[:-1]))  # one box fewer
+    other_release = DeepAccident("v1", own_release, verbose=False)
+    assert_raises(
         (
-            lambda: check_recordings(results, other),
+            lambda: check_recordings(results, other_release),
             ResultsError,
-            (str(results.path), "1 of 6", first, "check index DATAROOT"),
+            (str(results.path), "1 of 6", scenarios[0], "check index DATAROOT"),
         )
     )
-    check_recordings(
-        results_of(da_b, tmp_path / "second.json", release_note(da_b, [second])), other
-    )
+
+    unchanged_note = release_note(da_b, [scenarios[1]])
+    unchanged_results = write_noted_results(da_b, tmp_path / "second.json", unchanged_note)
+    check_recordings(unchanged_results, other_release)
 
 
-def test_what_is_not_known_is_not_compared(da_b: DeepAccident, tmp_path: Path) -> None:
-    for number, note in enumerate(
-        ({}, None, "v1", {"version": "v1"}, {"recordings": {"elsewhere/x": "0"}})
-    ):
-        check_recordings(results_of(da_b, tmp_path / f"{number}.json", note), da_b)
+def test_unknown_recordings_are_not_compared(da_b: DeepAccident, tmp_path: Path) -> None:
+    notes = ({}, None, "v1", {"version": "v1"}, {"recordings": {"elsewhere/x": "0"}})
+    for number, note in enumerate(notes):
+        check_recordings(write_noted_results(da_b, tmp_path / f"{number}.json", note), da_b)

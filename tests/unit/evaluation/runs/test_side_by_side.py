@@ -1,4 +1,4 @@
-"""Evaluations of different sources stand beside each other, each with its rules."""
+"""Evaluations of different sources side by side, each with its rules."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,7 +7,7 @@ from typing import Any
 from deepaccident_devkit.evaluation.runs import side_by_side
 
 
-def bundle(name: str, labels: str, **headlines: str) -> Any:
+def make_bundle(name: str, labels: str, **headlines: str) -> Any:
     summary = {
         "task": "motion",
         "protocol": "paper",
@@ -21,8 +21,12 @@ def bundle(name: str, labels: str, **headlines: str) -> Any:
 
 def test_a_column_has_the_rules_and_the_numbers_of_its_evaluation() -> None:
     report = side_by_side(
-        [bundle("road", "fiery", iou="20.1 %", vpq="3.0 %"), bundle("ours", "clean", iou="41.0 %")]
+        [
+            make_bundle("road", "fiery", iou="20.1 %", vpq="3.0 %"),
+            make_bundle("ours", "clean", iou="41.0 %"),
+        ]
     )
+
     assert report.rows == (
         ("evaluation", "road", "ours"),
         ("release", "data/road, v1", "data/ours, v1"),
@@ -31,4 +35,4 @@ def test_a_column_has_the_rules_and_the_numbers_of_its_evaluation() -> None:
         ("iou", "20.1 %", "41.0 %"),
         ("vpq", "3.0 %", "–"),
     )
-    assert report.to_text().endswith("no differences: they have no sample in common")
+    assert report.to_text().endswith("no differences, since they have no sample in common")

@@ -1,14 +1,15 @@
-"""An accident of which no label shows both actors ends no evaluation: its samples are left out, and
-told.
+"""Accidents that no label shows both actors of: they end no evaluation; their samples are left out,
+and a note counts them.
 """
 
 import shutil
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
-from memory_results import MemoryResults
+from support.memory_results import MemoryResults
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.descriptions import describe
@@ -32,50 +33,57 @@ pytestmark = pytest.mark.slow
 ALARM = Accident(positions=[[5.0, 0.0], [8.0, 0.0]], time=1.0, score=0.5)
 
 
-CHANGES: dict[str, tuple[int, str, str | None]] = {
+META_CHANGES: dict[str, tuple[int, str, str | None]] = {
     "id 0": (3, "0", "ego none"),
     "in no label": (3, "424242", None),
     "one actor twice": (3, "", None),
     "a first line alone": (3, "0", ""),
 }
-"""Place in meta's first line, the actor there (the first one again), and its agents (no further
-lines at all).
+"""Index in meta's first line, the actor id there (empty: the first actor again), and the line of
+colliding agents (None: as it was, empty: no further lines).
 """
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = SynthConfig(scenarios=4, frames=30, seed=5, sensors="none", unplanned=0, designed=True)
     return make_release(tmp_path_factory.mktemp("unplaced") / "release", config, workers=1)
 
 
-@pytest.fixture(scope="module", params=CHANGES)
+@pytest.fixture(scope="module", params=META_CHANGES)
 def unplaced(
-    request: pytest.FixtureRequest, whole: Path, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, whole_release: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> SimpleNamespace:
-    """The release with such a meta file, and the token of its scenario."""
-    root = Path(shutil.copytree(whole, tmp_path_factory.mktemp("unplaced") / "release"))
+    """Copy the release with a changed meta file; gives the token of its scenario, too."""
+    root = Path(shutil.copytree(whole_release, tmp_path_factory.mktemp("unplaced") / "release"))
     meta = min(root.glob("*_accident/meta/*.txt"))
-    line, *others = meta.read_text().split("\n")
-    first = line.split()
-    place, actor, agents = CHANGES[request.param]
-    first[place] = actor or first[1]
-    if agents is not None:
-        others = [f" colliding agents: {agents}", *others[1:]] if agents else []
-    meta.write_text("\n".join([" ".join(first), *others]))
+    first_line, *further_lines = meta.read_text().split("\n")
+    words = first_line.split()
+    index, actor, agents = META_CHANGES[request.param]
+    words[index] = actor or words[1]
+    if agents == "":
+        further_lines = []
+    elif agents is not None:
+        further_lines[0] = f" colliding agents: {agents}"
+    meta.write_text("\n".join([" ".join(words), *further_lines]))
+
+    split_lines = []
+    for path in sorted(root.glob("*/meta/*.txt")):
+        split_lines.append(f"{path.parents[1].name} {path.stem}\n")
+
     split = root / "mine.txt"
-    split.write_text(
-        "".join(
-            f"{each.parents[1].name} {each.stem}\n" for each in sorted(root.glob("*/meta/*.txt"))
-        )
-    )
-    dataset = DeepAccident("v1", root, verbose=False)
+    split.write_text("".join(split_lines))
     return SimpleNamespace(
-        dataset=dataset, token=f"{meta.parents[1].name}/{meta.stem}", split=str(split)
+        dataset=DeepAccident("v1", root, verbose=False),
+        token=f"{meta.parents[1].name}/{meta.stem}",
+        split=str(split),
     )
 
 
-def run_of(unplaced: SimpleNamespace, path: Path, task: Any, protocol: str) -> EvaluationRun:
+def evaluate_alarms(
+    unplaced: SimpleNamespace, path: Path, task: Any, protocol: str
+) -> EvaluationRun:
+    """Evaluate the same alarm in every sample."""
     setup = EvaluationSetup(task=task, protocol=protocol)
     selection = default_selection(setup, unplaced.split, samples="all")
     with ResultsWriter(path, "accident") as writer:
@@ -84,48 +92,51 @@ def run_of(unplaced: SimpleNamespace, path: Path, task: Any, protocol: str) -> E
     return evaluate_results(unplaced.dataset, path, setup, selection, workers=1)
 
 
-SAMPLES = 5 * 6
-"""Of a scenario: five agents, every half second of 3 s."""
+SAMPLES_PER_SCENARIO = 5 * 6
+"""Five agents, every half second of 3 s."""
 
 
-def test_it_ends_no_evaluation_of_accidents(unplaced: SimpleNamespace, tmp_path: Path) -> None:
-    boxes = run_of(unplaced, tmp_path / "boxes.json", "accident", "boxes").result
-    # those from 2 s before the impact on
-    assert (boxes.unplaced, boxes.at_impact, boxes.samples) == (5 * 5, 5, 4 * SAMPLES - 5 * 5 - 5)
-    assert UNPLACED_NOTE.format(f"{boxes.unplaced} samples") in boxes.notes
-    assert (
-        run_of(unplaced, tmp_path / "paper.json", "accident", "paper").result.samples == 4 * SAMPLES
-    )
-
-
-def test_it_ends_no_evaluation_of_warnings_and_is_no_normal_scenario(
+def test_an_unplaced_accident_ends_no_evaluation_of_accidents(
     unplaced: SimpleNamespace, tmp_path: Path
 ) -> None:
-    clean, field = (
-        run_of(unplaced, tmp_path / f"{protocol}.json", "warning", protocol)
-        for protocol in ("clean", "field")
-    )
-    assert all(
-        UNPLACED_NOTE.format(f"{SAMPLES} samples") in run.result.notes for run in (clean, field)
-    )
-    recordings = [each.recordings for each in clean.result.groups.values()]
-    assert [sum(each[kind] for each in recordings) for kind in ("accident", "twins", "others")] == [
-        5,
-        10,
-        0,
-    ]
+    boxes = evaluate_alarms(unplaced, tmp_path / "boxes.json", "accident", "boxes").result
+    left_out = 5 * 5  # five agents, every half second from 2 s before the impact on
+    assert (boxes.unplaced, boxes.at_impact) == (left_out, 5)
+    assert boxes.samples == 4 * SAMPLES_PER_SCENARIO - left_out - 5
+    assert UNPLACED_NOTE.format(f"{boxes.unplaced} samples") in boxes.notes
+
+    paper = evaluate_alarms(unplaced, tmp_path / "paper.json", "accident", "paper").result
+    assert paper.samples == 4 * SAMPLES_PER_SCENARIO
+
+
+def test_an_unplaced_accident_ends_no_evaluation_of_warnings(
+    unplaced: SimpleNamespace, tmp_path: Path
+) -> None:
+    """It does not count as a normal scenario, either."""
+    clean = evaluate_alarms(unplaced, tmp_path / "clean.json", "warning", "clean")
+    field = evaluate_alarms(unplaced, tmp_path / "field.json", "warning", "field")
+    note = UNPLACED_NOTE.format(f"{SAMPLES_PER_SCENARIO} samples")
+    assert note in clean.result.notes
+    assert note in field.result.notes
+
+    recordings: Counter[str] = Counter()
+    for group in clean.result.groups.values():
+        recordings.update(group.recordings)
+
+    assert (recordings["accident"], recordings["twins"], recordings["others"]) == (5, 10, 0)
+
     prevented = prevention_evaluator(unplaced.dataset, clean.evaluator, workers=1).compute()
-    assert [each.scenario for each in prevented.skipped] == [unplaced.token]
+    assert [scenario.scenario for scenario in prevented.skipped] == [unplaced.token]
 
 
-def test_maps_are_compared_with_maps_as_ever(unplaced: SimpleNamespace) -> None:
-    dataset, token = unplaced.dataset, f"{unplaced.token}/ego_vehicle/020"
-    label = dataset.motion_labels(token, MotionLabelConfig(protocol="released")).to_present(
-        "bilinear"
-    )
-    results = cast(
-        "Any", MemoryResults("motion", {token: instances_of(label.instance, label.config.grid)})
-    )
+def test_maps_are_compared_with_maps_as_usual(unplaced: SimpleNamespace) -> None:
+    dataset = unplaced.dataset
+    token = f"{unplaced.token}/ego_vehicle/020"
+    labels = dataset.motion_labels(token, MotionLabelConfig(protocol="released"))
+    label = labels.to_present("bilinear")
+    output = instances_of(label.instance, label.config.grid)
+    results: Any = MemoryResults("motion", {token: output})
+
     for protocol in ("released", "paper"):
         setup = EvaluationSetup(task="accident", protocol=protocol)
         evaluator = setup.evaluator()
@@ -133,42 +144,40 @@ def test_maps_are_compared_with_maps_as_ever(unplaced: SimpleNamespace) -> None:
         assert evaluator.compute().samples == 1
 
 
-def test_nothing_false_is_said(unplaced: SimpleNamespace) -> None:
+def test_descriptions_and_verdicts_say_that_it_is_unplaced(unplaced: SimpleNamespace) -> None:
     story = describe(unplaced.dataset, unplaced.token)
-    twice = story.facts["partners"] is None
-    words = (
-        "collide in 2.9 s, but the labels do not show how",
-        "two collide",
-        " that no label shows",
-    )
-    assert [story.facts["collision"], *(each in story.text for each in words)] == [
-        True,
-        True,
-        twice,
-        not twice,
-    ]
+    one_actor_twice = story.facts["partners"] is None
+    assert story.facts["collision"] is True
+    assert "collide in 2.9 s, but the labels do not show how" in story.text
+    assert ("two collide" in story.text) == one_actor_twice
+    assert (" that no label shows" in story.text) != one_actor_twice
+
     assert default_scenario(unplaced.dataset) != unplaced.token  # the other accident can be shown
-    verdict: Any = sample_verdict(
-        unplaced.dataset, f"{unplaced.token}/ego_vehicle/020", [ALARM], protocol="boxes"
-    )
+
+    sample = f"{unplaced.token}/ego_vehicle/020"
+    verdict: Any = sample_verdict(unplaced.dataset, sample, [ALARM], protocol="boxes")
     assert difference_words(verdict.compared).startswith(
-        "an accident comes in 1.0 s that no label shows both actors of"
+        "collision in 1.0 s, but no label shows both actors"
     )
 
 
-def test_it_is_a_collision_everywhere(
+def test_an_unplaced_accident_is_a_collision_everywhere(
     unplaced: SimpleNamespace, request: pytest.FixtureRequest
 ) -> None:
-    """Found, counted, skipped by name."""
+    """It is found by queries, counted by statistics, and named where a report skips it."""
     dataset, token = unplaced.dataset, unplaced.token
     assert token in [scenario["token"] for scenario in dataset.find(collision=True)]
-    assert dataset_statistics(dataset).histograms["collision_angles"].left_out.counts["total"] == 1
-    twice = request.node.callspec.params["unplaced"] == "one actor twice"
+
+    angles = dataset_statistics(dataset).histograms["collision_angles"]
+    assert angles.left_out.counts["total"] == 1
+
+    one_actor_twice = request.node.callspec.params["unplaced"] == "one actor twice"
     for report in (
         lead_time_ledger(dataset, [token], workers=1),
         avoidability_report(dataset, [token], workers=1),
     ):
-        assert ["counterpart not recorded" in each.reason for each in report.skipped] == [not twice]
-    assert all(
-        [dataset.render_frame(f"{token}/030"), dataset.render_sample(f"{token}/ego_vehicle/030")]
-    )
+        unrecorded = ["counterpart not recorded" in skipped.reason for skipped in report.skipped]
+        assert unrecorded == [not one_actor_twice]
+
+    assert dataset.render_frame(f"{token}/030")
+    assert dataset.render_sample(f"{token}/ego_vehicle/030")

@@ -1,16 +1,16 @@
-"""Bundles made again: the same, or every difference named."""
+"""Bundles made again: they are the same, or every difference is named."""
 
 import json
 import os
 import shutil
 from collections.abc import Callable
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import pytest
-from evaluation_runs import stored_run
-from refusals import assert_refused
+from support.evaluation_runs import stored_run
+from support.expected_errors import assert_raises
+from support.generated_bundles import change_json
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, ResultsError
@@ -34,33 +34,26 @@ from deepaccident_devkit.support.reading import file_checksum
 pytestmark = pytest.mark.slow
 
 Write = Callable[..., Results]
-SUMMARY_CHANGED = "files.json: metrics_summary.json"
+CHANGED_SUMMARY = "files.json: metrics_summary.json"
 
 
 @pytest.fixture
 def bundle(run: EvaluationRun, tmp_path: Path) -> Path:
-    return save_run(
-        run.broken_down(["all", "agent"], Resampling(resamples=10)), tmp_path / "bundle"
-    )
+    broken_down = run.broken_down(["all", "agent"], Resampling(resamples=10))
+    return save_run(broken_down, tmp_path / "bundle")
 
 
-def verify(bundle: Path, dataset: DeepAccident, **named: Any) -> Verification:
-    """With the results beside the bundle, unless others are given, or a copy is in it."""
-    beside = None if (bundle / "results").exists() else bundle.with_name("accidents.json")
-    return verify_bundle(bundle, dataset, workers=1, **{"results": beside, **named})
+def verify(bundle: Path, dataset: DeepAccident, **options: Any) -> Verification:
+    """Verify with the bundle's own copy of the results, or with the file beside the bundle."""
+    results = None if (bundle / "results").exists() else bundle.with_name("accidents.json")
+    return verify_bundle(bundle, dataset, workers=1, **{"results": results, **options})
 
 
-def changed(path: Path, change: Callable[[Any], object]) -> None:
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+def places_of(verification: Verification) -> list[str]:
+    return [difference.where for difference in verification.differences]
 
 
-def found(verification: Verification) -> list[str]:
-    return [each.where for each in verification.differences]
-
-
-def test_nothing_differs(bundle: Path, da_b: DeepAccident) -> None:
+def test_the_same_evaluation_has_no_differences(bundle: Path, da_b: DeepAccident) -> None:
     verification = verify(bundle, da_b)
     assert (verification.is_same, verification.samples, verification.notes) == (True, 6, ())
     assert verification.to_dict()["same"] is True
@@ -79,31 +72,33 @@ def test_nothing_differs(bundle: Path, da_b: DeepAccident) -> None:
         ("forecasting", "clean"),
     ],
 )
-def test_nothing_differs_whatever_the_task(
+def test_no_task_has_differences(
     da_b: DeepAccident, tmp_path: Path, task: str, protocol: str
 ) -> None:
-    """With groups, another horizon, and numbers that only some samples have."""
+    """Verify with groups, another horizon, and numbers that only some samples have."""
     setup = EvaluationSetup(task=task, protocol=protocol, horizon=0.5)
     selection = default_selection(setup, "val", agents=("ego_vehicle",), scope="all")
     run, results = stored_run(da_b, setup, tmp_path / "results", selection)
-    bundle = save_run(
-        run.broken_down(("all", "agent"), Resampling(resamples=10)), tmp_path / "bundle"
-    )
+    broken_down = run.broken_down(("all", "agent"), Resampling(resamples=10))
+    bundle = save_run(broken_down, tmp_path / "bundle")
+
     verification = verify(bundle, da_b, results=results)
     assert (verification.is_same, verification.differences) == (True, ())
 
 
-def test_with_results_inside_and_elsewhere(
+def test_a_bundle_with_its_results_can_be_moved(
     run: EvaluationRun, tmp_path: Path, own_release: Path
 ) -> None:
     bundle = save_run(run, tmp_path / "bundle", include_results=True)
-    moved = tmp_path / "moved"
-    shutil.move(bundle, moved)
+    moved_bundle = tmp_path / "moved"
+    shutil.move(bundle, moved_bundle)
     (tmp_path / "accidents.json").unlink()
-    assert verify(moved, DeepAccident(dataroot=own_release, verbose=False)).is_same
+
+    moved_release = DeepAccident(dataroot=own_release, verbose=False)
+    assert verify(moved_bundle, moved_release).is_same
 
 
-def test_a_partial_one(
+def test_a_partial_evaluation_is_the_same(
     da_b: DeepAccident,
     selection: SampleSelection,
     tmp_path: Path,
@@ -116,7 +111,7 @@ def test_a_partial_one(
 
 
 @pytest.mark.parametrize(
-    ("place", "stored", "named"),
+    ("path", "value", "differing_paths"),
     [
         ("metrics/apa", 0.99, ["metrics/apa"]),
         ("breakdowns/all/groups/0/metrics/apa", 1 - 1e-16, ["breakdowns/all/groups/0/metrics/apa"]),
@@ -124,71 +119,71 @@ def test_a_partial_one(
         ("environment/numpy", "1.0", []),
     ],
 )
-def test_a_value_of_the_summary(
-    bundle: Path, da_b: DeepAccident, place: str, stored: object, named: list[str]
+def test_another_value_of_the_summary_is_named(
+    bundle: Path, da_b: DeepAccident, path: str, value: object, differing_paths: list[str]
 ) -> None:
-    """To the last bit; another numpy is a note."""
+    """Values are compared to the last bit; another numpy is a note."""
 
     def change(summary: Any) -> None:
-        *parts, last = place.split("/")
-        reduce(lambda at, part: at[int(part) if part.isdigit() else part], parts, summary)[last] = (
-            stored
-        )
+        *keys, last_key = path.split("/")
+        parent = summary
+        for key in keys:
+            parent = parent[int(key) if key.isdigit() else key]
+        parent[last_key] = value
 
-    changed(bundle / "metrics_summary.json", change)
+    change_json(bundle / "metrics_summary.json", change)
     verification = verify(bundle, da_b)
-    assert found(verification) == [
-        SUMMARY_CHANGED,
-        *(f"metrics_summary.json: {each}" for each in named),
-    ]
-    assert any(
-        "evaluated with numpy 1.0, verified with " in note for note in verification.notes
-    ) != bool(named)
+
+    places = [f"metrics_summary.json: {differing_path}" for differing_path in differing_paths]
+    assert places_of(verification) == [CHANGED_SUMMARY, *places]
+
+    numpy_note = "evaluated with numpy 1.0, verified with "
+    has_numpy_note = any(numpy_note in note for note in verification.notes)
+    assert has_numpy_note != bool(differing_paths)
     assert verification.samples == 6
 
 
 @pytest.mark.parametrize("kind", ["label", "meta", "calib"])
-def test_a_file_of_a_scenario(bundle: Path, own_release: Path, kind: str) -> None:
-    """Also before the index knows of it: then there are no numbers of the files that are there."""
-    opened = DeepAccident(dataroot=own_release, verbose=False)
-    path = min(
-        own_release.glob("val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*")
-    )
+def test_another_file_of_a_scenario_is_named(bundle: Path, own_release: Path, kind: str) -> None:
+    """As long as the index does not know of the other file, there are no numbers to compare."""
+    dataset = DeepAccident(dataroot=own_release, verbose=False)
+    pattern = "val/*/meta/*.txt" if kind == "meta" else f"val/*/ego_vehicle/{kind}/*/*"
+    path = min(own_release.glob(pattern))
     path.write_bytes(path.read_bytes() + b"\n")
-    token, verification = min(opened.split_scenarios("val")), verify(bundle, opened)
-    assert found(verification) == ["all numbers"]
+    scenario = min(dataset.split_scenarios("val"))
+
+    verification = verify(bundle, dataset)
+    assert places_of(verification) == ["all numbers"]
     assert "the index is out of date" in verification.notes[0]
-    verification = verify(
-        bundle, DeepAccident(dataroot=own_release, index_dir=own_release / "anew", verbose=False)
-    )
-    assert found(verification) == [
+
+    reindexed = DeepAccident(dataroot=own_release, index_dir=own_release / "anew", verbose=False)
+    assert places_of(verify(bundle, reindexed)) == [
         "metrics_summary.json: release/fingerprint",
-        f"scenarios.json: {token}/{kind}",
+        f"scenarios.json: {scenario}/{kind}",
     ]
 
 
-def one_more_point(release: Path) -> None:
-    """As on another processor, in a box of another class than the agent's own row."""
+def add_a_point(release: Path) -> None:
+    """Add a LiDAR point to a box, as another processor may; the agent's own row stays."""
     path = min(release.glob("val/*/ego_vehicle/label/*/*_001.txt"))
     lines = path.read_text().split("\n")
     words = lines[-1].split(" ")
-    lines[-1] = " ".join([*words[:11], str(int(words[11]) + 1), words[12]])
+    words[11] = str(int(words[11]) + 1)
+    lines[-1] = " ".join(words)
     path.write_text("\n".join(lines))
 
 
-def without_boxes(bundle: Path) -> None:
-    """Make it a bundle of devkit 1.0.0, which kept the hashes of whole files only."""
+def make_bundle_of_devkit_1_0_0(bundle: Path) -> None:
+    """Drop the hashes of boxes and points: devkit 1.0.0 kept only the hashes of whole files."""
+
+    def drop_hashes(content: Any) -> None:
+        for hashes in content["scenarios"].values():
+            del hashes["boxes"], hashes["points"]
+
     path = bundle / "scenarios.json"
-    changed(
-        path,
-        lambda stored: [
-            each.pop(name) for each in stored["scenarios"].values() for name in ("boxes", "points")
-        ],
-    )
-    changed(
-        bundle / "files.json",
-        lambda listed: listed["files"].update({path.name: file_checksum(path)}),
-    )
+    change_json(path, drop_hashes)
+    checksum = {path.name: file_checksum(path)}
+    change_json(bundle / "files.json", lambda content: content["files"].update(checksum))
 
 
 def test_labels_with_a_few_other_points_are_the_same(
@@ -198,129 +193,134 @@ def test_labels_with_a_few_other_points_are_the_same(
     run: EvaluationRun,
     selection: SampleSelection,
 ) -> None:
-    one_more_point(own_release)
-    opened = DeepAccident(dataroot=own_release, verbose=False)
-    assert verify(bundle, opened).is_same
-    again = evaluate_results(opened, results, run.setup, selection, workers=1)
-    other = save_run(again, bundle.with_name("other"))
-    assert compare_bundles(bundle, other, Resampling(resamples=10)).samples == 6
-    without_boxes(bundle)
-    token = min(opened.split_scenarios("val"))
-    assert found(verify(bundle, opened)) == [
+    add_a_point(own_release)
+    dataset = DeepAccident(dataroot=own_release, verbose=False)
+    assert verify(bundle, dataset).is_same
+
+    other_run = evaluate_results(dataset, results, run.setup, selection, workers=1)
+    other_bundle = save_run(other_run, bundle.with_name("other"))
+    assert compare_bundles(bundle, other_bundle, Resampling(resamples=10)).samples == 6
+
+    make_bundle_of_devkit_1_0_0(bundle)
+    scenario = min(dataset.split_scenarios("val"))
+    assert places_of(verify(bundle, dataset)) == [
         "metrics_summary.json: release/fingerprint",
-        f"scenarios.json: {token}/label",
+        f"scenarios.json: {scenario}/label",
     ]
-    with pytest.raises(EvaluationError, match="files of 1 scenarios are not the same"):
-        compare_bundles(bundle, other)
+    with pytest.raises(EvaluationError, match="files differ in 1 scenario "):
+        compare_bundles(bundle, other_bundle)
 
 
 def test_a_bundle_of_devkit_1_0_0_verifies_and_compares(
     bundle: Path, da_b: DeepAccident, run: EvaluationRun
 ) -> None:
-    new = save_run(run, bundle.with_name("new"))
-    without_boxes(bundle)
+    new_bundle = save_run(run, bundle.with_name("new"))
+    make_bundle_of_devkit_1_0_0(bundle)
+
     assert verify(bundle, da_b).is_same
-    assert compare_bundles(bundle, new, Resampling(resamples=10)).samples == 6
+    assert compare_bundles(bundle, new_bundle, Resampling(resamples=10)).samples == 6
 
 
-def test_a_scenario_that_is_gone(bundle: Path, own_release: Path) -> None:
+def test_a_missing_scenario_leaves_no_numbers(bundle: Path, own_release: Path) -> None:
     for folder in own_release.glob("val/*_normal"):
         shutil.rmtree(folder)
+
     verification = verify(bundle, DeepAccident(dataroot=own_release, verbose=False))
-    assert found(verification) == ["all numbers"]
-    assert "3 predictions of no sample of this release" in verification.notes[0]
+
+    assert places_of(verification) == ["all numbers"]
+    assert "3 predictions for samples that are not in this release" in verification.notes[0]
     assert verification.samples == 0
 
 
-def test_a_scenario_that_the_bundle_does_not_state(bundle: Path, da_b: DeepAccident) -> None:
-    gone = min(read_scenarios(bundle, "_normal"))
-    changed(bundle / "scenarios.json", lambda stored: stored["scenarios"].pop(gone))
-    assert found(verify(bundle, da_b)) == ["files.json: scenarios.json", f"scenarios.json: {gone}"]
+def test_a_scenario_missing_from_the_bundle_is_named(bundle: Path, da_b: DeepAccident) -> None:
+    path = bundle / "scenarios.json"
+    scenarios = json.loads(path.read_text())["scenarios"]
+    missing = min(scenario for scenario in scenarios if "_normal/" in scenario)
+    change_json(path, lambda content: content["scenarios"].pop(missing))
+
+    assert places_of(verify(bundle, da_b)) == [
+        "files.json: scenarios.json",
+        f"scenarios.json: {missing}",
+    ]
 
 
-def test_other_results(
+def test_other_results_are_named(
     bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path, write_accidents: Write
 ) -> None:
-    differing = found(
-        verify(
-            bundle,
-            da_b,
-            results=write_accidents(tmp_path / "other.json", results.tokens, moved=1.0).path,
-        )
-    )
-    assert {each.split(": ")[0] for each in differing} == {
+    other_results = write_accidents(tmp_path / "other.json", results.tokens, moved=1.0)
+    places = places_of(verify(bundle, da_b, results=other_results.path))
+
+    assert {location.split(": ")[0] for location in places} == {
         "metrics_summary.json",
         "counts.json",
         "samples.parquet",
     }
-    assert "metrics_summary.json: results/fingerprint" in differing
+    assert "metrics_summary.json: results/fingerprint" in places
 
 
-def test_counts_of_a_sample(bundle: Path, da_b: DeepAccident) -> None:
-    token = min(json.loads((bundle / "counts.json").read_text())["counts"])
-    changed(bundle / "counts.json", lambda state: state["counts"][token].update(unjudged=7))
-    assert found(verify(bundle, da_b)) == [
+def test_other_counts_of_a_sample_are_named(bundle: Path, da_b: DeepAccident) -> None:
+    path = bundle / "counts.json"
+    token = min(json.loads(path.read_text())["counts"])
+    change_json(path, lambda content: content["counts"][token].update(unjudged=7))
+
+    assert places_of(verify(bundle, da_b)) == [
         "files.json: counts.json",
         f"counts.json: {token}/unjudged",
     ]
 
 
-def test_a_row(bundle: Path, da_b: DeepAccident) -> None:
-    rows, stamp = read_rows(bundle / "samples.parquet")
+def test_other_and_missing_rows_are_named(bundle: Path, da_b: DeepAccident) -> None:
+    rows, header = read_rows(bundle / "samples.parquet")
     rows[2]["tp_10m"] = 5
-    write_rows(bundle / "samples.parquet", rows[:-1], stamp)
-    assert found(verify(bundle, da_b)) == [
+    write_rows(bundle / "samples.parquet", rows[:-1], header)
+
+    assert places_of(verify(bundle, da_b)) == [
         "files.json: samples.parquet",
         f"samples.parquet: {rows[2]['token']}/tp_10m",
         f"samples.parquet: {rows[-1]['token']}",
     ]
 
 
-def test_files_foreign_missing_and_damaged(bundle: Path, da_b: DeepAccident) -> None:
+def test_foreign_missing_and_damaged_files_are_named(bundle: Path, da_b: DeepAccident) -> None:
     (bundle / "mine.txt").touch()
     (bundle / "counts.json").unlink()
     (bundle / "samples.parquet").write_bytes(b"PAR1")
     (bundle / "scenarios.json").write_text("{}")
-    verification = verify(bundle, da_b)
-    assert found(verification) == [
-        *("files.json: counts.json", "files.json: samples.parquet", "files.json: scenarios.json"),
-        *("files.json: mine.txt", "scenarios.json", "counts.json", "samples.parquet"),
+    assert places_of(verify(bundle, da_b)) == [
+        "files.json: counts.json",
+        "files.json: samples.parquet",
+        "files.json: scenarios.json",
+        "files.json: mine.txt",
+        "scenarios.json",
+        "counts.json",
+        "samples.parquet",
     ]
+
     (bundle / "files.json").write_text("")
-    assert found(verify(bundle, da_b))[0] == "files.json"
+    assert places_of(verify(bundle, da_b))[0] == "files.json"
 
 
-def test_another_protocol_claimed(bundle: Path, da_b: DeepAccident) -> None:
-    """With a smaller danger distance the pairs that pass close by in the normal scenario are no
+def test_counts_of_another_protocol_are_named(bundle: Path, da_b: DeepAccident) -> None:
+    """With a smaller danger distance, the pairs that pass closely in the normal scenario are no
     accidents.
     """
-    changed(
+    change_json(
         bundle / "metrics_summary.json",
         lambda summary: summary.update(switches={"reading.danger_distance": 0.5}),
     )
-    normal = [
-        token
-        for token in json.loads((bundle / "counts.json").read_text())["counts"]
-        if "_normal" in token
-    ]
-    differing = found(verify(bundle, da_b))
-    assert differing[:2] == [
-        SUMMARY_CHANGED,
+    counts = json.loads((bundle / "counts.json").read_text())["counts"]
+    normal_tokens = [token for token in counts if "_normal" in token]
+
+    places = places_of(verify(bundle, da_b))
+    assert places[:2] == [
+        CHANGED_SUMMARY,
         "metrics_summary.json: settings/choices/reading/danger_distance",
     ]
-    assert {f"counts.json: {token}/named" for token in normal} < set(differing)
-
-
-def read_scenarios(bundle: Path, ending: str) -> list[str]:
-    return [
-        token
-        for token in json.loads((bundle / "scenarios.json").read_text())["scenarios"]
-        if f"{ending}/" in token
-    ]
+    assert {f"counts.json: {token}/named" for token in normal_tokens} < set(places)
 
 
 @pytest.mark.parametrize(
-    ("stored", "found", "expected"),
+    ("stored", "current", "expected"),
     [
         ({"a": 1, "b": [1, 2]}, {"b": [1, 2], "a": 1}, []),
         ({"a": 1}, {"a": 1.0}, [("a", 1, 1.0)]),
@@ -332,11 +332,11 @@ def read_scenarios(bundle: Path, ending: str) -> list[str]:
         ({"skip": 1, "keep": {"skip": 1}}, {"skip": 2, "keep": {"skip": 2}}, [("keep/skip", 1, 2)]),
     ],
 )
-def test_differing(stored: Any, found: Any, expected: list[tuple[str, Any, Any]]) -> None:
-    assert list(find_differences(stored, found, without=["skip"])) == expected
+def test_find_differences(stored: Any, current: Any, expected: list[tuple[str, Any, Any]]) -> None:
+    assert list(find_differences(stored, current, without=["skip"])) == expected
 
 
-def test_what_does_not_belong_is_named_and_not_opened(
+def test_foreign_files_are_named_and_not_opened(
     bundle: Path, da_b: DeepAccident, tmp_path: Path
 ) -> None:
     os.mkfifo(bundle / "a pipe")
@@ -347,13 +347,14 @@ def test_what_does_not_belong_is_named_and_not_opened(
     (bundle / "scenarios.json").symlink_to(tmp_path / "scenarios.json")
     with (bundle / "counts.json").open("r+b") as file:
         file.truncate(5 << 30)
+
     verification = verify(bundle, da_b)
-    named = {each.where: each.found for each in verification.differences}
-    assert named["files.json: a pipe"] == "not a regular file (a named pipe)"
-    assert named["files.json: loop"] == named["files.json: a link"] == "a link"
-    assert named["files.json: extra\x1b.bin"] == "a file that is not listed"
-    assert "is a link, which is not followed" in named["scenarios.json"]
-    assert "has 5,368,709,120 bytes" in named["counts.json"]
+    findings = {difference.where: difference.found for difference in verification.differences}
+    assert findings["files.json: a pipe"] == "not a regular file (a named pipe)"
+    assert findings["files.json: loop"] == findings["files.json: a link"] == "a link"
+    assert findings["files.json: extra\x1b.bin"] == "a file that is not listed"
+    assert "is a link, which is not followed" in findings["scenarios.json"]
+    assert "has 5,368,709,120 bytes" in findings["counts.json"]
     assert "\x1b" not in verification.to_text()
 
 
@@ -361,11 +362,11 @@ def test_what_does_not_belong_is_named_and_not_opened(
     "name",
     ["metrics_summary.json", "files.json", "scenarios.json", "counts.json", "samples.parquet"],
 )
-def test_a_pipe_in_the_place_of_a_file(bundle: Path, da_b: DeepAccident, name: str) -> None:
+def test_a_pipe_instead_of_a_file(bundle: Path, da_b: DeepAccident, name: str) -> None:
     (bundle / name).unlink()
     os.mkfifo(bundle / name)
     if name == "metrics_summary.json":
-        assert_refused(
+        assert_raises(
             (
                 lambda: verify(bundle, da_b),
                 ResultsError,
@@ -373,30 +374,33 @@ def test_a_pipe_in_the_place_of_a_file(bundle: Path, da_b: DeepAccident, name: s
             ),
         )
     else:
-        assert name in found(verify(bundle, da_b))
+        assert name in places_of(verify(bundle, da_b))
 
 
 def test_paths_that_lead_out_are_opened_only_if_they_are_given(
     bundle: Path, da_b: DeepAccident, results: Results, tmp_path: Path
 ) -> None:
     command = f"check bundle {bundle} --dataroot {da_b.dataroot} --results {results.path}"
-    assert_refused(
+    assert_raises(
         (
             lambda: verify(bundle, da_b, results=None),
             ResultsError,
             f"are opened only if you give them: deepaccident {command}$",
         ),
     )
-    splits = tmp_path / "mine.txt"
-    os.mkfifo(splits)
-    changed(bundle / "metrics_summary.json", lambda summary: summary.update(split=str(splits)))
-    assert_refused(
-        (lambda: verify(bundle, da_b), ResultsError, f"{command} --split {splits}$"),
+
+    split = tmp_path / "mine.txt"
+    os.mkfifo(split)
+    change_json(bundle / "metrics_summary.json", lambda summary: summary.update(split=str(split)))
+    assert_raises(
+        (lambda: verify(bundle, da_b), ResultsError, f"{command} --split {split}$"),
     )
-    splits.unlink()
+
+    split.unlink()
     scenarios = sorted({token.rsplit("/", 2)[0] for token in results.tokens})
-    splits.write_text("".join(f"{token.replace('/', ' ')}\n" for token in scenarios))
-    assert found(verify(bundle, da_b, split=splits)) == [SUMMARY_CHANGED]
+    lines = [scenario.replace("/", " ") for scenario in scenarios]
+    split.write_text("\n".join([*lines, ""]))
+    assert places_of(verify(bundle, da_b, split=split)) == [CHANGED_SUMMARY]
 
 
 @pytest.mark.parametrize("kind", ["the folder", "the file", "a loop", "a pipe"])
@@ -404,17 +408,22 @@ def test_a_copy_of_the_results_that_leads_out_is_refused(
     run: EvaluationRun, da_b: DeepAccident, tmp_path: Path, kind: str
 ) -> None:
     bundle = save_run(run, tmp_path / "bundle", include_results=True)
-    copy = bundle / "results" / "accidents.json"
+    folder = bundle / "results"
+    copy = folder / "accidents.json"
     if kind == "the folder":
-        (bundle / "results").rename(tmp_path / "moved")
-        (bundle / "results").symlink_to(tmp_path / "moved")
-    else:
+        folder.rename(tmp_path / "moved")
+        folder.symlink_to(tmp_path / "moved")
+    elif kind == "the file":
         copy.rename(tmp_path / "elsewhere.json")
-        copy.symlink_to({"the file": tmp_path / "elsewhere.json"}.get(kind, copy))
-    if kind == "a pipe":
+        copy.symlink_to(tmp_path / "elsewhere.json")
+    elif kind == "a loop":
+        copy.unlink()
+        copy.symlink_to(copy)
+    else:
         copy.unlink()
         os.mkfifo(copy)
-    assert_refused(
+
+    assert_raises(
         (
             lambda: verify(bundle, da_b),
             ResultsError,
@@ -438,28 +447,27 @@ def test_a_copy_of_the_results_that_leads_out_is_refused(
 def test_counts_of_resamples_are_bounded(
     bundle: Path, da_b: DeepAccident, resampling: dict[str, Any]
 ) -> None:
-    changed(
+    change_json(
         bundle / "metrics_summary.json",
         lambda summary: summary["breakdowns"]["all"].update(resampling=resampling),
     )
-    assert "all numbers" in found(verify(bundle, da_b))
+    assert "all numbers" in places_of(verify(bundle, da_b))
 
 
-def test_no_results(bundle: Path, da_b: DeepAccident, results: Results) -> None:
+def test_missing_results_are_refused(bundle: Path, da_b: DeepAccident, results: Results) -> None:
     results.path.unlink()
-    assert_refused(
+    assert_raises(
         (lambda: verify(bundle, da_b), ResultsError, ("accidents.json", "no such file or folder"))
     )
 
 
-def test_hashes_of_a_stranger_are_text(bundle: Path, da_b: DeepAccident) -> None:
-    token = min(json.loads((bundle / "scenarios.json").read_text())["scenarios"])
+def test_foreign_hashes_are_shown_as_plain_text(bundle: Path, da_b: DeepAccident) -> None:
+    path = bundle / "scenarios.json"
+    scenario = min(json.loads(path.read_text())["scenarios"])
     for points in ([10**400] * 8, [1], [None] * 8):
-        changed(
-            bundle / "scenarios.json",
-            lambda stored, points=points: stored["scenarios"][token].update(
-                label="\u202e", points=points
-            ),
+        hashes = {"label": "\u202e", "points": points}
+        change_json(
+            path, lambda content, hashes=hashes: content["scenarios"][scenario].update(hashes)
         )
         text = verify(bundle, da_b).to_text()
         assert "scenarios.json" in text

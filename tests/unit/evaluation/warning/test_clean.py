@@ -1,4 +1,4 @@
-"""`CleanScores`: figures at any threshold and with any weights, beside counting frame by frame."""
+"""`CleanScores`: figures at any threshold and weights, compared with counting frame by frame."""
 
 import itertools
 import math
@@ -11,196 +11,213 @@ import pytest
 from deepaccident_devkit.evaluation.warning import CleanScores, ScoreSeries
 from deepaccident_devkit.evaluation.warning.clean import EARLY, SAME_RECALL, WINDOW
 
+# Of one recording: scores by column, label, `toa`, its highest score and that of any alarm.
 Drive = dict[str, Any]
-"""Of one recording: scores by column, label, `toa`, its highest score and that of any alarm."""
 
 
-def drives_of(
-    series: ScoreSeries, any_alarm: Sequence[float], weight: Sequence[int]
+def make_drives(
+    series: ScoreSeries, any_alarm: Sequence[float], weights: Sequence[int]
 ) -> list[Drive]:
-    """Each recording as often as its weight says."""
-    return [
-        {
-            "scores": (
-                there := {at: s for at, s in enumerate(row) if not math.isnan(s) and at < toa}
-            ),
-            "positive": positive,
-            "toa": toa,
-            "highest": max(there.values(), default=-math.inf),
-            "any": alarm,
+    """Make the drives of a series, each repeated by its weight."""
+    drives = []
+    for row, weight in enumerate(weights):
+        toa = series.toa[row]
+        scores = {
+            column: score
+            for column, score in enumerate(series.scores[row].tolist())
+            if not math.isnan(score) and column < toa
         }
-        for row, positive, toa, alarm, often in zip(
-            series.scores.tolist(),
-            series.positive.tolist(),
-            series.toa.tolist(),
-            any_alarm,
-            weight,
-            strict=True,
-        )
-        for _ in range(often)
-    ]
+        drive = {
+            "scores": scores,
+            "positive": bool(series.positive[row]),
+            "toa": float(toa),
+            "highest": max(scores.values(), default=-math.inf),
+            "any": any_alarm[row],
+        }
+        drives += [drive] * weight
+    return drives
+
+
+def share(part: float, total: float) -> float:
+    return part / total if total else math.nan
 
 
 def mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else math.nan
+    return share(sum(values), len(values))
 
 
-def area(drives: Sequence[tuple[bool, float]]) -> float:
-    """The chance that an accident's score is above another's, ties half."""
-    accidents, others = (
-        [score for positive, score in drives if positive is kind] for kind in (True, False)
-    )
-    return mean(
-        [(one > other) + (one == other) / 2 for one, other in itertools.product(accidents, others)]
-    )
-
-
-def lead(drive: Drive, threshold: float, fps: float) -> float | None:
-    first = next((at for at, score in drive["scores"].items() if score >= threshold), None)
-    return None if first is None else (drive["toa"] - first) / fps
-
-
-def plain_point(drives: Sequence[Drive], threshold: float, fps: float) -> dict[str, float]:
-    """The operating point, recording by recording."""
-    leads = [(each, lead(each, threshold, fps)) for each in drives]
-    seconds = [found for each, found in leads if each["positive"] and found is not None]
-    accidents = [each for each in drives if each["positive"]]
-    false = sum(found is not None for each, found in leads if not each["positive"])
-    misled = sum(
-        found is None and each["any"] >= threshold for each, found in leads if each["positive"]
-    )
-    calm = [
-        (score >= threshold, each["scores"].get(at - 1, -math.inf) >= threshold)
-        for each in drives
-        if not each["positive"]
-        for at, score in each["scores"].items()
+def area(scores: Sequence[tuple[bool, float]]) -> float:
+    """Return the chance that an accident's score is above another's; ties count half."""
+    accidents = [score for is_positive, score in scores if is_positive]
+    without_accident = [score for is_positive, score in scores if not is_positive]
+    wins = [
+        (accident > other) + (accident == other) / 2
+        for accident, other in itertools.product(accidents, without_accident)
     ]
-    alarmed, begun = sum(now for now, _ in calm), sum(now and not before for now, before in calm)
+    return mean(wins)
+
+
+def lead_frames(drive: Drive, threshold: float) -> float | None:
+    """Return the frames from the first alarm to the impact; None without an alarm."""
+    for column, score in drive["scores"].items():
+        if score >= threshold:
+            return drive["toa"] - column
+    return None
+
+
+def evaluate_at(drives: Sequence[Drive], threshold: float, fps: float) -> dict[str, float]:
+    """Evaluate an operating point, recording by recording."""
+    accidents = [drive for drive in drives if drive["positive"]]
+    without_accident = [drive for drive in drives if not drive["positive"]]
+    leads = [lead_frames(drive, threshold) for drive in accidents]
+    seconds = [frames / fps for frames in leads if frames is not None]
+    misled = sum(
+        frames is None and drive["any"] >= threshold
+        for drive, frames in zip(accidents, leads, strict=True)
+    )
+    false = sum(lead_frames(drive, threshold) is not None for drive in without_accident)
     warned = len(seconds) + false + misled
+
+    is_alarm, is_begin = [], []
+    for drive in without_accident:
+        for column, score in drive["scores"].items():
+            before = drive["scores"].get(column - 1, -math.inf)
+            is_alarm.append(score >= threshold)
+            is_begin.append(score >= threshold and not before >= threshold)
+    early = [
+        score >= threshold
+        for drive in accidents
+        for column, score in drive["scores"].items()
+        if (drive["toa"] - column) / fps > 5 + 1e-9
+    ]
     return {
         "threshold": threshold,
-        "recall": len(seconds) / len(accidents) if accidents else math.nan,
-        "precision": len(seconds) / warned if warned else math.nan,
+        "recall": share(len(seconds), len(accidents)),
+        "precision": share(len(seconds), warned),
         "tta_hit": mean(seconds),
-        "tta0": sum(seconds) / len(accidents) if accidents else math.nan,
-        "time_in_alarm": alarmed / len(calm) if calm else math.nan,
-        "alarm_seconds_per_minute": 60 * alarmed / len(calm) if calm else math.nan,
-        "episodes_per_minute": begun / (len(calm) / fps / 60) if calm else math.nan,
+        "tta0": share(sum(seconds), len(accidents)),
+        "time_in_alarm": mean(is_alarm),
+        "alarm_seconds_per_minute": 60 * mean(is_alarm),
+        "episodes_per_minute": 60 * fps * mean(is_begin),
         "false_recordings": false,
-        "early_share": mean(
-            [
-                score >= threshold
-                for each in accidents
-                for at, score in each["scores"].items()
-                if (each["toa"] - at) / fps > 5 + 1e-9
-            ]
-        ),
+        "early_share": mean(early),
     }
 
 
-def plain_figures(drives: Sequence[Drive], fps: float) -> dict[str, float]:
-    """The figures without a threshold, level by level and moment by moment."""
-    moments = []
-    for moment in range(1, round(3 * fps) + 1):
-        scores = [
-            (each, each["scores"].get(math.ceil(each["toa"] - moment - 1e-6))) for each in drives
-        ]
-        moments.append(
-            area([(each["positive"], score) for each, score in scores if score is not None])
+def evaluate_plainly(drives: Sequence[Drive], fps: float) -> dict[str, float]:
+    """Compute the figures without a threshold, level by level and moment by moment."""
+    areas = []
+    for frames in range(1, round(3 * fps) + 1):
+        scores = []
+        for drive in drives:
+            column = math.ceil(drive["toa"] - frames - 1e-6)
+            if column in drive["scores"]:
+                scores.append((drive["positive"], drive["scores"][column]))
+        areas.append(area(scores))
+
+    right_drives = [drive | {"any": -math.inf} for drive in drives]
+    levels = {drive["highest"] for drive in drives if drive["highest"] > -math.inf}
+    points = [evaluate_at(right_drives, level, fps) for level in sorted(levels, reverse=True)]
+    accidents = sum(drive["positive"] for drive in drives)
+    average_precision = mean_time = 0.0 if accidents else math.nan
+    previous_hits = 0
+    for point in points:
+        point["hits"] = round(point["recall"] * accidents) if accidents else 0
+        point["f1"] = 2 * point["hits"] / (point["hits"] + point["false_recordings"] + accidents)
+        if point["hits"] > previous_hits:
+            gain = (point["hits"] - previous_hits) / accidents
+            average_precision += gain * point["precision"]
+            mean_time += gain * point["tta_hit"]
+        previous_hits = point["hits"]
+
+    def threshold_of_highest(name: str, default: float, candidates: Any = points) -> float:
+        """Return the highest threshold with the highest value; `default` if all are 0."""
+        best = max(
+            candidates,
+            key=lambda point: point[name],
+            default={name: 0},
         )
-    levels = sorted(
-        {each["highest"] for each in drives if each["highest"] > -math.inf}, reverse=True
-    )
-    points = [
-        plain_point([each | {"any": -math.inf} for each in drives], level, fps) for level in levels
-    ]
-    accidents = sum(each["positive"] for each in drives)
-    found = [round(each["recall"] * accidents) if accidents else 0 for each in points]
-    f1 = [
-        2 * hits / (hits + each["false_recordings"] + accidents)
-        for hits, each in zip(found, points, strict=True)
-    ]
-    gains = np.diff(found, prepend=0) / accidents if accidents else [0.0] * len(found)
-    good = [at for at, each in enumerate(points) if each["precision"] >= 0.8 - 1e-9]
+        return best["threshold"] if best[name] else default
+
+    recalled = [point["threshold"] for point in points if point["recall"] >= 0.8 - 1e-9]
+    precise = [point for point in points if point["precision"] >= 0.8 - 1e-9]
     quiet = [
-        level
-        for level, each in zip(levels, points, strict=True)
-        if each["alarm_seconds_per_minute"] <= 9 + 1e-9
+        point["threshold"] for point in points if point["alarm_seconds_per_minute"] <= 9 + 1e-9
     ]
     return {
-        "area_at_moments": mean([each for each in moments if not math.isnan(each)]),
-        "area_under_curve": area([(each["positive"], each["highest"]) for each in drives]),
-        "average_precision": sum(
-            g * each["precision"] for g, each in zip(gains, points, strict=True) if g
-        )
-        if accidents
-        else math.nan,
-        "mean_time": sum(g * each["tta_hit"] for g, each in zip(gains, points, strict=True) if g)
-        if accidents
-        else math.nan,
-        "threshold_of_recall": next(
-            (each["threshold"] for each in points if each["recall"] >= 0.8 - 1e-9), math.nan
-        ),
-        "threshold_of_highest_recall": levels[int(np.argmax(found))] if any(found) else math.inf,
-        "threshold_of_precision": levels[max(good, key=lambda at: (found[at], -at))]
-        if good
-        else math.nan,
-        "threshold_of_best_f1": levels[int(np.argmax(f1))] if any(found) else math.nan,
+        "area_at_moments": mean([value for value in areas if not math.isnan(value)]),
+        "area_under_curve": area([(drive["positive"], drive["highest"]) for drive in drives]),
+        "average_precision": average_precision,
+        "mean_time": mean_time,
+        "threshold_of_recall": max(recalled, default=math.nan),
+        "threshold_of_highest_recall": threshold_of_highest("hits", math.inf),
+        "threshold_of_precision": threshold_of_highest("hits", math.nan, precise),
+        "threshold_of_best_f1": threshold_of_highest("f1", math.nan),
         "threshold_of_alarm_time": min(quiet, default=math.nan),
     }
 
 
 @pytest.mark.parametrize("seed", range(24))
 def test_figures_are_those_of_counting_frame_by_frame(seed: int) -> None:
-    source = np.random.default_rng(seed)
+    random = np.random.default_rng(seed)
     count, columns, fps = 8, 14, (1.0, 2.0)[seed % 2]
-    scores = source.integers(0, 12, (count, columns)) / 11
-    scores[source.random(scores.shape) < 0.2] = math.nan
-    scores[source.random(scores.shape) < 0.5] = -math.inf
-    positive = source.random(count) < (0.5, 0.5, 0.0, 1.0)[seed // 2 % 4]
+    scores = random.integers(0, 12, (count, columns)) / 11
+    scores[random.random(scores.shape) < 0.2] = math.nan
+    scores[random.random(scores.shape) < 0.5] = -math.inf
+    positive = random.random(count) < (0.5, 0.5, 0.0, 1.0)[seed // 2 % 4]
     series = ScoreSeries(
-        scores=scores, positive=positive, toa=source.integers(6, 32, count) / 2, fps=fps
+        scores=scores,
+        positive=positive,
+        toa=random.integers(6, 32, count) / 2,
+        fps=fps,
     )
-    any_alarm = np.where(positive & (source.random(count) < 0.3), 2.0, series.highest())
-    weight = source.integers(0, 3, count)
-    clean, drives = (
-        CleanScores(series, any_alarm),
-        drives_of(series, any_alarm.tolist(), weight.tolist()),
+    any_alarm = np.where(
+        positive & (random.random(count) < 0.3),
+        2.0,
+        series.highest(),
     )
-    given = weight.astype(np.float64)
-    expected = plain_figures(drives, fps)
-    found = {
-        name: getattr(clean, name)(given, *((9.0,) if name == "threshold_of_alarm_time" else ()))
-        for name in expected
-    }
-    assert found == pytest.approx(expected, nan_ok=True)
+    int_weights = random.integers(0, 3, count)
+    weights = int_weights.astype(np.float64)
+    clean = CleanScores(series, any_alarm)
+    drives = make_drives(series, any_alarm.tolist(), int_weights.tolist())
+
+    for name, expected in evaluate_plainly(drives, fps).items():
+        arguments = (9.0,) if name == "threshold_of_alarm_time" else ()
+        figure = getattr(clean, name)(weights, *arguments)
+        assert figure == pytest.approx(expected, nan_ok=True), name
     for threshold in (0.0, 4 / 11, 0.5, 1.0, 1.5):
-        made = clean.at(threshold, given)
-        point = plain_point(drives, threshold, fps)
-        assert {name: getattr(made, name) for name in point} == pytest.approx(point, nan_ok=True)
-        leads = [lead(each, threshold, fps) for each in drives if each["positive"]]
+        point = clean.at(threshold, weights)
+        expected_point = evaluate_at(drives, threshold, fps)
+        values = {name: getattr(point, name) for name in expected_point}
+        assert values == pytest.approx(expected_point, nan_ok=True)
+        leads = [lead_frames(drive, threshold) for drive in drives if drive["positive"]]
         for latency in (0.0, 2.0):
-            left = [0.0 if each is None else max(each - latency, 0.0) for each in leads]
-            assert clean.tta0_after(threshold, given, latency) == pytest.approx(
-                mean(left), nan_ok=True
-            )
+            seconds = [max((frames or 0.0) / fps - latency, 0.0) for frames in leads]
+            tta0 = clean.tta0_after(threshold, weights, latency)
+            assert tta0 == pytest.approx(mean(seconds), nan_ok=True)
 
 
-def test_the_windows_are_of_seconds() -> None:
-    """Of a frame a second: 3 s and more than 5 s before the impact at 10 s; one second a minute in
-    alarm is allowed.
+def test_windows_are_in_seconds() -> None:
+    """There is one frame a second: 3 s and more than 5 s before the impact at 10 s count, and one
+    second a minute in alarm is allowed.
     """
     assert (WINDOW, EARLY, SAME_RECALL) == (3.0, 5.0, 0.8)
     early = ScoreSeries(
-        scores=np.eye(10)[[4, 5]], positive=np.ones(2, dtype=bool), toa=np.full(2, 10.0), fps=1.0
+        scores=np.eye(10)[[4, 5]],
+        positive=np.ones(2, dtype=bool),
+        toa=np.full(2, 10.0),
+        fps=1.0,
     )
-    assert (
-        CleanScores(early).at(1.0, np.ones(2)).early_share == 0.1
-    )  # of 2 · 5 frames, that at 6 s and not that at 5 s
-    quiet = np.zeros((2, 60))
-    quiet[0, :2], quiet[0, 0] = 0.5, 0.9
+    # of 2 · 5 frames, the one at 6 s and not the one at 5 s
+    assert CleanScores(early).at(1.0, np.ones(2)).early_share == 0.1
+
+    scores = np.zeros((2, 60))
+    scores[0, :2] = [0.9, 0.5]
     calm = ScoreSeries(
-        scores=quiet, positive=np.zeros(2, dtype=bool), toa=np.full(2, 60.0), fps=1.0
+        scores=scores,
+        positive=np.zeros(2, dtype=bool),
+        toa=np.full(2, 60.0),
+        fps=1.0,
     )
     assert math.isnan(CleanScores(calm).threshold_of_alarm_time(np.ones(2), 0.4))
     assert CleanScores(calm).threshold_of_alarm_time(np.ones(2)) == 0.9
@@ -208,13 +225,16 @@ def test_the_windows_are_of_seconds() -> None:
 
 
 def test_without_recordings_or_a_threshold_there_is_nothing() -> None:
-    empty = CleanScores(
-        ScoreSeries(scores=np.zeros((0, 3)), positive=np.zeros(0, bool), toa=np.zeros(0), fps=2.0)
+    empty = ScoreSeries(
+        scores=np.zeros((0, 3)),
+        positive=np.zeros(0, bool),
+        toa=np.zeros(0),
+        fps=2.0,
     )
-    none = np.zeros(0)
-    assert [
-        math.isnan(each) for each in (empty.average_precision(none), empty.at(0.5, none).recall)
-    ] == [True] * 2
-    point = empty.at(math.nan, none)
-    assert all(math.isnan(getattr(point, name)) for name in point.__slots__)
-    assert math.isnan(empty.tta0_after(math.nan, none, 0.0))
+    clean, weights = CleanScores(empty), np.zeros(0)
+    assert math.isnan(clean.average_precision(weights))
+    assert math.isnan(clean.at(0.5, weights).recall)
+    point = clean.at(math.nan, weights)
+    for name in point.__slots__:
+        assert math.isnan(getattr(point, name))
+    assert math.isnan(clean.tta0_after(math.nan, weights, 0.0))

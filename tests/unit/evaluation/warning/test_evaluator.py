@@ -1,8 +1,8 @@
-"""What `WarningEvaluator` takes, refuses and leaves to its protocols."""
+"""Inputs that `WarningEvaluator` takes and refuses, and what it leaves to its protocols."""
 
 import pytest
-from accident_scenes import scene, standing
-from refusals import assert_refused
+from support.accident_scenes import motion_labels_of, parked_path
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.accident import AccidentContext
@@ -12,24 +12,23 @@ from deepaccident_devkit.evaluation.warning import WARNING_PROTOCOLS, WarningEva
 @pytest.mark.parametrize("protocol", WARNING_PROTOCOLS)
 def test_without_samples_there_is_nothing(protocol: str) -> None:
     evaluator = WarningEvaluator(protocol)
-    assert (evaluator.compute().samples, evaluator.has_intervals) == (0, protocol == "clean")
+    assert evaluator.compute().samples == 0
+    assert evaluator.has_intervals == (protocol == "clean")
 
 
 def test_the_protocols_and_their_choices() -> None:
-    choices = {"clean": {"scores_of": "pair", "threshold": None}, "field": {}}
-    assert {name: WarningEvaluator(name).settings for name in WARNING_PROTOCOLS} == choices
+    settings = {name: WarningEvaluator(name).settings for name in WARNING_PROTOCOLS}
+    assert settings == {"clean": {"scores_of": "pair", "threshold": None}, "field": {}}
     assert WarningEvaluator().protocol == WARNING_PROTOCOLS["clean"]
-    facts = (
-        WarningEvaluator.needs_whole_recordings,
-        WarningEvaluator.needs_meta,
-        WarningEvaluator.result_kinds,
-    )
-    assert facts == (True, True, ("motion", "accident"))
+    assert WarningEvaluator.needs_whole_recordings is True
+    assert WarningEvaluator.needs_meta is True
+    assert WarningEvaluator.result_kinds == ("motion", "accident")
 
 
 def test_what_cannot_be_evaluated() -> None:
-    update, label = WarningEvaluator().update, scene({1: standing(20, 10)})
-    assert_refused(
+    update = WarningEvaluator().update
+    label = motion_labels_of({1: parked_path(20, 10)})
+    assert_raises(
         (lambda: WarningEvaluator("boxes"), ChoiceError, ("protocol", "clean, field", "boxes")),
         (
             lambda: update("a/b/001", [], AccidentContext()),

@@ -1,4 +1,4 @@
-"""Detections of a nuScenes export: read back under our tokens, classes and rules."""
+"""Detections on a nuScenes export are read back with our tokens, classes and rules."""
 
 import json
 from pathlib import Path
@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
-from refusals import assert_refused
-from wording import lacking
+from support.command_calls import invoke_command
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation import DetectedBoxes
 from deepaccident_devkit.evaluation.detection import detection_truth
@@ -20,7 +17,8 @@ from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.export.nuscenes.detections import OTHER_CLASSES, results_from_nuscenes
 from deepaccident_devkit.export.nuscenes.scenes import token
 
-OURS = {
+REMEDY = "nuScenes export"
+OUR_CLASSES = {
     "car": "car",
     "truck": "truck",
     "bicycle": "cyclist",
@@ -29,8 +27,8 @@ OURS = {
 }
 
 
-def entry(name: str = "car", **changes: object) -> dict[str, Any]:
-    """A box as the nuScenes devkit writes it."""
+def make_entry(name: str = "car", **changes: object) -> dict[str, Any]:
+    """Make a box as the nuScenes devkit writes it."""
     return {
         "translation": [105.0, -33.0, 1.0],
         "size": [2.0, 4.5, 1.5],
@@ -45,20 +43,14 @@ def entry(name: str = "car", **changes: object) -> dict[str, Any]:
     }
 
 
-def written(path: Path, boxes: dict[str, list[dict[str, Any]]], **more: object) -> Path:
-    """A detection file of our samples → boxes, as a detector on the export writes it."""
-    results = {
-        token("sample", sample): [
-            {"sample_token": token("sample", sample), **each} for each in given
-        ]
-        for sample, given in boxes.items()
-    }
-    path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": results, **more}))
+def write_detections(path: Path, entries_by_sample: dict[str, list[dict[str, Any]]]) -> Path:
+    """Write a detection file as a detector on the export does, with boxes by our samples."""
+    results = {}
+    for sample, entries in entries_by_sample.items():
+        sample_token = token("sample", sample)
+        results[sample_token] = [{"sample_token": sample_token, **entry} for entry in entries]
+    path.write_text(json.dumps({"meta": {"use_lidar": True}, "results": results}))
     return path
-
-
-def verb(*words: object) -> Result:
-    return CliRunner().invoke(deepaccident, list(map(str, words)), catch_exceptions=False)
 
 
 @pytest.fixture
@@ -70,51 +62,42 @@ def sample(da_motion: DeepAccident) -> str:
 def test_perfect_detections_of_an_export_evaluate_as_perfect(
     da_motion: DeepAccident, tmp_path: Path
 ) -> None:
-    """Except vans, which a detector of nuScenes' classes cannot name."""
-    theirs = {ours: name for name, ours in OURS.items()}
+    """Vans are the exception, because a detector of nuScenes' classes cannot name them."""
+    nuscenes_classes = {ours: name for name, ours in OUR_CLASSES.items()}
     truth = {}
     for sample in da_motion.samples("train", "all"):
-        there = detection_truth(da_motion, sample, "paper").transform(
-            da_motion.world_from(sample, "lidar"), "world"
-        )
-        entries = detection_entries(
-            token("sample", sample), DetectedBoxes(boxes=there, scores=np.ones(len(there)))
-        )
-        named = [(theirs.get(each["detection_name"]), each) for each in entries]
-        truth[sample] = [
-            {**entry(), **each, "detection_name": name} for name, each in named if name
-        ]
-    count = sum(map(len, truth.values()))
-    truth[sample].append(entry("barrier"))
-    file, out = written(tmp_path / "nuscenes.json", truth), tmp_path / "ours.json"
-    done = verb("results", file, da_motion.dataroot, "--out", out)
-    assert not lacking(
-        done.output,
-        f"{count:,} boxes of {len(truth)} samples",
-        "left out: 1 boxes of the class barrier",
-    )
+        world_from_lidar = da_motion.world_from(sample, "lidar")
+        boxes = detection_truth(da_motion, sample, "paper").transform(world_from_lidar, "world")
+        detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
+        truth[sample] = []
+        for entry in detection_entries(token("sample", sample), detected):
+            name = nuscenes_classes.get(entry["detection_name"])
+            if name:
+                truth[sample].append({**make_entry(), **entry, "detection_name": name})
+    num_boxes = sum(map(len, truth.values()))
+    truth[sample].append(make_entry("barrier"))
+
+    path = write_detections(tmp_path / "nuscenes.json", truth)
+    out = tmp_path / "ours.json"
+    result = invoke_command("results", path, da_motion.dataroot, "--out", out)
+
+    assert f"({len(truth)} samples, {num_boxes:,} boxes)" in result.output
+    assert "excluded: 1 box of class barrier" in result.output
     assert read_results(out).meta == {"use_lidar": True}
-    listed = (
-        "--split",
-        "train",
-        "--samples",
-        "all",
-        "--protocol",
-        "paper",
-        "--resamples",
-        "0",
-        "--json",
+
+    result = invoke_command(
+        *("evaluate", "detection", da_motion.dataroot),
+        *("--results", out, "--split", "train", "--samples", "all"),
+        *("--protocol", "paper", "--resamples", 0, "--json"),
     )
-    summary = json.loads(
-        verb("evaluate", "detection", da_motion.dataroot, "--results", out, *listed).stdout
-    )
-    found = {
-        name: each["mean_AP"]
-        for name, each in summary["metrics"]["classes"].items()
-        if each["truths"] != [0]
-    }
-    assert found == {
-        **dict.fromkeys(("car", "truck", "motorcycle", "pedestrian"), 100.0),
+    scores = json.loads(result.stdout)["metrics"]["classes"]
+    precisions = {name: row["mean_AP"] for name, row in scores.items() if row["truths"] != [0]}
+
+    assert precisions == {
+        "car": 100.0,
+        "truck": 100.0,
+        "motorcycle": 100.0,
+        "pedestrian": 100.0,
         "van": 0.0,
     }
 
@@ -123,43 +106,38 @@ def test_fields_mean_what_they_mean_in_nuscenes(
     da_motion: DeepAccident, tmp_path: Path, sample: str
 ) -> None:
     other = sample.replace("ego_vehicle", "infrastructure")
-    names = [*OURS, "van", "cyclist", *OTHER_CLASSES, "bus"]
-    given = [entry(name, detection_score=number / 16) for number, name in enumerate(names)]
-    given[1]["velocity"] = [float("nan"), float("nan")]
-    given[1]["ego_translation"] = [float("nan")] * 3
-    found = results_from_nuscenes(
-        da_motion, written(tmp_path / "nuscenes.json", {other: given, sample: []})
-    )
-    assert list(found.boxes) == [other, sample]
-    boxes, scores = found.boxes[other].boxes, found.boxes[other].scores
-    assert (boxes.frame, boxes.category_names) == ("world", [*OURS.values(), "van", "cyclist"])
-    assert scores.tolist() == [number / 16 for number in range(7)]
-    assert (boxes.center[0].tolist(), boxes.size[0].tolist()) == (
-        [105.0, -33.0, 1.0],
-        [4.5, 2.0, 1.5],
-    )
-    assert (boxes.yaw[0], boxes.velocity[0].tolist()) == (
-        pytest.approx(2 * np.arctan2(0.8, 0.6)),
-        [3.0, -4.0, 0.0],
-    )
+    names = [*OUR_CLASSES, "van", "cyclist", *OTHER_CLASSES, "bus"]
+    entries = [make_entry(name, detection_score=index / 16) for index, name in enumerate(names)]
+    entries[1]["velocity"] = [float("nan"), float("nan")]
+    entries[1]["ego_translation"] = [float("nan")] * 3
+    path = write_detections(tmp_path / "nuscenes.json", {other: entries, sample: []})
+    results = results_from_nuscenes(da_motion, path)
+
+    assert list(results.boxes) == [other, sample]
+
+    boxes = results.boxes[other].boxes
+    assert boxes.frame == "world"
+    assert boxes.category_names == [*OUR_CLASSES.values(), "van", "cyclist"]
+    assert results.boxes[other].scores.tolist() == [index / 16 for index in range(7)]
+    assert boxes.center[0].tolist() == [105.0, -33.0, 1.0]
+    assert boxes.size[0].tolist() == [4.5, 2.0, 1.5]
+    assert boxes.yaw[0] == pytest.approx(2 * np.arctan2(0.8, 0.6))
+    assert boxes.velocity[0].tolist() == [3.0, -4.0, 0.0]
     assert np.isnan(boxes.velocity[1]).any()
-    assert found.left_out == {
+    assert results.left_out == {
         "barrier": 1,
         "bus": 2,
         "construction_vehicle": 1,
         "traffic_cone": 1,
         "trailer": 1,
     }
-    assert not len(found.boxes[sample])
-
-
-REMEDY = "nuScenes export"
+    assert not len(results.boxes[sample])
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
-        ("", "no JSON"),
+        ("", "not JSON"),
         ("[]", r"\[\]"),
         ('{"meta": {}}', "results: .*null"),
         ('{"meta": 3, "results": {}}', "meta: .*3"),
@@ -173,22 +151,17 @@ REMEDY = "nuScenes export"
         ('{"results": {"fd84": [3]}}', r"'fd84'.*\[0\]"),
     ],
 )
-def test_what_is_no_file_of_this_export(
-    da_motion: DeepAccident, tmp_path: Path, content: str, told: str
+def test_files_of_another_kind_are_refused(
+    da_motion: DeepAccident, tmp_path: Path, content: str, message: str
 ) -> None:
     path = tmp_path / "nuscenes.json"
     path.write_text(content)
-    assert_refused(
-        (
-            lambda: results_from_nuscenes(da_motion, path),
-            ResultsError,
-            f"nuscenes.json: .*{told}.*{REMEDY}",
-        )
-    )
+    with pytest.raises(ResultsError, match=f"nuscenes.json: .*{message}.*{REMEDY}"):
+        results_from_nuscenes(da_motion, path)
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"translation": [0.0, float("nan"), 0.0]}, "entry 2: translation: entry 1"),
         ({"rotation": [2.0, 0.0, 0.0, 0.0]}, r"\[2\].rotation"),
@@ -206,56 +179,30 @@ def test_what_is_no_file_of_this_export(
     ],
 )
 def test_the_first_wrong_box_is_named(
-    da_motion: DeepAccident, tmp_path: Path, sample: str, change: dict[str, object], told: str
+    da_motion: DeepAccident, tmp_path: Path, sample: str, change: dict[str, object], message: str
 ) -> None:
-    path = written(
-        tmp_path / "nuscenes.json",
-        {sample: [entry("bus"), entry(), entry(**{"name": "car", **change})]},
-    )
-    assert_refused(
-        (
-            lambda: results_from_nuscenes(da_motion, path),
-            ResultsError,
-            f"results of '{token('sample', sample)}': {told}.*{REMEDY}",
-        )
-    )
+    entries = [make_entry("bus"), make_entry(), make_entry(**change)]
+    path = write_detections(tmp_path / "nuscenes.json", {sample: entries})
+    prefix = f"results of '{token('sample', sample)}'"
+    with pytest.raises(ResultsError, match=f"{prefix}: {message}.*{REMEDY}"):
+        results_from_nuscenes(da_motion, path)
 
 
 def test_only_keyframes_are_samples_of_the_export(
     da_motion: DeepAccident, tmp_path: Path, sample: str
 ) -> None:
-    keys = da_motion.samples("train", "all")
-    assert (
-        list(
-            results_from_nuscenes(
-                da_motion, written(tmp_path / "a.json", {key: [] for key in keys})
-            ).boxes
-        )
-        == keys
-    )
+    keyframes = da_motion.samples("train", "all")
+    path = write_detections(tmp_path / "a.json", {keyframe: [] for keyframe in keyframes})
+    assert list(results_from_nuscenes(da_motion, path).boxes) == keyframes
+
     between = f"{sample[:-3]}{int(sample[-3:]) + 1:03d}"
-    assert_refused(
-        (
-            lambda: results_from_nuscenes(da_motion, written(tmp_path / "b.json", {between: []})),
-            ResultsError,
-            f"{token('sample', between)}: ",
-        )
-    )
+    path = write_detections(tmp_path / "b.json", {between: []})
+    with pytest.raises(ResultsError, match=f"{token('sample', between)}: "):
+        results_from_nuscenes(da_motion, path)
 
 
-def test_the_verb_refuses_before_it_indexes(tmp_path: Path) -> None:
-    (tmp_path / "there.json").write_text("{}")
-    words = ("results",)
-    assert_refused(
-        (
-            lambda: verb(
-                *words,
-                tmp_path / "there.json",
-                tmp_path / "no release",
-                "--out",
-                tmp_path / "there.json",
-            ),
-            ResultsError,
-            r"there\.json: is there already",
-        )
-    )
+def test_the_command_refuses_an_existing_file_before_it_indexes(tmp_path: Path) -> None:
+    existing = tmp_path / "there.json"
+    existing.write_text("{}")
+    with pytest.raises(ResultsError, match=r"there\.json: already exists"):
+        invoke_command("results", existing, tmp_path / "no release", "--out", existing)

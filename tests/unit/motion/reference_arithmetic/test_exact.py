@@ -1,7 +1,7 @@
-"""Every default and constant of exact, against what is written out here."""
+"""Compare every default and constant of reference_arithmetic with the values written out here."""
 
 import numpy as np
-from written_out import written_out
+from support.default_values import package_values
 
 from deepaccident_devkit.motion.reference_arithmetic.contours import first_contour
 from deepaccident_devkit.motion.reference_arithmetic.outlines import pair_gaps
@@ -26,11 +26,14 @@ WRITTEN = {
 
 
 def test_every_default_and_constant_written_out() -> None:
-    assert written_out("deepaccident_devkit.motion.reference_arithmetic") == WRITTEN
-    assert first_contour(np.zeros(1, dtype=int), np.zeros(1, dtype=int)) == [(0, 0)]
-    assert len(pair_gaps(np.zeros((3, 3), dtype=np.int32), np.zeros(0, dtype=np.int64))[0]) == 0
-    assert (
-        len(filled_cells(np.zeros((0, 4, 2)), (3, 3))[0])
-        == len(pose_matrices(np.zeros((0, 6))))
-        == 0
-    )
+    assert package_values("deepaccident_devkit.motion.reference_arithmetic") == WRITTEN
+
+    cell = np.zeros(1, dtype=int)
+    assert first_contour(cell, cell) == [(0, 0)]
+
+    pairs, _ = pair_gaps(np.zeros((3, 3), dtype=np.int32), np.zeros(0, dtype=np.int64))
+    assert len(pairs) == 0
+
+    cells, _ = filled_cells(np.zeros((0, 4, 2)), (3, 3))
+    assert len(cells) == 0
+    assert len(pose_matrices(np.zeros((0, 6)))) == 0

@@ -1,5 +1,5 @@
-"""Scores that are a clip's length, a town or a clock are told; random ones, the truth and good
-detectors are not.
+"""Scores that only reproduce a clip's length, a town or a clock are reported; random ones, the
+truth and good detectors are not.
 """
 
 import json
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny import META, write_tiny_release
+from support.tiny_release import META_TEXT, write_tiny_release
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ResultsError, TokenError
@@ -21,20 +21,25 @@ from deepaccident_devkit.selection.splits import save_selection
 
 pytestmark = pytest.mark.slow
 
-PAIRS = 12
-SILENT = re.sub("^.*", "ClearNoon -1 -1 -1 -1 -1 -1 -1 14", META)
-Made = Callable[[Mapping[str, Any], np.random.Generator], float]
+NUM_PAIRS = 12
+META_WITHOUT_COLLISION = re.sub("^.*", "ClearNoon -1 -1 -1 -1 -1 -1 -1 14", META_TEXT)
+ScoreFunction = Callable[[Mapping[str, Any], np.random.Generator], float]
 
 
 @pytest.fixture(scope="module")
 def release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """Twins of two agents in three towns; an accident has 2 to 8 frames, its twin 7 to 13. One has
-    no meta.
+    """Write twins of two agents in three towns, and one scenario without meta.
+
+    Accidents have 2 to 8 frames, their twins 7 to 13.
     """
-    root, rng = tmp_path_factory.mktemp("audit") / "release", np.random.default_rng(0)
-    for number in range(PAIRS):
-        for kind, low, meta in (("accident", 2, META), ("normal", 7, SILENT)):
-            frames = int(rng.integers(low, low + 7))
+    root = tmp_path_factory.mktemp("audit") / "release"
+    rng = np.random.default_rng(0)
+    for number in range(NUM_PAIRS):
+        for kind, min_frames, meta in (
+            ("accident", 2, META_TEXT),
+            ("normal", 7, META_WITHOUT_COLLISION),
+        ):
+            frames = int(rng.integers(min_frames, min_frames + 7))
             write_tiny_release(
                 root,
                 frames=frames,
@@ -47,181 +52,223 @@ def release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
     return DeepAccident(dataroot=root, verbose=False)
 
 
-def of_scenarios(release: DeepAccident, score: Made) -> dict[str, float]:
+def score_scenarios(release: DeepAccident, score: ScoreFunction) -> dict[str, float]:
     rng = np.random.default_rng(1)
     return {
-        each["token"]: float(score(dict(each), rng)) for each in release.scenario if each["weather"]
+        scenario["token"]: float(score(dict(scenario), rng))
+        for scenario in release.scenario
+        if scenario["weather"]
     }
 
 
-def of_samples(release: DeepAccident, score: Made) -> dict[str, float]:
+def score_samples(release: DeepAccident, score: ScoreFunction) -> dict[str, float]:
+    """Score each sample as a record that has its scenario's fields, too."""
     rng = np.random.default_rng(1)
-    scenarios = {each["token"]: each for each in release.scenario}
-    samples = [{**scenarios[each["scenario_token"]], **each} for each in release.sample]
-    return {each["token"]: float(score(each, rng)) for each in samples if each["weather"]}
+    scores = {}
+    for sample in release.sample:
+        record = {**release.get("scenario", sample["scenario_token"]), **sample}
+        if record["weather"]:
+            scores[record["token"]] = float(score(record, rng))
+    return scores
 
 
-def frame_of(sample: Mapping[str, Any]) -> int:
+def frame_number(sample: Mapping[str, Any]) -> int:
     return int(sample["token"][-3:])
 
 
-def row_of(report: AuditReport, name: str) -> list[float]:
-    return next([*row[1:]] for row in report.tables["scores"] if row[0] == name)  # type: ignore[misc]
+def score_randomly(_record: Mapping[str, Any], rng: np.random.Generator) -> float:
+    return rng.random()
 
 
-def kinds(report: AuditReport) -> list[str]:
+def score_truth(record: Mapping[str, Any], _rng: np.random.Generator) -> float:
+    return record["collision"] is not None
+
+
+def attribute_row(report: AuditReport, name: str) -> list[float]:
+    rows = {row[0]: [*row[1:]] for row in report.tables["scores"]}
+    return rows[name]  # type: ignore[return-value]
+
+
+def finding_kinds(report: AuditReport) -> list[str]:
     return [finding.kind for finding in report.findings]
 
 
-@pytest.mark.parametrize("of", [of_scenarios, of_samples])
+@pytest.mark.parametrize("score_all", [score_scenarios, score_samples])
 @pytest.mark.parametrize(
     "score",
     [
-        lambda each, _rng: -each["num_frames"],
-        lambda each, rng: -each["num_frames"] + 0.3 * rng.normal(),
+        lambda record, _rng: -record["num_frames"],
+        lambda record, rng: -record["num_frames"] + 0.3 * rng.normal(),
     ],
     ids=["length", "length with noise"],
 )
-def test_the_length_of_clips_is_told(release: DeepAccident, of: Any, score: Made) -> None:
-    report = audit_scores(release, of(release, score))
-    assert kinds(report) == ["length"]
+def test_the_length_of_clips_is_reported(
+    release: DeepAccident, score_all: Any, score: ScoreFunction
+) -> None:
+    report = audit_scores(release, score_all(release, score))
+    assert finding_kinds(report) == ["length"]
     assert "a detector of short clips" in report.findings[0].what
-    area, overall, low, high, within, *_ = row_of(report, "length")
+    area, correlation, low, high, within_accidents, *_ = attribute_row(report, "length")
     assert area > 0.9
-    assert -1 <= low <= overall <= high < -0.8
-    assert within < -0.8
+    assert -1 <= low <= correlation <= high < -0.8
+    assert within_accidents < -0.8
 
 
 @pytest.mark.parametrize(
-    ("of", "score"),
+    ("score_all", "score"),
     [
-        (of_scenarios, lambda _each, rng: rng.random()),
-        (of_samples, lambda _each, rng: rng.random()),
-        (of_scenarios, lambda each, _rng: each["collision"] is not None),
-        (of_scenarios, lambda each, rng: (each["collision"] is not None) + 0.2 * rng.random()),
-        (of_samples, lambda each, _rng: each["collision"] is not None),
+        (score_scenarios, score_randomly),
+        (score_samples, score_randomly),
+        (score_scenarios, score_truth),
+        (score_scenarios, lambda record, rng: score_truth(record, rng) + 0.2 * rng.random()),
+        (score_samples, score_truth),
         (  # rises towards the accident
-            of_samples,
-            lambda each, rng: (
-                (each["collision"] is not None) * frame_of(each) / each["num_frames"]
+            score_samples,
+            lambda record, rng: (
+                score_truth(record, rng) * frame_number(record) / record["num_frames"]
                 + rng.random() / 9
             ),
         ),
     ],
     ids=["random", "random samples", "truth", "truth with noise", "truth of samples", "rising"],
 )
-def test_other_scores_are_not_told(release: DeepAccident, of: Any, score: Made) -> None:
-    assert kinds(audit_scores(release, of(release, score))) == []
+def test_other_scores_are_not_reported(
+    release: DeepAccident, score_all: Any, score: ScoreFunction
+) -> None:
+    assert finding_kinds(audit_scores(release, score_all(release, score))) == []
 
 
 def test_the_truth_is_not_called_its_length_though_the_length_separates_it(
     release: DeepAccident,
 ) -> None:
-    report = audit_scores(
-        release, of_scenarios(release, lambda each, _rng: each["collision"] is not None)
-    )
-    assert row_of(report, "the scores")[0] == 1
-    area, overall, _, _, *within = row_of(report, "length")
+    report = audit_scores(release, score_scenarios(release, score_truth))
+    assert attribute_row(report, "the scores")[0] == 1
+    area, correlation, _, _, *within_classes = attribute_row(report, "length")
     assert area > 0.9
-    assert overall < -0.7
-    assert within == [0, 0, 0]
+    assert correlation < -0.7
+    assert within_classes == [0, 0, 0]
 
 
 @pytest.mark.parametrize(
-    ("kind", "said", "of", "score"),
+    ("kind", "description", "score_all", "score"),
     [
-        ("town", "a detector of towns", of_scenarios, lambda each, _rng: int(each["town"][-1]) % 3),
+        (
+            "town",
+            "a detector of towns",
+            score_scenarios,
+            lambda record, _rng: int(record["town"][-1]) % 3,
+        ),
         (
             "name",
             "a detector of large numbers in names",
-            of_scenarios,
-            lambda each, _rng: int(each["name"][-5:]),
+            score_scenarios,
+            lambda record, _rng: int(record["name"][-5:]),
         ),
-        ("length", "a detector of long clips", of_scenarios, lambda each, _rng: each["num_frames"]),
-        ("frame", "a detector of late frames", of_samples, lambda each, _rng: frame_of(each)),
-        ("frame", "a detector of early frames", of_samples, lambda each, _rng: -frame_of(each)),
+        (
+            "length",
+            "a detector of long clips",
+            score_scenarios,
+            lambda record, _rng: record["num_frames"],
+        ),
+        (
+            "frame",
+            "a detector of late frames",
+            score_samples,
+            lambda record, _rng: frame_number(record),
+        ),
+        (
+            "frame",
+            "a detector of early frames",
+            score_samples,
+            lambda record, _rng: -frame_number(record),
+        ),
     ],
 )
-def test_other_attributes(
-    release: DeepAccident, kind: str, said: str, of: Any, score: Made
+def test_scores_that_follow_another_attribute_are_reported(
+    release: DeepAccident, kind: str, description: str, score_all: Any, score: ScoreFunction
 ) -> None:
-    report = audit_scores(release, of(release, score))
-    assert {finding.kind: said in finding.what for finding in report.findings}[kind]
+    report = audit_scores(release, score_all(release, score))
+    descriptions = {finding.kind: finding.what for finding in report.findings}
+    assert description in descriptions[kind]
 
 
-def test_areas(release: DeepAccident) -> None:
-    """Twins share name and town, which so tell nothing; the folder tells all here, and the weather
-    of META too.
+def test_areas_follow_from_pairs_of_scenarios(release: DeepAccident) -> None:
+    """Twins share name and town, so these tell nothing; here the folder and META's weather tell
+    everything.
     """
-    report = audit_scores(release, of_samples(release, lambda _each, rng: rng.random()))
-    areas = {
-        name: row_of(report, name)[0] for name in ("folder", "name", "town", "weather", "actors")
-    }
+    report = audit_scores(release, score_samples(release, score_randomly))
+    attributes = ("folder", "name", "town", "weather", "actors")
+    areas = {attribute: attribute_row(report, attribute)[0] for attribute in attributes}
     assert areas == {"folder": 1, "name": 0.5, "town": 0.5, "weather": 1, "actors": 0.5}
-    scenarios = [each for each in release.scenario if each["weather"]]
-    pairs = [
-        (one["num_frames"] < other["num_frames"]) + (one["num_frames"] == other["num_frames"]) / 2
-        for one in scenarios
-        for other in scenarios
-        if one["collision"] and not other["collision"]
-    ]
-    assert row_of(report, "length")[0] == round(sum(pairs) / len(pairs), 3)
+
+    scenarios = [scenario for scenario in release.scenario if scenario["weather"]]
+    accidents = [scenario for scenario in scenarios if scenario["collision"]]
+    twins = [scenario for scenario in scenarios if not scenario["collision"]]
+    num_shorter = 0
+    num_equal = 0
+    for accident in accidents:
+        for twin in twins:
+            num_shorter += accident["num_frames"] < twin["num_frames"]
+            num_equal += accident["num_frames"] == twin["num_frames"]
+    area = (num_shorter + num_equal / 2) / (len(accidents) * len(twins))
+    assert attribute_row(report, "length")[0] == round(area, 3)
 
 
 def test_leaving_a_scenario_out_of_its_own_share_makes_no_area(release: DeepAccident) -> None:
-    """Without twins, the other collisions of a collision's town are fewer, which must not look like
+    """Without twins, a town has fewer other collisions for each collision, which must not look like
     a sign.
     """
-    scores = of_scenarios(release, lambda _each, rng: rng.random())
-    alone = {
-        token: score
-        for token, score in scores.items()
-        if ("accident" in token) == (int(token[-5:]) < PAIRS / 2)
-    }
-    assert row_of(audit_scores(release, alone), "town")[0] == 0.5
+    scores = score_scenarios(release, score_randomly)
+    scores_without_twins = {}
+    for token, score in scores.items():
+        is_accident = "accident" in token
+        if is_accident == (int(token[-5:]) < NUM_PAIRS / 2):
+            scores_without_twins[token] = score
+    report = audit_scores(release, scores_without_twins)
+    assert attribute_row(report, "town")[0] == 0.5
 
 
-def test_a_split_and_the_same_numbers_again(release: DeepAccident, tmp_path: Path) -> None:
-    scores = of_scenarios(release, lambda _each, rng: rng.random())
-    chosen = [token for token in scores if int(token[-5:]) < 8]
-    path = save_selection(chosen, tmp_path / "chosen.txt")
-    report = audit_scores(release, scores, path)
+def test_a_split_gives_the_same_numbers_as_only_its_scores(
+    release: DeepAccident, tmp_path: Path
+) -> None:
+    scores = score_scenarios(release, score_randomly)
+    selected = [token for token in scores if int(token[-5:]) < 8]
+    split = save_selection(selected, tmp_path / "chosen.txt")
+    report = audit_scores(release, scores, split)
     assert report.notes[0] == "16 scenarios with meta and a score, 8 with a collision."
-    few = {token: scores[token] for token in reversed(chosen)}
-    assert report.to_json() == audit_scores(release, few).to_json()
-    assert json.loads(report.to_json())["tables"]["scores"][1][:2] == [
-        "the scores",
-        row_of(report, "the scores")[0],
-    ]
+
+    selected_scores = {token: scores[token] for token in reversed(selected)}
+    assert report.to_json() == audit_scores(release, selected_scores).to_json()
+    score_row = json.loads(report.to_json())["tables"]["scores"][1]
+    assert score_row[:2] == ["the scores", attribute_row(report, "the scores")[0]]
 
 
 def test_few_scenarios_give_no_verdict(release: DeepAccident) -> None:
-    scores = of_scenarios(release, lambda each, _rng: -each["num_frames"])
-    report = audit_scores(
-        release, {token: scores[token] for token in scores if int(token[-5:]) < 3}
-    )
-    assert (kinds(report), report.exit_status) == ([], 2)
+    scores = score_scenarios(release, lambda record, _rng: -record["num_frames"])
+    few_scores = {token: score for token, score in scores.items() if int(token[-5:]) < 3}
+    report = audit_scores(release, few_scores)
+    assert (finding_kinds(report), report.exit_status) == ([], 2)
     assert "fewer than 6" in report.cannot_say[0]
 
 
-def test_what_cannot_be_told_apart_from_the_truth_is_said(release: DeepAccident) -> None:
-    """Each folder's word is right here."""
-    for score in (lambda each, _rng: each["designed_accident"], lambda _each, rng: rng.random()):
-        report = audit_scores(release, of_scenarios(release, score))
-        assert (kinds(report), report.exit_status) == ([], 0)
+def test_attributes_that_agree_with_the_truth_are_named(release: DeepAccident) -> None:
+    """Here the name of each folder is right."""
+    for score in (lambda record, _rng: record["designed_accident"], score_randomly):
+        report = audit_scores(release, score_scenarios(release, score))
+        assert (finding_kinds(report), report.exit_status) == ([], 0)
         assert report.cannot_say[0].startswith("folder, weather, actors, frame: ")
 
 
 @pytest.fixture(scope="module")
 def odd_release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
-    """As in val, some scenarios end otherwise than their folder says: two without a collision, and
-    one with.
+    """Write a release in which, as in val, the folder of some scenarios is wrong: two accidents
+    have no collision, and one normal scenario has one.
     """
     root = tmp_path_factory.mktemp("odd") / "release"
-    for number in range(PAIRS):
+    for number in range(NUM_PAIRS):
         for kind, meta in (
-            ("accident", SILENT if number < 2 else META),
-            ("normal", META if number == 2 else SILENT),
+            ("accident", META_WITHOUT_COLLISION if number < 2 else META_TEXT),
+            ("normal", META_TEXT if number == 2 else META_WITHOUT_COLLISION),
         ):
             write_tiny_release(
                 root,
@@ -235,40 +282,41 @@ def odd_release(tmp_path_factory: pytest.TempPathFactory) -> DeepAccident:
 
 
 @pytest.mark.parametrize(
-    ("score", "found"),
+    ("score", "kinds"),
     [
-        (lambda each, _rng: each["designed_accident"], ["folder"]),
-        (lambda each, _rng: -5.0 * each["designed_accident"], ["folder"]),
-        (lambda each, rng: each["designed_accident"] + 0.3 * rng.random(), ["folder"]),
-        (lambda each, rng: np.exp(each["designed_accident"] + 0.3 * rng.random()), ["folder"]),
-        (lambda each, _rng: each["collision"] is not None, []),
-        (lambda each, rng: (each["collision"] is not None) + 0.3 * rng.random(), []),
-        (lambda _each, rng: rng.random(), []),
+        (lambda record, _rng: record["designed_accident"], ["folder"]),
+        (lambda record, _rng: -5.0 * record["designed_accident"], ["folder"]),
+        (lambda record, rng: record["designed_accident"] + 0.3 * rng.random(), ["folder"]),
+        (lambda record, rng: np.exp(record["designed_accident"] + 0.3 * rng.random()), ["folder"]),
+        (score_truth, []),
+        (lambda record, rng: score_truth(record, rng) + 0.3 * rng.random(), []),
+        (score_randomly, []),
     ],
 )
-def test_the_folders_word_is_told_from_the_truth(
-    odd_release: DeepAccident, score: Made, found: list[str]
+def test_the_folders_name_is_told_apart_from_the_truth(
+    odd_release: DeepAccident, score: ScoreFunction, kinds: list[str]
 ) -> None:
-    report = audit_scores(odd_release, of_scenarios(odd_release, score))
-    assert (kinds(report), report.exit_status) == (found, len(found))
+    report = audit_scores(odd_release, score_scenarios(odd_release, score))
+    assert (finding_kinds(report), report.exit_status) == (kinds, len(kinds))
     assert "folder" not in report.cannot_say[0]
 
 
-def test_refused(release: DeepAccident) -> None:
+def test_scores_of_unknown_scenarios_and_of_none_are_refused(release: DeepAccident) -> None:
     with pytest.raises(TokenError, match="no scenario 'a/b'"):
         audit_scores(release, {"a/b": 1.0})
-    unknown = next(each["token"] for each in release.scenario if not each["weather"])
-    for scores in ({}, {unknown: 1.0}):
+    scenarios = release.scenario
+    without_meta = next(scenario["token"] for scenario in scenarios if not scenario["weather"])
+    for scores in ({}, {without_meta: 1.0}):
         with pytest.raises(ResultsError, match="no scenario with meta has a score"):
             audit_scores(release, scores)
 
 
-def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
+def test_scores_are_read_from_many_kinds_of_files(release: DeepAccident, tmp_path: Path) -> None:
     sample, other = release.sample[0]["token"], release.sample[1]["token"]
     path = tmp_path / "scores.csv"
     path.write_text(f'token,score\n"{sample}",0.5\n\n{other}, 2e-1\n')
     assert read_scores(path) == {sample: 0.5, other: 0.2}
-    for number, lines in enumerate(
+    for number, content in enumerate(
         (
             f",token,score\n0,{sample},0.5\n1,{other},2e-1\n",
             f"0;{sample};0,5\r\n1;{other};0,2\r\n",
@@ -277,9 +325,10 @@ def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
             f'\ufeff"0","{sample}","0.5"\n"1","{other}","0.2"\n',
         )
     ):
-        path = tmp_path / f"scores{number}.{('csv', 'tsv', 'TXT')[number % 3]}"
-        path.write_text(lines, encoding="utf-8", newline="")
-        assert read_scores(path) == {sample: 0.5, other: 0.2}, lines
+        suffix = ("csv", "tsv", "TXT")[number % 3]
+        path = tmp_path / f"scores{number}.{suffix}"
+        path.write_text(content, encoding="utf-8", newline="")
+        assert read_scores(path) == {sample: 0.5, other: 0.2}, content
     path = tmp_path / "scores.json"
     for scores in (
         {sample: 1, other: 0.25},
@@ -287,6 +336,7 @@ def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
     ):
         path.write_text(json.dumps(scores))
         assert read_scores(path) == {sample: 1, other: 0.25}
+
     accidents = [
         Accident(positions=np.zeros((2, 2)), time=1.0, score=score) for score in (0.3, 0.7)
     ]
@@ -294,18 +344,17 @@ def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
         writer.add(sample, accidents)
         writer.add(other, [])
     assert read_scores(tmp_path / "results.json") == {sample: 0.7, other: 0.0}
-    document = json.loads((tmp_path / "results.json").read_text()) | {
-        "task": "detection",
-        "results": {sample: []},
-    }
+
+    document = json.loads((tmp_path / "results.json").read_text())
+    document |= {"task": "detection", "results": {sample: []}}
     (tmp_path / "boxes.json").write_text(json.dumps(document))
     (tmp_path / "folder").mkdir()
-    for name, content, told in (
+    for name, content, message in (
         ("boxes.json", None, "expected a score, found "),
         ("no.json", None, "cannot be read"),
         ("folder", None, "not a regular file"),
         ("odd.csv", f"{sample},much", "expected a score, found .*: None"),
-        ("odd.csv", f"score,token\n0.5,{sample}", "line 2: expected a token and then its score"),
+        ("odd.csv", f"score,token\n0.5,{sample}", "line 2: expected a token and its score"),
         ("odd.csv", f"{sample} 0.5", "line 1: .*a comma, a semicolon, a tab or a bar"),
         ("odd.csv", f"{sample},0.5,1", "expected a score, found .*: None"),
         ("odd.csv", "\x00".join(sample), "line 1: "),
@@ -315,9 +364,9 @@ def test_files_of_scores(release: DeepAccident, tmp_path: Path) -> None:
         ("odd.csv", f"{sample},nan", "expected a score, found .*: nan"),
         ("odd.json", "[1, 2]", "expected an object of token and score"),
         ("odd.json", f'{{"{sample}": true}}', "expected a score, found .*: True"),
-        ("odd.json", "{", "is no JSON"),
+        ("odd.json", "{", "is not JSON"),
     ):
         if content is not None:
             (tmp_path / name).write_text(content)
-        with pytest.raises(ResultsError, match=rf"{re.escape(name)}: .*{told}"):
+        with pytest.raises(ResultsError, match=rf"{re.escape(name)}: .*{message}"):
             read_scores(tmp_path / name)

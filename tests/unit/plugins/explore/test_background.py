@@ -1,4 +1,4 @@
-"""Slow work: each piece once, in order, and a failure does not keep the others from being done."""
+"""Slow work is done once and in order, and a failure does not keep the rest from being done."""
 
 import threading
 from unittest.mock import Mock
@@ -10,7 +10,7 @@ from deepaccident_devkit.plugins.explore import background
 from deepaccident_devkit.plugins.explore.background import Jobs
 
 
-def test_a_failure_is_told_and_the_next_is_done() -> None:
+def test_a_failure_is_reported_and_the_next_job_is_done() -> None:
     jobs = Jobs()
     jobs.ask("missing", "", Mock(side_effect=NotAvailableError("no labels here")))
     jobs.ask("broken", "", Mock(side_effect=ZeroDivisionError("of nothing")))
@@ -23,23 +23,21 @@ def test_a_failure_is_told_and_the_next_is_done() -> None:
     ]
 
 
-def test_the_results_that_were_not_asked_for_the_longest_go(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_least_recently_used_results_are_evicted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(background, "MAX_JOBS", 3)
-    jobs, done = Jobs(), []
-    for name in ("a", "b", "c", "a", "d", "a", "b"):  # with d, b has to go, and with b, c
-        jobs.ask(name, "", lambda name=name: done.append(name))
+    jobs, finished = Jobs(), []
+    for name in ("a", "b", "c", "a", "d", "a", "b"):  # d evicts b, and b evicts c
+        jobs.ask(name, "", lambda name=name: finished.append(name))
         assert jobs.wait(60)
-    assert done == ["a", "b", "c", "d", "b"]
+    assert finished == ["a", "b", "c", "d", "b"]
 
 
-def test_what_runs_is_not_waited_for() -> None:
-    jobs, go = Jobs(), threading.Event()
-    slow = jobs.ask("slow", "", go.wait)
+def test_a_running_job_is_not_waited_for() -> None:
+    jobs, go_on = Jobs(), threading.Event()
+    slow = jobs.ask("slow", "", go_on.wait)
     late = jobs.ask("late", "", lambda: 1)
     assert (jobs.wait(0.05), slow.is_done) == (False, False)
     jobs.end()
-    go.set()
+    go_on.set()
     assert jobs.wait(60)
-    assert late.result == 1  # it was asked for before the end
+    assert late.result == 1  # it was requested before the end

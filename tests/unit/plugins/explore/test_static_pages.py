@@ -1,5 +1,5 @@
-"""Pages as files: they say what served pages say, need nothing else, and are there as a whole or
-not at all.
+"""Pages as files say the same as served pages, need nothing else, and are written completely or not
+at all.
 """
 
 import re
@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 from urllib.parse import unquote, urljoin
 
 import pytest
-from damaged_releases import damaged_release
-from evaluation_runs import stored_run
-from refusals import assert_refused
-from replay_page import accident, data_of, normal
-from shown_page import Shown, shown
-from wording import holding, lacking
+from support.damaged_releases import damage_release
+from support.evaluation_runs import stored_run
+from support.expected_errors import assert_raises
+from support.html_page import ParsedPage, parse_page
+from support.replay_page import accident_scenario, normal_scenario, read_page_data
+from support.text_contents import contained_parts, missing_parts
+from support.tiny_release_index import folder_contents
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, ConfigError, NotAvailableError, TokenError
@@ -23,199 +24,181 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.plugins.explore import Explorer, export_pages, static_pages
 from deepaccident_devkit.plugins.explore.pages.scenario import PARTS, part_html
 from deepaccident_devkit.render.captions import scenario_words
+from deepaccident_devkit.support.human_names import human_name
 
 pytestmark = pytest.mark.slow
 
 SVG = "http://www.w3.org/2000/svg"
-"""A name, which no browser opens."""
+"""The name of a namespace, which no browser opens."""
 
 
-class Made(NamedTuple):
-    """An export with two bundles and results without one, and what it was made from."""
+class Export(NamedTuple):
+    """Exported pages with two bundles and results without one, and the models behind them."""
 
     index: Path
-    given: dict[str, list[Path]]
+    models: dict[str, list[Path]]
 
-    def page(self, token: str) -> Shown:
-        return shown(self.index.parent / token / "index.html")
+    def page(self, token: str) -> ParsedPage:
+        return parse_page(self.index.parent / token / "index.html")
 
     def replay(self, token: str) -> dict[str, Any]:
-        return data_of(self.index.parent / token / "replay.html")
+        return read_page_data(self.index.parent / token / "replay.html")
 
 
 @pytest.fixture(scope="module")
-def made(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Made:
+def export(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> Export:
     folder = tmp_path_factory.mktemp("made")
-    run, _ = stored_run(
-        da_motion, EvaluationSetup(task="accident", protocol="boxes"), folder / "first.json"
-    )
+    accident_setup = EvaluationSetup(task="accident", protocol="boxes")
+    accident, _ = stored_run(da_motion, accident_setup, folder / "first.json")
     stored_run(da_motion, EvaluationSetup(task="motion"), folder / "maps")
     detection, _ = stored_run(da_motion, EvaluationSetup(task="detection"), folder / "boxes.json")
     bundles = [
         save_run(detection, folder / "boxes"),
-        save_run(run, folder / "first", include_results=True),
+        save_run(accident, folder / "first", include_results=True),
     ]
-    given = {"bundles": bundles, "results": [folder / "boxes.json", folder / "maps"]}
-    return Made(export_pages(da_motion, folder / "out", **given, workers=1), given)
+    models = {"bundles": bundles, "results": [folder / "boxes.json", folder / "maps"]}
+    return Export(export_pages(da_motion, folder / "out", **models, workers=1), models)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
+def test_an_export_has_a_list_static_files_and_a_folder_for_each_scenario(
+    export: Export, da_motion: DeepAccident
+) -> None:
+    root = export.index.parent
+    expected = {"index.html", ".deepaccident_pages"}
+    expected |= {f"static/{name}" for name in ("explore.css", "keys.js", "pages.css", "sorting.js")}
+    for scenario in da_motion.scenario:
+        for name in ("index.html", "replay.html", "thumbnail.jpg"):
+            expected.add(f"{scenario['token']}/{name}")
+    assert folder_contents(root).keys() == expected
+    assert [path.name for path in root.parent.glob(".*")] == []
 
 
-def test_what_is_written(made: Made, da_motion: DeepAccident) -> None:
-    tokens = [scenario["token"] for scenario in da_motion.scenario]
-    of_scenarios = [
-        f"{token}/{name}"
-        for token in tokens
-        for name in ("index.html", "replay.html", "thumbnail.jpg")
-    ]
-    found = contents(made.index.parent)
-    static = {"explore.css", "keys.js", "pages.css", "sorting.js"}
-    assert found.keys() == {
-        "index.html",
-        ".deepaccident_pages",
-        *of_scenarios,
-        *(f"static/{each}" for each in static),
-    }
-    assert [path.name for path in made.index.parent.parent.glob(".*")] == []
+def test_all_links_lead_to_files(export: Export) -> None:
+    root = export.index.parent
+    linked_files = set()
+    for path in root.rglob("index.html"):
+        page = parse_page(path)
+        addresses = [address for address, _ in page.links] + page.loads
+        for address in addresses:
+            assert not address.startswith("/")
+            if not address.startswith(("data:", "#")):
+                url = urljoin(path.as_uri(), address)
+                linked_files.add(unquote(url).removeprefix("file://"))
 
-
-def test_all_links_lead_to_files(made: Made) -> None:
-    root, reached = made.index.parent, set()
-    for page in root.rglob("index.html"):
-        told = shown(page)
-        addresses = [
-            each
-            for each in (*(address for address, _ in told.links), *told.loads)
-            if each[:5] != "data:"
-        ]
-        assert not [each for each in addresses if each.startswith("/")]
-        reached |= {
-            unquote(urljoin(page.as_uri(), each)).removeprefix("file://")
-            for each in addresses
-            if each[0] != "#"
-        }
-    assert reached == {
-        str(path)
-        for path in root.rglob("*")
-        if path.is_file() and path.name != ".deepaccident_pages"
-    }
+    files = {str(path) for path in root.rglob("*") if path.is_file()}
+    assert linked_files == files - {str(root / ".deepaccident_pages")}
 
 
 def test_nothing_needs_a_network_or_tells_where_the_release_lies(
-    made: Made, da_motion: DeepAccident
+    export: Export, da_motion: DeepAccident
 ) -> None:
-    for name, content in contents(made.index.parent).items():
+    root = export.index.parent
+    for name, content in folder_contents(root).items():
         text = content.decode(errors="replace").replace(SVG, "")
         assert not re.search(r"https?:|//[a-z]+\.", text), name
-        assert not holding(text, str(da_motion.dataroot), str(made.index.parent)), name
-    for page in made.index.parent.rglob("index.html"):
-        (policy,) = [each["content"] for each in shown(page).all("meta") if "http-equiv" in each]
+        assert not contained_parts(text, str(da_motion.dataroot), str(root)), name
+    for path in root.rglob("index.html"):
+        metas = parse_page(path).all("meta")
+        (policy,) = [meta["content"] for meta in metas if "http-equiv" in meta]
         assert policy.startswith("default-src 'none'; script-src 'self' file:;")
-        assert not holding(policy, "unsafe", "connect-src")
+        assert not contained_parts(policy, "unsafe", "connect-src")
 
 
-def test_the_list_has_the_scenarios_and_their_values(made: Made, da_motion: DeepAccident) -> None:
-    told, explorer = shown(made.index), Explorer(da_motion)
+def test_the_list_has_the_scenarios_and_their_values(
+    export: Export, da_motion: DeepAccident
+) -> None:
+    explorer = Explorer(da_motion)
     explorer.scenarios.begin()
     assert explorer.jobs.wait(60)
+    scenarios = explorer.scenarios
     expected = []
     for record in da_motion.scenario:
-        place = explorer.scenarios.row_of[record["token"]]
-        visibility, lead = (
-            explorer.scenarios.values(name)[place] for name in ("accident_visibility", "lead")
-        )
-        where = [record["token"], scenario_words(record), "train", "35"]
-        expected.append([*where, visibility or "–", "–" if lead is None else f"{lead:.1f}"])
+        row = scenarios.row_of[record["token"]]
+        visibility = human_name(scenarios.values("accident_visibility")[row] or "–", "values")
+        lead = scenarios.values("lead")[row]
+        lead_text = "–" if lead is None else f"{lead:.1f}"
+        words = scenario_words(record)
+        expected.append([record["token"], words, "train", "35", visibility, lead_text])
     explorer.jobs.end()
-    assert [row[:6] for row in told.table("scenario")] == expected
+    assert [row[:6] for row in parse_page(export.index).table("scenario")] == expected
 
 
-@pytest.mark.parametrize("which", [accident, normal])
-def test_a_page_has_all_parts(made: Made, da_motion: DeepAccident, which: Any) -> None:
-    token = which(da_motion)
-    page, explorer = made.page(token), Explorer(da_motion)
-    parts = {
-        name: " ".join(Shown(part_html(explorer, token, name, "../../../")).text.split())
-        for name in PARTS
-    }
-    assert not lacking(
-        page.text,
-        *PARTS.values(),
-        *[f"{name}{value}" for name, value in made.replay(token)["facts"]],
-    )
-    assert not lacking(
-        " ".join(page.text.split()), *(parts[name] for name in parts if name != "findings")
-    )
-    assert [each["src"] for each in page.all("iframe")] == ["replay.html"]
+@pytest.mark.parametrize("select_scenario", [accident_scenario, normal_scenario])
+def test_a_page_has_all_parts(
+    export: Export, da_motion: DeepAccident, select_scenario: Any
+) -> None:
+    token = select_scenario(da_motion)
+    page, explorer = export.page(token), Explorer(da_motion)
+    facts = [f"{name}{value}" for name, value in export.replay(token)["facts"]]
+    assert not missing_parts(page.text, *PARTS.values(), *facts)
+
+    page_text = " ".join(page.text.split())
+    for name in PARTS:
+        part = ParsedPage(part_html(explorer, token, name, "../../../"))
+        assert name == "findings" or " ".join(part.text.split()) in page_text
+    assert [frame["src"] for frame in page.all("iframe")] == ["replay.html"]
     assert page.address_of("Its twin").startswith("../../type1_subtype1_")
 
 
 def test_the_same_call_gives_the_same_bytes(
-    made: Made, da_motion: DeepAccident, tmp_path: Path
+    export: Export, da_motion: DeepAccident, tmp_path: Path
 ) -> None:
-    again = export_pages(da_motion, tmp_path / "another name", **made.given, workers=2)
-    assert contents(again.parent) == contents(made.index.parent)
+    index = export_pages(da_motion, tmp_path / "another name", **export.models, workers=2)
+    assert folder_contents(index.parent) == folder_contents(export.index.parent)
 
 
-# which scenarios
+# selection of scenarios
 
 
 @pytest.fixture
-def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_replays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(static_pages, "tried_replay", lambda *_, **__: "not in this test")
 
 
-def listed(index: Path) -> list[str]:
-    return [row[0] for row in shown(index).table("scenario")]
+def listed_scenarios(index: Path) -> list[str]:
+    return [row[0] for row in parse_page(index).table("scenario")]
 
 
-@pytest.mark.usefixtures("_quickly")
+@pytest.mark.usefixtures("_without_replays")
 def test_scenarios_are_chosen_by_filters_and_by_name(da_b: DeepAccident, tmp_path: Path) -> None:
     tokens = [scenario["token"] for scenario in da_b.scenario]
-    wanted = [scenario["token"] for scenario in da_b.find("collision=true")]
+    accidents = [scenario["token"] for scenario in da_b.find("collision=true")]
     index = export_pages(da_b, tmp_path / "a", where=["collision=true", "length>=1"], workers=1)
-    assert listed(index) == wanted
-    index = export_pages(
-        da_b, tmp_path / "b", scenarios=[da_b.scenario[4], tokens[1], tokens[4]], workers=1
-    )
-    (found,) = re.findall(r"da\.find\('(.*?)'\)", shown(index).text)
-    assert listed(index) == [tokens[4], tokens[1]]
-    assert {each["token"] for each in da_b.find(found)} == {tokens[4], tokens[1]}
+    assert listed_scenarios(index) == accidents
+
+    selected = [da_b.scenario[4], tokens[1], tokens[4]]
+    index = export_pages(da_b, tmp_path / "b", scenarios=selected, workers=1)
+    (where,) = re.findall(r"da\.find\('(.*?)'\)", parse_page(index).text)
+    assert listed_scenarios(index) == [tokens[4], tokens[1]]
+    assert {scenario["token"] for scenario in da_b.find(where)} == {tokens[4], tokens[1]}
+
     index = export_pages(
         da_b, tmp_path / "c", scenarios=tokens[::-1], where=["collision=true"], workers=1
     )
-    assert listed(index) == wanted[::-1]
-    assert (
-        "There is no replay: not in this test"
-        in shown(tmp_path / "c" / wanted[0] / "index.html").text
-    )
+    assert listed_scenarios(index) == accidents[::-1]
+    page = parse_page(tmp_path / "c" / accidents[0] / "index.html")
+    assert "There is no replay: not in this test" in page.text
 
 
-def test_what_cannot_be_exported(
+def test_impossible_selections_are_refused(
     da_b: DeepAccident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(static_pages, "MAX_SCENARIOS", 3)
 
-    def export(**chosen: Any) -> Callable[[], object]:
-        return lambda: export_pages(da_b, tmp_path / "out", **chosen)
+    def exporter(**options: Any) -> Callable[[], object]:
+        return lambda: export_pages(da_b, tmp_path / "out", **options)
 
-    assert_refused(
-        (export(), ConfigError, ("6 scenarios", "at most 3", "--where")),
-        (export(where=["length>=1000"]), NotAvailableError, ("no scenario matches",)),
-        (export(scenarios=[]), NotAvailableError, ("no scenario matches",)),
-        (export(scenarios=["no such"]), TokenError, ("no such",)),
-        (export(where=["collision=true"], workers=0), ChoiceError, ("workers",)),
+    assert_raises(
+        (exporter(), ConfigError, ("6 scenarios", "at most 3", "--where")),
+        (exporter(where=["length>=1000"]), NotAvailableError, ("no scenario matches",)),
+        (exporter(scenarios=[]), NotAvailableError, ("no scenario matches",)),
+        (exporter(scenarios=["no such"]), TokenError, ("no such",)),
+        (exporter(where=["collision=true"], workers=0), ChoiceError, ("workers",)),
     )
     assert [*tmp_path.iterdir()] == []
 
 
-@pytest.mark.usefixtures("_quickly")
+@pytest.mark.usefixtures("_without_replays")
 def test_hostile_names_are_text(own_release: Path, tmp_path: Path) -> None:
     first = DeepAccident("v1", own_release, verbose=False).scenario[0]
     hostile = "<img src=x onerror=alert(1)>'\"&?#%41 .."
@@ -223,104 +206,106 @@ def test_hostile_names_are_text(own_release: Path, tmp_path: Path) -> None:
         path.rename(path.with_name(path.name.replace("Town", f"{hostile}Town")))
     dataset = DeepAccident("v1", own_release, verbose=False)
     token = next(scenario["token"] for scenario in dataset.scenario if hostile in scenario["name"])
-    page = shown(export_pages(dataset, tmp_path / "out", scenarios=[token], workers=1))
-    assert [each["src"] for each in page.all("img")] == [
-        address for address in page.loads if address.endswith("jpg")
-    ]
+
+    page = parse_page(export_pages(dataset, tmp_path / "out", scenarios=[token], workers=1))
+    thumbnails = [address for address in page.loads if address.endswith("jpg")]
+    assert [image["src"] for image in page.all("img")] == thumbnails
     assert page.table("scenario")[0][0] == token
     (folder,) = (tmp_path / "out").glob("type*/*")
     assert re.fullmatch(r"[A-Za-z0-9_.-]+", folder.name)
-    assert shown(folder / "index.html").all("img") == []
+    assert parse_page(folder / "index.html").all("img") == []
     assert (tmp_path / "out" / unquote(page.address_of(token))).is_file()
 
 
-def test_a_damaged_release(own_release: Path, tmp_path: Path) -> None:
-    damaged = damaged_release(own_release)
-    index = export_pages(damaged.dataset, tmp_path / "out", workers=1)
-    assert listed(index) == [scenario["token"] for scenario in damaged.dataset.scenario]
-    assert damaged.broken not in listed(index)
-    assert "meta-missing" in shown(tmp_path / "out" / damaged.without_meta / "index.html").text
-    told = {
-        name: content.decode(errors="replace")
-        for name, content in contents(tmp_path / "out").items()
-    }
-    told |= {
-        page: shown(page).text for page in (tmp_path / "out").rglob("index.html")
-    }  # names are not broken in these
-    assert [place for place, text in told.items() if str(own_release) in text] == []
+def test_a_damaged_release_is_exported_without_its_broken_scenario(
+    own_release: Path, tmp_path: Path
+) -> None:
+    damaged = damage_release(own_release)
+    out = tmp_path / "out"
+    tokens = listed_scenarios(export_pages(damaged.dataset, out, workers=1))
+    assert tokens == [scenario["token"] for scenario in damaged.dataset.scenario]
+    assert damaged.broken not in tokens
+    assert "meta-missing" in parse_page(out / damaged.without_meta / "index.html").text
+    for path in out.rglob("*"):
+        if path.is_file():
+            assert str(own_release) not in path.read_text(errors="replace"), path
+        if path.name == "index.html":  # the text has no tags that split a path
+            assert str(own_release) not in parse_page(path).text, path
 
 
-# the folder
+# output folder
 
 
 @pytest.fixture
-def one(da_b: DeepAccident, _quickly: None) -> dict[str, Any]:
-    """Arguments for an export of a scenario without a replay."""
+def arguments(da_b: DeepAccident, _without_replays: None) -> dict[str, Any]:
+    """Return arguments for an export of one scenario without a replay."""
     return {"dataset": da_b, "scenarios": [da_b.scenario[0]], "workers": 1}
 
 
 def test_an_earlier_export_is_replaced(
-    one: dict[str, Any], da_b: DeepAccident, tmp_path: Path
+    arguments: dict[str, Any], da_b: DeepAccident, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    export_pages(folder=out, **one)
-    other = one | {"scenarios": [da_b.scenario[1]]}
-    export_pages(folder=out, **other)
-    export_pages(folder=tmp_path / "fresh", **other)
-    assert contents(out) == contents(tmp_path / "fresh")
+    export_pages(folder=out, **arguments)
+    other_arguments = arguments | {"scenarios": [da_b.scenario[1]]}
+    export_pages(folder=out, **other_arguments)
+    export_pages(folder=tmp_path / "fresh", **other_arguments)
+    assert folder_contents(out) == folder_contents(tmp_path / "fresh")
 
 
-def test_other_files_are_never_touched(one: dict[str, Any], tmp_path: Path) -> None:
-    out, notes = tmp_path / "out", tmp_path / "out" / "static" / "notes.txt"
-    export_pages(folder=out, **one)
-    before = contents(out)
+def test_other_files_are_never_touched(arguments: dict[str, Any], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    export_pages(folder=out, **arguments)
+    before = folder_contents(out)
 
-    def again() -> None:
-        export_pages(folder=out, **one)
+    def export_again() -> None:
+        export_pages(folder=out, **arguments)
 
+    notes = out / "static" / "notes.txt"
     notes.write_text("mine")
-    assert_refused((again, ConfigError, ("static/notes.txt", "which no export wrote")))
+    assert_raises((export_again, ConfigError, ("static/notes.txt", "which no export wrote")))
     assert notes.read_text() == "mine"
     notes.unlink()
     (out / "link").symlink_to(tmp_path)
-    assert_refused((again, ConfigError, ("holds link", "which no export wrote")))
+    assert_raises((export_again, ConfigError, ("contains link", "which no export wrote")))
     (out / "link").unlink()
-    assert contents(out) == before
+    assert folder_contents(out) == before
 
 
-def test_folders_that_cannot_be(one: dict[str, Any], tmp_path: Path) -> None:
+def test_impossible_folders_are_refused(arguments: dict[str, Any], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
 
-    def export(folder: Path | str) -> Callable[[], object]:
-        return lambda: export_pages(folder=folder, **one)
+    def exporter(folder: Path | str) -> Callable[[], object]:
+        return lambda: export_pages(folder=folder, **arguments)
 
-    assert_refused(
-        (export(tmp_path / "file"), ConfigError, ("is a file",)),
-        (export(tmp_path / "file" / "below"), ConfigError, ("is a file",)),
-        (export(tmp_path), ConfigError, ("holds file", "which no export wrote")),
-        (export(""), ConfigError, ("an empty path",)),
+    assert_raises(
+        (exporter(tmp_path / "file"), ConfigError, ("is a file",)),
+        (exporter(tmp_path / "file" / "below"), ConfigError, ("is a file",)),
+        (exporter(tmp_path), ConfigError, ("contains file", "which no export wrote")),
+        (exporter(""), ConfigError, ("an empty path",)),
     )
-    assert contents(tmp_path) == {"file": b"mine"}
+    assert folder_contents(tmp_path) == {"file": b"mine"}
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
 def test_an_interrupted_export_leaves_nothing(
-    one: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException]
+    arguments: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: type[BaseException],
 ) -> None:
-    kept = tmp_path / "kept"
-    export_pages(folder=kept, **one)
-    before = contents(tmp_path)
+    earlier_export = tmp_path / "kept"
+    export_pages(folder=earlier_export, **arguments)
+    before = folder_contents(tmp_path)
 
-    def interrupted() -> dict[str, str]:
+    def interrupt() -> dict[str, str]:
         assert len([*tmp_path.rglob("thumbnail.jpg")]) == 2  # something was written
         raise error
 
-    monkeypatch.setattr(static_pages, "assets", interrupted)
-    for folder in (kept, tmp_path / "new"):
+    monkeypatch.setattr(static_pages, "assets", interrupt)
+    for folder in (earlier_export, tmp_path / "new"):
         with pytest.raises(error):
-            export_pages(folder=folder, **one)
-        assert (contents(tmp_path), [path.name for path in tmp_path.iterdir()]) == (
-            before,
-            ["kept"],
-        )
+            export_pages(folder=folder, **arguments)
+        assert folder_contents(tmp_path) == before
+        assert [path.name for path in tmp_path.iterdir()] == ["kept"]

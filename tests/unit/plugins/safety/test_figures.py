@@ -1,13 +1,13 @@
-"""The figures of safety: their cells and dots are the report's numbers, their words legible."""
+"""The figures of safety: cells and dots show the report's numbers, and the words are legible."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from picture_texts import panels_share, text_faults
-from refusals import assert_refused
-from replayed_accidents import head_on, rear_end
+from support.braking_accidents import head_on_accident, rear_end_accident
+from support.expected_errors import assert_raises
+from support.figure_texts import STYLES, find_text_faults, panel_area_ratio
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.collisions import OUTCOMES
@@ -18,7 +18,7 @@ from deepaccident_devkit.plugins.safety.figures import render_avoidability, rend
 from deepaccident_devkit.render import detached_figure, style
 
 
-def report_of(*accidents: object) -> AvoidabilityReport:
+def make_report(*accidents: object) -> AvoidabilityReport:
     return AvoidabilityReport(
         dataroot="/data", version="v1", accidents=accidents, dropped=(), skipped=(), margins={}
     )
@@ -26,41 +26,56 @@ def report_of(*accidents: object) -> AvoidabilityReport:
 
 @pytest.fixture(scope="module")
 def report() -> AvoidabilityReport:
-    return report_of(
-        avoidability_of(rear_end(20, 10)),
-        avoidability_of(rear_end(20, 14, 2)),
-        avoidability_of(head_on(9, 2)),
+    return make_report(
+        avoidability_of(rear_end_accident(20, 10)),
+        avoidability_of(rear_end_accident(20, 14, 2)),
+        avoidability_of(head_on_accident(9, 2)),
     )
 
 
 def test_cells_are_the_shares(report: AvoidabilityReport) -> None:
     figure = detached_figure((10, 6))
     assert render_avoidability(report, fig=figure) is figure
-    avoided, speeds = figure.axes[:4], figure.axes[4:8]
-    warned = ("the first brakes", "the second brakes", "both brake", "the ego brakes")
-    assert [ax.get_title() for ax in avoided] == [f"{who} (2)" for who in warned]
+
+    avoided_axes, speed_axes = figure.axes[:4], figure.axes[4:8]
+    assert [ax.get_title() for ax in avoided_axes] == [
+        "only actor 1 brakes (n = 2)",
+        "only actor 2 brakes (n = 2)",
+        "both actors brake (n = 2)",
+        "only the ego brakes (n = 2)",
+    ]
+
     shares = report.shares[0]
-    one, two = (ax.images[0].get_array() for ax in (avoided[0], speeds[0]))
-    np.testing.assert_allclose(one.T, shares.shares[: one.shape[1], :, OUTCOMES.index("avoided")])
-    np.testing.assert_allclose(two.T, shares.relative_speed[: two.shape[1]])
-    assert [label.get_text() for label in avoided[0].get_yticklabels()][::8] == [
+    avoided = avoided_axes[0].images[0].get_array().T
+    speeds = speed_axes[0].images[0].get_array().T
+    expected_avoided = shares.shares[: len(avoided), :, OUTCOMES.index("avoided")]
+    np.testing.assert_allclose(avoided, expected_avoided)
+    np.testing.assert_allclose(speeds, shares.relative_speed[: len(speeds)])
+
+    labels = [label.get_text() for label in avoided_axes[0].get_yticklabels()]
+    assert labels[::8] == [
         "0.5 s, 4 m/s²",
         "1.5 s, 8 m/s²",
     ]
-    assert avoided[0].images[0].get_extent() == pytest.approx((-0.05, 5.05, 8.5, -0.5))
+    extent = avoided_axes[0].images[0].get_extent()
+    assert extent == pytest.approx((-0.05, 5.05, 8.5, -0.5))
 
 
 def test_cells_end_where_few_recordings_are_long_enough() -> None:
-    short = [avoidability_of(rear_end(20, 14, 2)) for _ in range(2)]
-    figure = render_avoidability(
-        report_of(avoidability_of(rear_end(20, 10)), *short), fig=detached_figure((10, 6))
+    report = make_report(
+        avoidability_of(rear_end_accident(20, 10)),
+        avoidability_of(rear_end_accident(20, 14, 2)),
+        avoidability_of(rear_end_accident(20, 14, 2)),
     )
+    figure = render_avoidability(report, fig=detached_figure((10, 6)))
+
     assert figure.axes[0].images[0].get_extent()[1] == pytest.approx(2.05)
 
 
 def test_groups_without_accidents(report: AvoidabilityReport) -> None:
-    assert len(render_avoidability(report, "head-on", fig=detached_figure((10, 6))).axes) == 8 + 2
-    assert_refused(
+    figure = render_avoidability(report, "head-on", fig=detached_figure((10, 6)))
+    assert len(figure.axes) == 8 + 2
+    assert_raises(
         (
             lambda: render_avoidability(report, "pedestrians"),
             NotAvailableError,
@@ -75,37 +90,42 @@ def test_groups_without_accidents(report: AvoidabilityReport) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [None, "paper", "cvpr-column", "slide"])
+@pytest.mark.parametrize("medium", STYLES)
 def test_words_are_apart_and_large(
-    report: AvoidabilityReport, da_b: DeepAccident, place: Any
+    report: AvoidabilityReport, da_b: DeepAccident, medium: Any
 ) -> None:
-    with style(place):
-        for figure in (render_avoidability(report), render_lead_times(lead_time_ledger(da_b))):
-            assert text_faults(figure) == []
-            assert panels_share(figure) > 0.35
+    with style(medium):
+        for figure in (
+            render_avoidability(report),
+            render_lead_times(lead_time_ledger(da_b)),
+        ):
+            assert find_text_faults(figure) == []
+            assert panel_area_ratio(figure) > 0.35
 
 
 def test_dots_are_the_means(da_b: DeepAccident) -> None:
-    ledger, figure = (
-        lead_time_ledger(da_b, rule=ObservationRule(kind="points")),
-        Figure(layout="constrained"),
-    )
+    ledger = lead_time_ledger(da_b, rule=ObservationRule(kind="points"))
+    figure = Figure(layout="constrained")
     assert render_lead_times(ledger, fig=figure) is figure
-    _, leads, shapley = figure.axes
 
-    def mean_of(number: int) -> float:
+    def mean_lead(number: int) -> float:
         return float(ledger.mean_leads[number].mean or 0)
 
-    longest = [
-        max((each for each in range(16) if len(COALITIONS[each]) == size), key=mean_of)
-        for size in (3, 4, 5)
-    ]
-    order = [0, 1, 2, 4, 8, *longest]
+    longest = []
+    for size in (3, 4, 5):
+        numbers = [number for number in range(16) if len(COALITIONS[number]) == size]
+        longest.append(max(numbers, key=mean_lead))
+    expected_leads = [ledger.mean_leads[number] for number in (0, 1, 2, 4, 8, *longest)]
+
+    _, lead_axes, shapley_axes = figure.axes
     for ax, means in (
-        (leads, [ledger.mean_leads[number] for number in order]),
-        (shapley, ledger.mean_shapley),
+        (lead_axes, expected_leads),
+        (shapley_axes, ledger.mean_shapley),
     ):
-        found = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
-        assert found == pytest.approx([each.mean for each in means])
+        dots = [line.get_xdata()[0] for line in ax.lines if line.get_marker() == "o"]
+        assert dots == pytest.approx([mean.mean for mean in means])
+
     nothing = lead_time_ledger(da_b, da_b.find(collision=False))
-    assert_refused((lambda: render_lead_times(nothing), NotAvailableError, ("no accident",)))
+    assert_raises(
+        (lambda: render_lead_times(nothing), NotAvailableError, ("no accident",)),
+    )

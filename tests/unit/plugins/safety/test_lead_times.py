@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli import deepaccident
@@ -29,8 +29,8 @@ from deepaccident_devkit.plugins.safety.lead_times import mean_times
 from deepaccident_devkit.taxonomy import AGENTS
 
 
-def without(root: Path, agent: str) -> DeepAccident:
-    """The release without an agent's labels."""
+def remove_labels(root: Path, agent: str) -> DeepAccident:
+    """Remove an agent's labels, and open the release."""
     for folder in root.glob(f"*/*/{agent}/label"):
         shutil.rmtree(folder)
     return DeepAccident("v1", root, verbose=False)
@@ -38,15 +38,20 @@ def without(root: Path, agent: str) -> DeepAccident:
 
 @pytest.mark.parametrize("kind", ["annotated", "points", "released"])
 def test_each_set_of_agents_by_a_plain_search(da_motion: DeepAccident, kind: str) -> None:
-    scenario, normal = (da_motion.find(collision=ends)[0] for ends in (True, False))
-    times = lead_times(da_motion, scenario, ObservationRule(kind=kind))
-    assert (times.ego_collides, lead_times(da_motion, normal)) == (True, None)
-    _, observed = observed_actors(da_motion, scenario, times.actor_ids, times.rule)
+    accident, normal = (da_motion.find(collision=collides)[0] for collides in (True, False))
+    times = lead_times(da_motion, accident, ObservationRule(kind=kind))
+    assert times.ego_collides is True
+    assert lead_times(da_motion, normal) is None
+
+    _, observed = observed_actors(da_motion, accident, times.actor_ids, times.rule)
     for number, members in enumerate(COALITIONS):
-        both = observed[[AGENTS.index(name) for name in members]].any(axis=0).all(axis=0)
+        rows = [AGENTS.index(name) for name in members]
+        both = observed[rows].any(axis=0).all(axis=0)
         frame = int(np.flatnonzero(both)[0]) + 1 if both.any() else 0
-        lead = (scenario["num_frames"] - frame) / 10 if frame else 0
-        assert (times.first_frames[number], times.leads[number]) == (frame, pytest.approx(lead))
+        lead = (accident["num_frames"] - frame) / 10 if frame else 0
+        assert times.first_frames[number] == frame
+        assert times.leads[number] == pytest.approx(lead)
+
     assert times.shapley.sum() == pytest.approx(times.together - times.alone)
     assert times.gains[3] == pytest.approx(times.leads[8] - times.leads[0])
     assert times.losses[0] == pytest.approx(times.leads[15] - times.leads[14])
@@ -69,106 +74,120 @@ def test_gains_and_losses_are_differences_of_sets() -> None:
         leads=leads,
         shapley=np.ones(4),
     )
-    assert (times.ego_collides, times.alone, times.together, times.from_the_start) == (
-        False,
-        1.0,
-        7.0,
-        False,
-    )
-    assert (times.gains.tolist(), times.losses.tolist()) == (
-        [0.5, 1.0, 0.25, 0.0],
-        [0.5, 1.0, 1.5, 2.5],
-    )
+    assert (times.ego_collides, times.from_the_start) == (False, False)
+    assert (times.alone, times.together) == (1.0, 7.0)
+    assert times.gains.tolist() == [0.5, 1.0, 0.25, 0.0]
+    assert times.losses.tolist() == [0.5, 1.0, 1.5, 2.5]
+
     frames = np.arange(16)[::-1]
-    seen = [
-        replace(times, first_frames=first).from_the_start
-        for first in (frames + 1, frames + 2, 0 * frames)
+    from_the_start = [
+        replace(times, first_frames=first_frames).from_the_start
+        for first_frames in (frames + 1, frames + 2, 0 * frames)
     ]
-    assert seen == [True, False, False]
+    assert from_the_start == [True, False, False]
+
     less = replace(times, missing=("infrastructure",))
-    assert (less.together, less.losses.tolist()[:3]) == (4.5, [0.5, 1.5, 2.25])
+    assert less.together == 4.5
+    assert less.losses.tolist()[:3] == [0.5, 1.5, 2.25]
 
 
-def test_missing_agents_leave_the_sets_that_are_there(
-    da: DeepAccident, da_partial: DeepAccident
-) -> None:
+def test_missing_agents_leave_the_other_sets(da: DeepAccident, da_partial: DeepAccident) -> None:
     scenario = da.find(collision=True)[0]["token"]
-    whole, partial = (
-        lead_times(each, scenario, ObservationRule(kind="points")) for each in (da, da_partial)
-    )
+    rule = ObservationRule(kind="points")
+    whole, partial = (lead_times(dataset, scenario, rule) for dataset in (da, da_partial))
     assert (whole.missing, partial.missing) == ((), ("other_vehicle_behind",))
+
     known = np.array(["other_vehicle_behind" not in members for members in COALITIONS])
     np.testing.assert_array_equal(partial.leads, np.where(known, whole.leads, np.nan))
     for values in (partial.shapley, partial.gains, partial.losses):
         assert np.isnan(values).tolist() == [False, False, True, False]
     assert partial.together == whole.leads[0b1011]
     assert np.nansum(partial.shapley) == pytest.approx(partial.together - partial.alone)
-    told = partial.to_dict()
-    assert told["shapley_seconds"]["other_vehicle_behind"] is None
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
+
+    payload = partial.to_dict()
+    assert payload["shapley_seconds"]["other_vehicle_behind"] is None
+    assert json.loads(json.dumps(payload, allow_nan=False)) == payload
 
 
 def test_without_the_egos_labels_there_is_a_reason(own_release: Path) -> None:
-    da = without(own_release, "ego_vehicle")
-    accident, ledger = da.find(collision=True)[0], lead_time_ledger(da)
-    assert_refused(
+    da = remove_labels(own_release, "ego_vehicle")
+    accident = da.find(collision=True)[0]
+    assert_raises(
         (lambda: lead_times(da, accident), NotAvailableError, ("has no labels of ego_vehicle",))
     )
+
+    ledger = lead_time_ledger(da)
     assert (ledger.accidents, len(ledger.skipped)) == ((), 3)
     assert "no labels of ego_vehicle" in ledger.to_text()
 
 
 def test_scenarios_are_counted_and_a_chosen_few_looked_at(da_b: DeepAccident) -> None:
-    accidents = [scenario["token"] for scenario in da_b.find(collision=True)]
-    ledger, few = lead_time_ledger(da_b), lead_time_ledger(da_b, [accidents[1], accidents[1]])
-    for each, tokens, others in (
-        (ledger, accidents, len(da_b.scenario) - len(accidents)),
-        (few, accidents[1:2], 0),
+    tokens = [scenario["token"] for scenario in da_b.find(collision=True)]
+    full_ledger = lead_time_ledger(da_b)
+    short_ledger = lead_time_ledger(da_b, [tokens[1], tokens[1]])
+
+    for ledger, expected_tokens, without_accident in (
+        (full_ledger, tokens, len(da_b.scenario) - len(tokens)),
+        (short_ledger, tokens[1:2], 0),
     ):
-        assert ([one.scenario for one in each.accidents], each.without_accident) == (tokens, others)
-    for means, name in ((ledger.mean_leads, "leads"), (ledger.mean_gains, "gains")):
-        values = np.mean([getattr(each, name) for each in ledger.accidents], axis=0)
-        assert [each.mean for each in means] == pytest.approx(values)
+        assert [accident.scenario for accident in ledger.accidents] == expected_tokens
+        assert ledger.without_accident == without_accident
+
+    for means, name in (
+        (full_ledger.mean_leads, "leads"),
+        (full_ledger.mean_gains, "gains"),
+    ):
+        values = np.mean([getattr(accident, name) for accident in full_ledger.accidents], axis=0)
+        assert [mean.mean for mean in means] == pytest.approx(values)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("report", [lead_time_ledger, avoidability_report, twin_report])
-def test_two_workers_find_the_same(da_b: DeepAccident, report: Callable[..., Any]) -> None:
-    assert report(da_b, workers=2).to_json() == report(da_b, workers=1).to_json()
+@pytest.mark.parametrize("make_report", [lead_time_ledger, avoidability_report, twin_report])
+def test_two_workers_find_the_same(da_b: DeepAccident, make_report: Callable[..., Any]) -> None:
+    one = make_report(da_b, workers=1)
+    two = make_report(da_b, workers=2)
+    assert two.to_json() == one.to_json()
 
 
 def test_means_have_intervals_from_six_accidents_on() -> None:
     values = np.random.default_rng(1).exponential(2.0, size=(400, 2))
     values[:396, 1] = np.nan
-    known, few = mean_times(values)
+    full, few = mean_times(values)
     assert (few.accidents, few.low, few.high, few.text) == (4, None, None, f"{few.mean:.2f}")
     assert few.mean == pytest.approx(values[396:, 1].mean())
-    values[:200, 1], values[200:, 1] = values[:200, 0], np.nan
+
+    values[:200, 1] = values[:200, 0]
+    values[200:, 1] = np.nan
     half = mean_times(values)[1]
-    for mean, of in ((known, values[:, 0]), (half, values[:200, 0])):
-        error = of.std() / math.sqrt(len(of))
-        assert mean.mean == pytest.approx(of.mean())
-        assert [mean.mean - mean.low, mean.high - mean.mean] == pytest.approx(
+    for interval, sample in (
+        (full, values[:, 0]),
+        (half, values[:200, 0]),
+    ):
+        error = sample.std() / math.sqrt(len(sample))
+        assert interval.mean == pytest.approx(sample.mean())
+        assert [interval.mean - interval.low, interval.high - interval.mean] == pytest.approx(
             [1.96 * error] * 2, abs=0.2 * error
         )
 
 
 def test_the_command_prints_and_writes_the_ledger(da_b: DeepAccident, tmp_path: Path) -> None:
-    command = ["safety", "lead-time", str(da_b.dataroot)]
-    result = CliRunner().invoke(
-        deepaccident, [*command, "--seen", "annotated", "--out", str(tmp_path)]
-    )
+    arguments = ["safety", "lead-time", str(da_b.dataroot), "--seen", "annotated"]
+    result = CliRunner().invoke(deepaccident, [*arguments, "--out", str(tmp_path)])
     assert result.exit_code == 0
     names = {"lead_times.csv", "lead_times.json", "lead_times.png", "skipped.csv"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    told = json.loads((tmp_path / "lead_times.json").read_text(encoding="utf-8"))
-    rows = list(
-        csv.DictReader((tmp_path / "lead_times.csv").read_text(encoding="utf-8").splitlines())
-    )
-    assert len(rows) == told["summary"]["accidents"] == len(da_b.find(collision=True))
-    for row, accident in zip(rows, told["accidents"], strict=True):
-        values = {f"lead_{name}": str(lead) for name, lead in accident["lead_seconds"].items()}
-        values |= {
-            f"shapley_{partner}": str(accident["shapley_seconds"][partner]) for partner in PARTNERS
-        }
-        assert row.items() >= {**values, "scenario": accident["scenario"]}.items()
+
+    payload = json.loads((tmp_path / "lead_times.json").read_text(encoding="utf-8"))
+    lines = (tmp_path / "lead_times.csv").read_text(encoding="utf-8").splitlines()
+    rows = list(csv.DictReader(lines))
+    assert len(rows) == payload["summary"]["accidents"] == len(da_b.find(collision=True))
+
+    for row, accident in zip(rows, payload["accidents"], strict=True):
+        leads = accident["lead_seconds"]
+        shapley = accident["shapley_seconds"]
+        assert row["scenario"] == accident["scenario"]
+        assert row.items() >= {f"lead_{name}": str(lead) for name, lead in leads.items()}.items()
+        assert (
+            row.items()
+            >= {f"shapley_{partner}": str(shapley[partner]) for partner in PARTNERS}.items()
+        )

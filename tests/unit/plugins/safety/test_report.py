@@ -1,5 +1,5 @@
-"""The safety report: its numbers are those of its parts, each accident is replayed once, and
-nothing is lost.
+"""The safety report: its numbers equal the numbers of its parts, each accident is replayed once,
+and nothing is lost.
 """
 
 import csv
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from damaged_releases import damaged_release
-from wording import lacking
+from support.damaged_releases import damage_release
+from support.text_contents import missing_parts
 
 import deepaccident_devkit.plugins.safety.report as report_module
 from deepaccident_devkit import DeepAccident
@@ -40,9 +40,9 @@ def test_its_parts_are_those_of_the_functions(
         (report.twins, twin_report),
     ):
         assert part.to_dict() == function(da_motion, workers=1).to_dict()
-    assert [row.story for row in report.rows] + list(report.normal) == list(
-        stories(da_motion, workers=1)
-    )
+
+    accident_stories = [row.story for row in report.rows]
+    assert accident_stories + list(report.normal) == list(stories(da_motion, workers=1))
     assert (report.scenarios, len(report.rows), report.left_out) == (2, 1, [])
 
 
@@ -50,27 +50,28 @@ def test_a_row_has_the_numbers_of_its_accident(
     da_motion: DeepAccident, report: SafetyReport
 ) -> None:
     (row,) = report.rows
-    (replayed,), (times,), (twin,) = (
-        report.avoidability.accidents,
-        report.ledger.accidents,
-        report.twins.diffs,
-    )
-    story, told = describe(da_motion, row.scenario).facts["accident"], row.to_dict()
+    (replayed,) = report.avoidability.accidents
+    (times,) = report.ledger.accidents
+    (twin,) = report.twins.diffs
+    story = describe(da_motion, row.scenario).facts["accident"]
+    payload = row.to_dict()
+
+    assert row.brakes == ["ego_vehicle"]
+    assert payload["last_moments"]["6"] == story["braking"]["slack"]
     slack = replayed.slack[replayed.accident.agents.index("ego_vehicle")]
-    assert (row.brakes, told["last_moments"]["6"]) == (["ego_vehicle"], story["braking"]["slack"])
-    assert row.last_moments == pytest.approx(
-        dict(zip((4.0, 6.0, 8.0), slack, strict=True)), abs=0.005
-    )
-    known = {**story["seen"], "ego_vehicle": times.alone, "all": times.together}
-    assert row.leads == pytest.approx(known, abs=1e-6)
-    assert (row.parts, row.severity) == (
-        pytest.approx(twin.to_dict()["time_to_impact"]),
-        max(each["delta_v"] for each in story["pair"]),
-    )
+    last_moments = dict(zip((4.0, 6.0, 8.0), slack, strict=True))
+    assert row.last_moments == pytest.approx(last_moments, abs=0.005)
+
+    leads = {**story["seen"], "ego_vehicle": times.alone, "all": times.together}
+    assert row.leads == pytest.approx(leads, abs=1e-6)
+    assert row.parts == pytest.approx(twin.to_dict()["time_to_impact"])
+    assert row.severity == max(collider["delta_v"] for collider in story["pair"])
+
     pairs = interactions(da_motion, row.scenario).pairs
-    at = pairs.position(*times.actor_ids)
-    measures = told["time_exposed"], np.inf if told["pet"] is None else told["pet"]
-    assert measures == pytest.approx((pairs.tet[at, 0], abs(pairs.pet[at])), abs=0.005)
+    pair = pairs.position(*times.actor_ids)
+    pet = np.inf if payload["pet"] is None else payload["pet"]
+    assert payload["time_exposed"] == pytest.approx(pairs.tet[pair, 0], abs=0.005)
+    assert pet == pytest.approx(abs(pairs.pet[pair]), abs=0.005)
 
 
 def test_an_accident_that_cannot_be_replayed_keeps_its_row(
@@ -79,6 +80,7 @@ def test_an_accident_that_cannot_be_replayed_keeps_its_row(
     (accident,) = da_motion.find(collision=True)
     dropped = Dropped(Skipped(scenario=accident["token"], reason="2.00 m apart"), 2.0)
     monkeypatch.setattr(report_module, "replay_accident", lambda *_: dropped)
+
     report = safety_report(da_motion, [accident], workers=1)
     (row,) = report.rows
     assert (row.replayed, row.last_moments, row.brakes, row.severity) == (None, {}, [], -1.0)
@@ -87,35 +89,37 @@ def test_an_accident_that_cannot_be_replayed_keeps_its_row(
 
 
 def test_what_is_left_out_is_named(own_release: Path) -> None:
-    damaged = damaged_release(own_release)
+    damaged = damage_release(own_release)
     report = safety_report(damaged.dataset, workers=1)
-    shown = [row.scenario for row in report.rows] + [
-        each.facts["scenario"] for each in report.normal
-    ]
-    assert sorted(shown) == sorted(damaged.whole)
-    told = {scenario: f"{part}: {reason}" for scenario, part, reason in report.left_out}
+    accidents = [row.scenario for row in report.rows]
+    normal = [story.facts["scenario"] for story in report.normal]
+    assert sorted(accidents + normal) == sorted(damaged.whole)
+
+    messages = {scenario: f"{part}: {reason}" for scenario, part, reason in report.left_out}
     for scenario, *words in (
         (damaged.without_meta, "braking: skipped, lead times", "no meta file"),
         (damaged.without_labels, "braking: skipped, lead times", "no labels"),
         (damaged.broken, "everything", "on_error='skip'"),
     ):
-        assert not lacking(told[scenario], *words)
+        assert not missing_parts(messages[scenario], *words)
 
 
 def test_normal_scenarios_come_by_their_least_time_to_collision(da_b: DeepAccident) -> None:
     normal = safety_report(da_b, workers=1).normal
-    times = [
-        np.inf if (each := story.facts["nearest"]) is None else each["min_ttc"] for story in normal
-    ]
+    nearest = [story.facts["nearest"] for story in normal]
+    times = [np.inf if approach is None else approach["min_ttc"] for approach in nearest]
+
     assert times == sorted(times)
-    assert len(normal) == sum(each["collision"] is None for each in da_b.scenario)
+    assert len(normal) == sum(scenario["collision"] is None for scenario in da_b.scenario)
 
 
 def test_tables(report: SafetyReport, tmp_path: Path) -> None:
+    (row,) = report.rows
     accidents, left_out = report.to_csv(tmp_path)
     heading, line = csv.reader(accidents.read_text(encoding="utf-8").splitlines())
-    cells, (row,) = dict(zip(heading, line, strict=True)), report.rows
+    cells = dict(zip(heading, line, strict=True))
     assert (cells["scenario"], cells["story"]) == (row.scenario, row.story.text)
+
     numbers = {
         "closing_speed": row.story.facts["accident"]["closing_speed"],
         "lead_infrastructure": row.leads["infrastructure"],

@@ -1,4 +1,4 @@
-"""Hidden actors, intervals, verdicts, controls: on data whose answers are known."""
+"""Hidden actors, intervals, verdicts and controls, on data with known answers."""
 
 from dataclasses import replace
 from typing import Any
@@ -28,161 +28,165 @@ LABELS = MotionLabelConfig(
 )
 
 
-SAMPLE = "type1_subtype1_accident/Town03_{}/ego_vehicle/010"
+SAMPLE_TEMPLATE = "type1_subtype1_accident/Town03_{}/ego_vehicle/010"
 
 
-def boxes_at(*places: tuple[float, float], frame: str = "ego") -> DetectedBoxes:
-    center = np.array([(*place, 0.0) for place in places]).reshape(-1, 3)
-    made = Boxes.from_arrays(center, np.ones_like(center), np.zeros(len(center)), frame=frame)
-    return DetectedBoxes(boxes=made, scores=np.ones(len(center)))
+def make_boxes(*positions: tuple[float, float], frame: str = "ego") -> DetectedBoxes:
+    """Make boxes of 1 m at positions on the ground, all with score 1."""
+    count = len(positions)
+    center = np.zeros((count, 3))
+    center[:, :2] = np.reshape(positions, (count, 2))
+    boxes = Boxes.from_arrays(center, np.ones((count, 3)), np.zeros(count), frame=frame)
+    return DetectedBoxes(boxes=boxes, scores=np.ones(count))
 
 
-def motion_of(foreground: np.ndarray) -> MotionOutput:
-    return MotionOutput(
-        grid=LABELS.grid, instances=np.repeat(foreground[None, None], 5, axis=1).astype(np.int32)
-    )
+def make_motion(foreground: np.ndarray) -> MotionOutput:
+    instances = np.repeat(foreground[None, None], 5, axis=1).astype(np.int32)
+    return MotionOutput(grid=LABELS.grid, instances=instances)
 
 
-def test_hidden_actors_are_those_that_a_partner_alone_sees(da: DeepAccident) -> None:
-    """Those that the ego sees are given as boxes, and the map of all: the hidden are on the map and
-    not detected.
+def test_hidden_actors_are_the_ones_that_only_a_partner_sees(da: DeepAccident) -> None:
+    """The prediction has boxes of actors that the ego sees and a map of all actors: hidden actors
+    are on the map, but not detected.
     """
-    evaluator, hidden, seen = HiddenActors(), 0, 0
+    evaluator = HiddenActors()
+    num_hidden, num_seen = 0, 0
     for scenario in da.scenario:
         token = f"{scenario['token']}/ego_vehicle/004"
-        alone = {each.rsplit("/", 1)[1] for each in visible_instances(da, token, agents="single")}
-        every = seen_actors(da, token, agents="all", frame="ego").boxes
-        drawn = motion_labels(da, token, LABELS).segmentation[0] > 0
-        index, inside = LABELS.grid.index_of(every.center[:, :2])
-        found = []
-        for actor, box, (row, column), there in zip(
-            every.actor_id, every.center, index, inside, strict=True
-        ):
-            if actor >= 0 and there and drawn[row, column]:
-                found += [tuple(box[:2])] * (str(actor) in alone)
-                hidden, seen = hidden + (str(actor) not in alone), seen + (str(actor) in alone)
-        evaluator.update(
-            token, da, LABELS, motion_of(drawn), boxes_at(*found, (49.0, -49.0), (80.0, 0.0))
-        )
-    totals = {
-        name: sum(each[name] for each in evaluator.counts.values()) for name in ("hidden", "seen")
-    }
-    assert totals == {"hidden": hidden, "seen": seen}
+        instances = visible_instances(da, token, agents="single")
+        visible_ids = {int(instance.rsplit("/", 1)[1]) for instance in instances}
+        boxes = seen_actors(da, token, agents="all", frame="ego").boxes
+        foreground = motion_labels(da, token, LABELS).segmentation[0] > 0
+        cells, is_inside = LABELS.grid.index_of(boxes.center[:, :2])
+        is_known = (boxes.actor_id >= 0) & is_inside
+        detected = [(49.0, -49.0), (80.0, 0.0)]
+        for index in np.flatnonzero(is_known):
+            row, column = cells[index]
+            if not foreground[row, column]:
+                continue
+            if boxes.actor_id[index] in visible_ids:
+                num_seen += 1
+                detected.append(tuple(boxes.center[index, :2]))
+            else:
+                num_hidden += 1
+        evaluator.update(token, da, LABELS, make_motion(foreground), make_boxes(*detected))
+
+    counts = evaluator.counts.values()
+    assert sum(sample["hidden"] for sample in counts) == num_hidden
+    assert sum(sample["seen"] for sample in counts) == num_seen
     assert evaluator.compute() == {
         "false_foreground": 0.0,
         "hidden_foreground": 1.0,
         "seen_foreground": 1.0,
         "hidden_detected": 0.0,
         "seen_detected": 1.0,
-        "false_boxes": 1.0,  # what lies beyond the grid does not count
+        "false_boxes": 1.0,  # the box beyond the grid does not count
     }
     zeros = np.zeros((5, 2, 100, 100), dtype=np.float32)
     heads = MotionOutput.from_arrays(zeros, zeros[:, :1], zeros, zeros, grid=LABELS.grid)
     with pytest.raises(EvaluationError, match="expected instance maps, found heads"):
-        evaluator.update("other", da, LABELS, heads, boxes_at())
+        evaluator.update("other", da, LABELS, heads, make_boxes())
 
 
-def seeds_of(*shares: float) -> dict[str, dict[str, Any]]:
-    """Ten pairs, in each ten hidden actors of which about this share is found; a seed a share."""
-    made = {}
+def make_hidden_seeds(*shares: float) -> dict[str, dict[str, Any]]:
+    """Make a seed for each share, with ten pairs of ten hidden actors; about this share of them is
+    found.
+    """
+    seeds = {}
     for seed, share in enumerate(shares, 1):
-        evaluators = evaluators_of("clean")
+        evaluator = evaluators_of("clean")[HIDDEN]
         for pair in range(10):
-            found = round(10 * share) + (pair + seed) % 2
-            names = (
-                "seen",
-                "seen_foreground",
-                "seen_detected",
-                "cells",
-                "false_cells",
-                "false_boxes",
-            )
             counts = {
                 "hidden": 10,
-                "hidden_foreground": found,
+                "hidden_foreground": round(10 * share) + (pair + seed) % 2,
                 "hidden_detected": 0,
-                **dict.fromkeys(names, 0),
+                "seen": 0,
+                "seen_foreground": 0,
+                "seen_detected": 0,
+                "cells": 0,
+                "false_cells": 0,
+                "false_boxes": 0,
             }
-            evaluators[HIDDEN].add(SAMPLE.format(pair), counts)
-        made[str(seed)] = {HIDDEN: evaluators[HIDDEN]}
-    return made
+            evaluator.add(SAMPLE_TEMPLATE.format(pair), counts)
+        seeds[str(seed)] = {HIDDEN: evaluator}
+    return seeds
 
 
-def detections_of(*models: tuple[float, float], token: str = SAMPLE) -> dict[str, dict[str, Any]]:
-    """Seeds whose models give a score to true boxes and another one to false boxes, in ten
-    pairs.
-    """
-    made = {}
-    for seed, (true_score, false_score) in enumerate(models, 1):
+def make_detection_seeds(*models: tuple[float, float]) -> dict[str, dict[str, Any]]:
+    """Make a seed for each model's scores of true and of false boxes, with ten pairs."""
+    seeds = {}
+    truth = make_boxes((10.0, 0.0), frame="lidar").boxes
+    for seed, scores in enumerate(models, 1):
         evaluator = evaluators_of("clean")["detection"]
         for pair in range(10):
-            truth = boxes_at((10.0, 0.0), frame="lidar").boxes
-            both = boxes_at(
-                (10.0, 5.0 * (not (pair + seed) % 4)), (30.0, 20.0), frame="lidar"
-            ).boxes
-            found = DetectedBoxes(boxes=both, scores=np.array([true_score, false_score]))
-            evaluator.update(token.format(pair), found, truth)
-        made[str(seed)] = {"detection": evaluator}
-    return made
+            y = 0.0 if (pair + seed) % 4 else 5.0
+            boxes = make_boxes((10.0, y), (30.0, 20.0), frame="lidar").boxes
+            detections = DetectedBoxes(boxes=boxes, scores=np.array(scores))
+            evaluator.update(SAMPLE_TEMPLATE.format(pair), detections, truth)
+        seeds[str(seed)] = {"detection": evaluator}
+    return seeds
 
 
 @pytest.mark.parametrize("models", [((0.9, 0.8), (0.3, 0.2)), ((0.9, 0.8), (0.3, 0.4), (0.6, 0.6))])
 def test_a_number_over_seeds_is_the_mean_of_each_seeds_number(
     models: tuple[tuple[float, float], ...],
 ) -> None:
-    """The curve over the boxes of both would rank the first model's false boxes above the second
-    one's true boxes.
+    """A curve over the boxes of all models would rank the first model's false boxes above the
+    second model's true boxes.
     """
-    seeds = detections_of(*models)
-    tokens = seeds["1"]["detection"].tokens
-    alone = [each["detection"].compute().mean_average_precision for each in seeds.values()]
-    found = numbers_of_rows(tokens, seeds)["map"]
-    assert [*found["seeds"].values()] == alone
-    assert found["value"] == pytest.approx(np.mean(alone))
-    assert found["low"] <= found["value"] <= found["high"]
+    seeds = make_detection_seeds(*models)
+    numbers = numbers_of_rows(seeds["1"]["detection"].tokens, seeds)["map"]
+    expected = [
+        evaluators["detection"].compute().mean_average_precision for evaluators in seeds.values()
+    ]
+    assert [*numbers["seeds"].values()] == expected
+    assert numbers["value"] == pytest.approx(np.mean(expected))
+    assert numbers["low"] <= numbers["value"] <= numbers["high"]
 
 
 def test_a_number_that_a_seed_lacks_has_no_mean() -> None:
-    seeds = seeds_of(0.6, 0.7)
+    seeds = make_hidden_seeds(0.6, 0.7)
     tokens = seeds["1"][HIDDEN].tokens
+    second = seeds["2"][HIDDEN]
     for token in tokens:
-        seeds["2"][HIDDEN]._counts[token] = {**seeds["2"][HIDDEN].counts[token], "hidden": 0}
-    found = numbers_of_rows(tokens, seeds)["hidden_foreground"]
-    assert (found["value"], found["low"], found["seeds"]) == (
-        None,
-        None,
-        {"1": pytest.approx(0.65), "2": None},
-    )
+        second._counts[token] = {**second.counts[token], "hidden": 0}
+    numbers = numbers_of_rows(tokens, seeds)["hidden_foreground"]
+    assert numbers["value"] is None
+    assert numbers["low"] is None
+    assert numbers["seeds"] == {"1": pytest.approx(0.65), "2": None}
 
 
-def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seeds_count_together_and_are_also_listed_one_by_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(
         "deepaccident_devkit.plugins.study.numbers.NUMBERS",
         {"hidden_foreground": (HIDDEN, "hidden_foreground", "")},
     )
-    many, few = seeds_of(0.6, 0.7, 0.8), seeds_of(0.2, 0.3, 0.4)
-    tokens = many["1"][HIDDEN].tokens
-    found = numbers_of_rows(tokens, many)["hidden_foreground"]
-    assert found["seeds"] == {
+    many_found, few_found = make_hidden_seeds(0.6, 0.7, 0.8), make_hidden_seeds(0.2, 0.3, 0.4)
+    tokens = many_found["1"][HIDDEN].tokens
+    numbers = numbers_of_rows(tokens, many_found)["hidden_foreground"]
+    assert numbers["seeds"] == {
         "1": pytest.approx(0.65),
         "2": pytest.approx(0.75),
         "3": pytest.approx(0.85),
     }
-    assert found["low"] < 0.75 < found["high"]
-    baseline = {"": few["1"]}
-    against = numbers_of_rows(tokens, many, baseline)["hidden_foreground"]
-    assert against["value"] == pytest.approx(0.5)
-    assert against["seeds"] == {
+    assert numbers["low"] < 0.75 < numbers["high"]
+
+    baseline = {"": few_found["1"]}
+    differences = numbers_of_rows(tokens, many_found, baseline)["hidden_foreground"]
+    assert differences["value"] == pytest.approx(0.5)
+    assert differences["seeds"] == {
         "1": pytest.approx(0.4),
         "2": pytest.approx(0.5),
         "3": pytest.approx(0.6),
     }
-    assert numbers_of_rows([*tokens][:3], many)["hidden_foreground"]["low"] is None
+    assert numbers_of_rows([*tokens][:3], many_found)["hidden_foreground"]["low"] is None
     assert numbers_of_rows(tokens, baseline)["hidden_foreground"]["seeds"] == {}
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "told"),
+    ("low", "high", "expected"),
     [
         (0.1, 0.3, "wins"),
         (-0.3, -0.1, "loses"),
@@ -192,62 +196,67 @@ def test_seeds_count_together_and_each_stands_beside(monkeypatch: pytest.MonkeyP
     ],
 )
 def test_the_verdict_follows_from_the_interval(
-    low: float | None, high: float | None, told: str
+    low: float | None, high: float | None, expected: str
 ) -> None:
-    assert verdict({"low": low, "high": high}) == told
+    assert verdict({"low": low, "high": high}) == expected
 
 
-def test_labels_as_predictions_know_nobody_who_comes_into_sight_later(da: DeepAccident) -> None:
-    later, labels = 0, replace(LABELS, agents="single")
+def test_labels_as_predictions_lack_actors_that_come_into_sight_later(da: DeepAccident) -> None:
+    config = replace(LABELS, agents="single")
     tokens = [f"{scenario['token']}/ego_vehicle_behind/001" for scenario in da.scenario]
     row = StudyRow(name="labels", trivial="labels", agents="single")
+    num_later = 0
     for token, (motion, _, _) in predictions_of(row, None, "cpu", da, tokens, LABELS):
-        told = motion_labels(da, token, labels).to_present()
-        seen = {
-            int(each.rsplit("/", 1)[1]) for each in visible_instances(da, token, agents="single")
-        } | {OWN_BOX_ID}
-        drawn = {actor for actor, number in told.id_map.items() if (told.instance == number).any()}
-        assert {told.id_map[actor] for actor in drawn & seen} == set(
-            np.unique(motion.instances).tolist()
-        ) - {0}
-        later += len(drawn - seen)
-    assert later > 0
+        instances = visible_instances(da, token, agents="single")
+        visible_ids = {int(instance.rsplit("/", 1)[1]) for instance in instances}
+        label = motion_labels(da, token, config).to_present()
+        expected = set()
+        for actor_id, number in label.id_map.items():
+            if not (label.instance == number).any():
+                continue
+            if actor_id in visible_ids or actor_id == OWN_BOX_ID:
+                expected.add(number)
+            else:
+                num_later += 1
+        assert set(np.unique(motion.instances).tolist()) - {0} == expected
+    assert num_later > 0
 
 
-def test_strangers_are_of_another_pair() -> None:
-    own = [
+def test_strangers_come_from_another_pair() -> None:
+    tokens = [
         f"type1_subtype1_{kind}/Town03_{name}/ego_vehicle/{frame:03d}"
         for name in "ab"
         for kind in ("accident", "normal")
         for frame in (5, 10)
     ]
-    others = strangers_of(own)
-    assert [each.split("/")[1] for each in others] == ["Town03_b"] * 4 + ["Town03_a"] * 4
-    assert [each.rsplit("/", 1)[1] for each in others] == [each.rsplit("/", 1)[1] for each in own]
+    strangers = strangers_of(tokens)
+    assert [token.split("/")[1] for token in strangers] == ["Town03_b"] * 4 + ["Town03_a"] * 4
+    frames = [token.rsplit("/", 1)[1] for token in tokens]
+    assert [token.rsplit("/", 1)[1] for token in strangers] == frames
     with pytest.raises(
-        NotAvailableError, match="Town03_a: there is no other pair to take strangers from"
+        NotAvailableError, match="Town03_a: there is no other pair to take unrelated partners from"
     ):
-        strangers_of(own[:4])
+        strangers_of(tokens[:4])
 
 
-def test_partners_of_strangers_are_those_of_the_same_name() -> None:
-    class Numbers(list):  # type: ignore[type-arg]
-        def clone(self) -> "Numbers":
-            return Numbers(self)
+def test_partners_are_replaced_by_strangers_of_the_same_name() -> None:
+    class FakeTensor(list):  # type: ignore[type-arg]
+        def clone(self) -> "FakeTensor":
+            return FakeTensor(self)
 
     item = {
         "token": "a",
         "agents": ("ego", "behind", "pole"),
-        "images": Numbers([0, 1, 2]),
+        "images": FakeTensor([0, 1, 2]),
         "points": [[0], [1], [2]],
     }
     other = {
         "token": "b",
         "agents": ("ego", "pole"),
-        "images": Numbers([10, 12]),
+        "images": FakeTensor([10, 12]),
         "points": [[10], [12]],
     }
-    found = with_strangers(item, other)
-    assert (found["token"], found["agents"]) == ("a", item["agents"])
-    assert (found["images"], found["points"]) == ([0, 1, 12], [[0], [1], [12]])
+    mixed = with_strangers(item, other)
+    assert (mixed["token"], mixed["agents"]) == ("a", item["agents"])
+    assert (mixed["images"], mixed["points"]) == ([0, 1, 12], [[0], [1], [12]])
     assert item["images"] == [0, 1, 2]

@@ -1,4 +1,6 @@
-"""What a test and a training have in common, whatever the names of scenarios and of releases."""
+"""Scenarios that a test shares with a training are known, whatever the names of scenarios and
+releases.
+"""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -13,26 +15,25 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.plugins.study.overlap import known_scenarios
 
-Changed = Callable[[Path], object]
+Change = Callable[[Path], object]
 
 
-def renamed(root: Path) -> None:
-    """Give all scenarios other numbers: in folders, in the names of files, and in split files."""
+def rename_scenarios(root: Path) -> None:
+    """Give all scenarios other numbers in folders, file names and split files."""
     for path in sorted(root.rglob("*scenario0*"), key=lambda path: -len(path.parts)):
         path.rename(path.with_name(path.name.replace("scenario0", "scenario7")))
-    for listed in root.rglob("*.txt"):
-        if listed.parent.name != "label":
-            listed.write_text(listed.read_text().replace("scenario0", "scenario7"))
+    for text_file in root.rglob("*.txt"):
+        if text_file.parent.name != "label":
+            text_file.write_text(text_file.read_text().replace("scenario0", "scenario7"))
 
 
-def shortened(root: Path) -> None:
-    """Leave out the last frames."""
+def remove_last_frames(root: Path) -> None:
     for path in [*root.rglob("*_003.*"), *root.rglob("*_004.*")]:
         path.unlink()
 
 
-def without(word: str) -> Changed:
-    """Leave out the folders that have a word in their name."""
+def folder_remover(word: str) -> Change:
+    """Return a change that removes folders with a word in their name."""
 
     def change(root: Path) -> None:
         for folder in [*root.rglob(f"*{word}*")]:
@@ -41,7 +42,7 @@ def without(word: str) -> Changed:
     return change
 
 
-def opened(root: Path, changes: Iterable[Changed] = ()) -> DeepAccident:
+def open_changed(root: Path, changes: Iterable[Change] = ()) -> DeepAccident:
     for change in changes:
         change(root)
     return DeepAccident("v1", root, verbose=False, on_error="skip")
@@ -53,83 +54,85 @@ def tokens_of(dataset: DeepAccident) -> list[str]:
 
 def test_twins_and_the_same_scenarios_of_one_release_are_known(da_b: DeepAccident) -> None:
     tokens = tokens_of(da_b)
-    for learned in tokens:
-        pair = [each for each in tokens if cluster_of(each) == cluster_of(learned)]
-        assert learned in pair
-        assert known_scenarios((da_b, [learned]), (da_b, tokens)) == pair
-    assert (
-        known_scenarios((da_b, []), (da_b, tokens))
-        == known_scenarios((da_b, tokens), (da_b, []))
-        == []
-    )
+    for token in tokens:
+        pair = [other for other in tokens if cluster_of(other) == cluster_of(token)]
+        assert token in pair
+        assert known_scenarios((da_b, [token]), (da_b, tokens)) == pair
+    assert known_scenarios((da_b, []), (da_b, tokens)) == []
+    assert known_scenarios((da_b, tokens), (da_b, [])) == []
 
 
 @pytest.mark.parametrize(
     "changes",
     [
         (),
-        (renamed,),
-        (shortened,),
-        (renamed, shortened),
-        (without("_behind"),),
-        (renamed, without("_normal")),
-        (renamed, without("_accident")),
+        (rename_scenarios,),
+        (remove_last_frames,),
+        (rename_scenarios, remove_last_frames),
+        (folder_remover("_behind"),),
+        (rename_scenarios, folder_remover("_normal")),
+        (rename_scenarios, folder_remover("_accident")),
     ],
 )
 def test_a_copy_is_known_by_its_actors(
-    changes: tuple[Changed, ...], da_b: DeepAccident, own_release: Path
+    changes: tuple[Change, ...], da_b: DeepAccident, own_release: Path
 ) -> None:
-    """Under other names, with fewer frames, fewer agents, or of one of the twins alone."""
-    copy, tokens = opened(own_release, changes), tokens_of(da_b)
-    assert tokens_of(copy)
-    assert known_scenarios((copy, tokens_of(copy)), (da_b, tokens)) == tokens
-    assert known_scenarios((da_b, tokens), (copy, tokens_of(copy))) == tokens_of(copy)
+    """A copy may have other names, fewer frames, fewer agents, or only one of the twins."""
+    copy, tokens = open_changed(own_release, changes), tokens_of(da_b)
+    copy_tokens = tokens_of(copy)
+    assert copy_tokens
+    assert known_scenarios((copy, copy_tokens), (da_b, tokens)) == tokens
+    assert known_scenarios((da_b, tokens), (copy, copy_tokens)) == copy_tokens
 
 
 def test_other_releases_of_the_generator_are_not_known(
     da: DeepAccident, da_b: DeepAccident, da_motion: DeepAccident
 ) -> None:
-    releases = [(each, tokens_of(each)) for each in (da, da_b, da_motion)]
+    releases = [(dataset, tokens_of(dataset)) for dataset in (da, da_b, da_motion)]
     for learned in releases:
         for tested in releases:
-            assert known_scenarios(learned, tested) == (tested[1] if learned is tested else [])
+            expected = tested[1] if learned is tested else []
+            assert known_scenarios(learned, tested) == expected
 
 
-def scene(name: str, moving: list[int], parked: int, layout: str = "A") -> tuple[Any, list[str]]:
-    """A release of one scenario with these actors, whose sizes follow from their ids."""
+def make_scenario(
+    name: str, moving: list[int], parked: int, layout: str = "A"
+) -> tuple[Any, list[str]]:
+    """Make a release of one scenario with these actors; their sizes follow from their ids."""
     ids = np.array([*moving, *range(20_001, 20_001 + parked), -1])
     rows = np.arange(len(ids))
     tables = {
         "instance": {"actor_id": ids, "scenario_row": 0 * rows, "first_annotation_row": rows},
         "annotation": {"size": np.outer(ids % 1000, [0.01, 0.02, 0.03])},
     }
-    return SimpleNamespace(
+    release = SimpleNamespace(
         layout=layout, dataroot=Path(name), columns=tables.get, getind=lambda *_: 0
-    ), [name]
+    )
+    return release, [name]
 
 
 @pytest.mark.parametrize(
-    ("learned", "tested", "known"),
+    ("learned", "tested", "is_known"),
     [
         ([1, 2, 3, 4], [1, 2, 3, 9], True),
         ([1, 2, 3, 4], [1, 2, 8, 9], False),
         ([1, 2, 3, 4, 5, 6, 7, 8, 9, 10], [1, 2, 3, 4, 5, 6, 7], True),  # fewer frames
-        ([1, 2], [1, 2], False),  # may be chance
+        ([1, 2], [1, 2], False),  # two equal actors may be chance
         ([], [], False),
     ],
 )
 def test_a_town_has_the_same_parked_vehicles_in_all_scenarios(
-    learned: list[int], tested: list[int], known: bool
+    learned: list[int], tested: list[int], is_known: bool
 ) -> None:
-    ours, theirs = scene("a", learned, 20), scene("b", tested, 20)
-    assert bool(known_scenarios(ours, theirs)) == bool(known_scenarios(theirs, ours)) == known
+    learned_scenario = make_scenario("a", learned, parked=20)
+    tested_scenario = make_scenario("b", tested, parked=20)
+    assert bool(known_scenarios(learned_scenario, tested_scenario)) == is_known
+    assert bool(known_scenarios(tested_scenario, learned_scenario)) == is_known
 
 
 def test_instances_of_nuscenes_are_compared_by_their_sizes() -> None:
-    """Their numbers are others: 1001 has the size of 1."""
-    assert known_scenarios(
-        scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0, "nuScenes")
-    ) == ["b"]
-    assert (
-        known_scenarios(scene("a", [1, 2, 3, 4], 0), scene("b", [1001, 1002, 1003, 1004], 0)) == []
-    )
+    """Their ids differ, and an actor with id 1001 has the size of the one with id 1."""
+    learned = make_scenario("a", [1, 2, 3, 4], parked=0)
+    ids = [1001, 1002, 1003, 1004]
+    assert known_scenarios(learned, make_scenario("b", ids, 0, layout="nuScenes")) == ["b"]
+    assert known_scenarios(learned, make_scenario("b", ids, 0)) == []

@@ -1,34 +1,31 @@
-"""Recipes: what a file can say, and what is said of faults."""
+"""Recipes: what a file can contain, and how faults in it are reported."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
+from support.study_recipes import write_recipe
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.study import read_recipe
 from deepaccident_devkit.plugins.study.recipe import MAX_ROWS, SHIPPED_RECIPES, StudyRow
 
-PLAIN: dict[str, Any] = {
+PLAIN_RECIPE: dict[str, Any] = {
     "title": "A study",
     "question": "Does it help?",
     "releases": {"test": {"seed": 3, "scenarios": 4}},
     "test": {"release": "test"},
     "rows": [{"name": "one", "baseline": "standing"}, {"name": "two", "trivial": "nothing"}],
 }
-MODEL = {"weights": {"trunk": {"release": "test"}}, "rows": [{"name": "one", "weights": "trunk"}]}
-
-
-def written(folder: Path, recipe: dict[str, Any]) -> str:
-    path = folder / "mine.yaml"
-    path.write_text(json.dumps(recipe), encoding="utf-8")  # JSON is YAML
-    return str(path)
+MODEL_RECIPE = {
+    "weights": {"trunk": {"release": "test"}},
+    "rows": [{"name": "one", "weights": "trunk"}],
+}
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"titel": "A study"}, "unknown field `titel`"),
         ({"title": 3}, r"expected `str`, got `int` - at `\$.title`"),
@@ -54,11 +51,11 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
         ),
         (
             {"rows": [{"name": "one", "trivial": "nothing"}] * 2},
-            "rows: one: name: is there twice; name the keys",
+            "rows: one: name: appears twice; put the keys",
         ),
         (
             {"rows": [{"name": "one", "baseline": "standing", "control": "blank"}]},
-            "control: spoils what a model sees",
+            "control: changes what a model sees",
         ),
         (
             {"rows": [{"name": "one", "baseline": "standing", "agents": "+front"}]},
@@ -77,20 +74,20 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
             "unknown field `latencies`",
         ),
         (
-            {**MODEL, "rows": [{"name": "one", "weights": "trunk", "horizon": 3.0}]},
-            "horizon: is what the weights were",
+            {**MODEL_RECIPE, "rows": [{"name": "one", "weights": "trunk", "horizon": 3.0}]},
+            "horizon: is set by the weights",
         ),
         (
-            {**MODEL, "weights": {"trunk": {"release": "tset"}}},
+            {**MODEL_RECIPE, "weights": {"trunk": {"release": "tset"}}},
             "weights.trunk: release: .*did you mean 'test'",
         ),
         (
-            {**MODEL, "weights": {"trunk": {"release": "test", "from": "trunk"}}},
-            "from, which stands above: expected",
+            {**MODEL_RECIPE, "weights": {"trunk": {"release": "test", "from": "trunk"}}},
+            r"from \(weights listed above\): expected",
         ),
         (
-            {**MODEL, "weights": {"trunk": {"file": "tiny", "steps": 3}}},
-            "file: these weights are there; leave the other",
+            {**MODEL_RECIPE, "weights": {"trunk": {"file": "tiny", "steps": 3}}},
+            "file: these weights already exist; remove the other",
         ),
         (
             {"releases": {"test": {"sede": 3}}},
@@ -108,7 +105,7 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
         ({"test": {"release": "test", "labels": "cleam"}}, "test: .*did you mean 'clean'"),
         (
             {"test": {"release": "TEST"}},
-            "test: release: found 'TEST'; write it with the same capital letters",
+            "test: release: found 'TEST'; use the same capital letters",
         ),
         (
             {"headline": {"row": "one", "less": "two", "number": "APA"}},
@@ -141,7 +138,7 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
         ),
         *(
             (
-                {**MODEL, "weights": {"trunk": {"release": "test", key: value}}},
+                {**MODEL_RECIPE, "weights": {"trunk": {"release": "test", key: value}}},
                 f"weights.trunk: .*{key}",
             )
             for key, value in {
@@ -153,7 +150,7 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
             }.items()
         ),
         (
-            {**MODEL, "weights": {"trunk": {"release": "test", "mix": 1.5}}},
+            {**MODEL_RECIPE, "weights": {"trunk": {"release": "test", "mix": 1.5}}},
             "mix: expected a share .*found 1.5",
         ),
         ({"seeds": [-1]}, r"expected `int` >= 0 - at `\$.seeds\[0\]`"),
@@ -174,70 +171,72 @@ def written(folder: Path, recipe: dict[str, Any]) -> str:
     ],
 )
 def test_a_fault_is_named_with_its_file_its_key_and_a_remedy(
-    changes: dict[str, Any], told: str, tmp_path: Path
+    changes: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    path = written(tmp_path, {**PLAIN, **changes})
-    with pytest.raises(ConfigError, match=told) as raised:
-        read_recipe(path)
+    path = write_recipe(tmp_path, {**PLAIN_RECIPE, **changes})
+    with pytest.raises(ConfigError, match=message) as raised:
+        read_recipe(str(path))
     assert str(raised.value).startswith(f"{path}: ")
 
 
 @pytest.mark.parametrize("rows", [5, [5], {"a": 1}, None])
-def test_rows_of_the_smoke_part_are_rows(rows: Any, tmp_path: Path) -> None:
-    path = written(tmp_path, {**PLAIN, "smoke": {"rows": rows}})
+def test_rows_of_the_smoke_part_must_be_rows(rows: Any, tmp_path: Path) -> None:
+    path = write_recipe(tmp_path, {**PLAIN_RECIPE, "smoke": {"rows": rows}})
     with pytest.raises(
         ConfigError, match=r"mine.yaml: the recipe: expected .* got .* - at `\$.rows"
     ):
-        read_recipe(path, smoke=True)
+        read_recipe(str(path), smoke=True)
 
 
 def test_lists_in_many_keys_are_counted_before_they_are_multiplied_out(tmp_path: Path) -> None:
-    numbers = {
-        key: [float(each) for each in range(100)]
-        for key in ("horizon", "latency", "pose_noise", "packet_loss")
-    }
+    def read_rows(rows: list[dict[str, Any]]) -> tuple[StudyRow, ...]:
+        return read_recipe(str(write_recipe(tmp_path, {**PLAIN_RECIPE, "rows": rows}))).rows
+
+    hundred_numbers = [float(number) for number in range(100)]
     row = {
         "name": "a",
         "baseline": "standing",
-        **numbers,
+        "horizon": hundred_numbers,
+        "latency": hundred_numbers,
+        "pose_noise": hundred_numbers,
+        "packet_loss": hundred_numbers,
         "agents": ["all"] * 100,
         "budget": list(range(1, 101)),
     }
     with pytest.raises(
-        ConfigError, match=r"rows: expected 1 to 1,000, found 1,000,000,000,000: a list makes a row"
+        ConfigError,
+        match=r"rows: expected 1 to 1,000, found 1,000,000,000,000; each value of a list",
     ):
-        read_recipe(written(tmp_path, {**PLAIN, "rows": [row]}))
-    many = [
-        {"name": f"{{agents}} {each}", "trivial": "nothing", "agents": ["all", "single"]}
-        for each in range(500)
+        read_rows([row])
+    many_rows = [
+        {"name": f"{{agents}} {number}", "trivial": "nothing", "agents": ["all", "single"]}
+        for number in range(500)
     ]
-    assert len(read_recipe(written(tmp_path, {**PLAIN, "rows": many})).rows) == MAX_ROWS
+    assert len(read_rows(many_rows)) == MAX_ROWS
     with pytest.raises(ConfigError, match="found 1,001"):
-        read_recipe(
-            written(tmp_path, {**PLAIN, "rows": [*many, {"name": "one", "trivial": "nothing"}]})
-        )
+        read_rows([*many_rows, {"name": "one", "trivial": "nothing"}])
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"rows": [{"name": f"n{each}", "trivial": "nothing"} for each in range(28_000)]},
-        {"weights": {f"w{each}": {"release": "test"} for each in range(40_000)}},
+        {"rows": [{"name": f"n{number}", "trivial": "nothing"} for number in range(28_000)]},
+        {"weights": {f"w{number}": {"release": "test"} for number in range(40_000)}},
     ],
 )
 def test_a_recipe_of_too_many_characters_is_not_parsed(
     changes: dict[str, Any], tmp_path: Path
 ) -> None:
-    path = written(tmp_path, {**PLAIN, **changes})
+    path = str(write_recipe(tmp_path, {**PLAIN_RECIPE, **changes}))
     with pytest.raises(
         ConfigError, match=r"has [\d,]+ characters, more than 100,000; split the study|more than"
-    ) as told:
+    ) as raised:
         read_recipe(path)
-    assert path in str(told.value)
+    assert path in str(raised.value)
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         (None, r"no\.yaml: cannot be read"),
         ("a: &b {}\nc: *b\n", r"no\.yaml:2: c: aliases"),
@@ -245,26 +244,25 @@ def test_a_recipe_of_too_many_characters_is_not_parsed(
         ("- a\n", r"no\.yaml: .*got `array`"),
     ],
 )
-def test_files_that_are_no_recipes(content: str | None, told: str, tmp_path: Path) -> None:
+def test_files_that_are_no_recipes_are_refused(
+    content: str | None, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "no.yaml"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=message):
         read_recipe(str(path))
 
 
-def test_an_unknown_recipe_and_a_smoke_part_that_is_not_there_are_refused(tmp_path: Path) -> None:
-    assert_refused(
+def test_an_unknown_recipe_and_a_missing_smoke_part_are_refused(tmp_path: Path) -> None:
+    path = str(write_recipe(tmp_path, PLAIN_RECIPE))
+    assert_raises(
         (lambda: read_recipe("link"), ConfigError, ("'link'", "did you mean 'links'")),
-        (
-            lambda: read_recipe(written(tmp_path, PLAIN), smoke=True),
-            ConfigError,
-            ("smoke", "--smoke"),
-        ),
+        (lambda: read_recipe(path, smoke=True), ConfigError, ("smoke", "--smoke")),
     )
 
 
-def test_a_list_makes_a_row_each(tmp_path: Path) -> None:
+def test_each_element_of_a_list_makes_a_row(tmp_path: Path) -> None:
     rows = [
         {
             "name": "{agents}, {latency} s",
@@ -274,58 +272,57 @@ def test_a_list_makes_a_row_each(tmp_path: Path) -> None:
         },
         {"name": "{agents.__class__} {weights}", "trivial": "nothing", "agents": ["all"]},
     ]
-    found = read_recipe(written(tmp_path, {**PLAIN, "rows": rows})).rows
+    study_rows = read_recipe(str(write_recipe(tmp_path, {**PLAIN_RECIPE, "rows": rows}))).rows
     expected = [
         StudyRow(
-            name=f"{agents}, {late} s",
+            name=f"{agents}, {latency} s",
             baseline="standing",
             agents=agents,
-            latency=late,
-            over=("latency", late, f"{agents}, … s"),
+            latency=latency,
+            over=("latency", latency, f"{agents}, … s"),
         )
         for agents in ("single", "all")
-        for late in (0.0, 0.5)
+        for latency in (0.0, 0.5)
     ]
-    assert list(found) == [
-        *expected,
-        StudyRow(name="{agents.__class__} {weights}", trivial="nothing"),
-    ]
-    assert (found[0].link, found[1].link and found[1].link.latency_frames) == (None, 5)
-    assert StudyRow(name="a", agents="ego_vehicle,other_vehicle").cooperating == [
-        "ego_vehicle",
-        "other_vehicle",
-    ]
+    expected.append(StudyRow(name="{agents.__class__} {weights}", trivial="nothing"))
+    assert list(study_rows) == expected
+    assert study_rows[0].link is None
+    assert study_rows[1].link.latency_frames == 5
+    row = StudyRow(name="a", agents="ego_vehicle,other_vehicle")
+    assert row.cooperating == ["ego_vehicle", "other_vehicle"]
 
 
 def test_the_smoke_part_replaces_what_it_names(tmp_path: Path) -> None:
-    small = {"releases": {"test": {"scenarios": 2}}, "rows": PLAIN["rows"][:1], "title": "Small"}
-    path = written(tmp_path, {**PLAIN, "smoke": small})
+    smoke_part = {
+        "releases": {"test": {"scenarios": 2}},
+        "rows": PLAIN_RECIPE["rows"][:1],
+        "title": "Small",
+    }
+    path = str(write_recipe(tmp_path, {**PLAIN_RECIPE, "smoke": smoke_part}))
     whole, smoke = read_recipe(path), read_recipe(path, smoke=True)
-    assert (whole.name, smoke.name, whole.title, smoke.title) == (
-        "mine",
-        "mine-smoke",
-        "A study",
-        "Small",
-    )
+    assert (whole.name, smoke.name) == ("mine", "mine-smoke")
+    assert (whole.title, smoke.title) == ("A study", "Small")
     assert (len(whole.rows), len(smoke.rows)) == (2, 1)
-    assert (whole.releases["test"], smoke.releases["test"]) == (
-        {"seed": 3, "scenarios": 4},
-        {"seed": 3, "scenarios": 2},
-    )
+    assert whole.releases["test"] == {"seed": 3, "scenarios": 4}
+    assert smoke.releases["test"] == {"seed": 3, "scenarios": 2}
     assert whole.test == smoke.test
 
 
-def test_the_recipes_that_ship_share_releases_and_the_trunk() -> None:
-    names = sorted(each.stem for each in SHIPPED_RECIPES.glob("*.yaml"))
+def test_the_shipped_recipes_share_releases_and_the_trunk() -> None:
+    names = sorted(path.stem for path in SHIPPED_RECIPES.glob("*.yaml"))
     assert all(read_recipe(name, smoke=True).rows for name in names)
-    trained = [recipe for recipe in map(read_recipe, names) if "trunk" in recipe.weights]
-    assert len(trained) > 1
-    assert len({str((each.releases["training"], each.weights["trunk"])) for each in trained}) == 1
-    assert all(set(each.seeds) <= set(trained[0].seeds) for each in trained)
+    first, *other_recipes = (
+        recipe for recipe in map(read_recipe, names) if "trunk" in recipe.weights
+    )
+    assert other_recipes
+    for recipe in other_recipes:
+        assert recipe.releases["training"] == first.releases["training"]
+        assert recipe.weights["trunk"] == first.weights["trunk"]
+        assert set(recipe.seeds) <= set(first.seeds)
 
 
 def test_a_scenario_file_lies_beside_the_recipe(tmp_path: Path) -> None:
-    recipe = written(
-        tmp_path, {**PLAIN, "releases": {"test": {"seed": 3, "spec": "scenes/mine.yaml"}}}
-    )
-    assert read_recipe(recipe).releases["test"]["spec"] == str(tmp_path / "scenes" / "mine.yaml")
+    releases = {"test": {"seed": 3, "spec": "scenes/mine.yaml"}}
+    path = write_recipe(tmp_path, {**PLAIN_RECIPE, "releases": releases})
+    expected = str(tmp_path / "scenes" / "mine.yaml")
+    assert read_recipe(str(path)).releases["test"]["spec"] == expected

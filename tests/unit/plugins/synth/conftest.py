@@ -27,13 +27,13 @@ def scenarios(release_root) -> tuple[ScenarioFolder, ...]:
 
 @pytest.fixture(scope="session")
 def digests():
-    """Relative path → content of every file below a folder."""
+    """A function that reads every file below a folder: relative path → content."""
 
     def read(root: Path) -> dict[str, bytes]:
         return {
-            p.relative_to(root).as_posix(): p.read_bytes()
-            for p in sorted(root.rglob("*"))
-            if p.is_file()
+            path.relative_to(root).as_posix(): path.read_bytes()
+            for path in sorted(root.rglob("*"))
+            if path.is_file()
         }
 
     return read

@@ -1,4 +1,4 @@
-"""Benchmarks: what is published is what is made, wherever it is made, and what differs is told."""
+"""Benchmarks: a release made anywhere equals the published one, and every difference is named."""
 
 import importlib
 import json
@@ -32,11 +32,13 @@ from deepaccident_devkit.release import read_image, read_lidar, write_image, wri
 TOP = Path(__file__).parents[4]
 
 
-def more_points(path: Path) -> None:
-    path.write_text(re.sub(r"(\d+) (True|False)$", r"1\1 \2", path.read_text(), flags=re.MULTILINE))
+def add_points(path: Path) -> None:
+    """Write a 1 before each number of points in a label file."""
+    text = path.read_text()
+    path.write_text(re.sub(r"(\d+) (True|False)$", r"1\1 \2", text, flags=re.MULTILINE))
 
 
-MAKE = """
+RECORDING_SCRIPT = """
 import json, sys
 from dataclasses import replace
 from pathlib import Path
@@ -49,14 +51,15 @@ config = BENCHMARKS["v1"]
 plans = plan_scenarios(config)
 for number in numbers:
     record_scenario(RecordingJob(root, replace(config, sensors=sensors), plans[number]))
-print(json.dumps({each.token: described(each) for each in find_release(root).scenarios}))
+scenarios = find_release(root).scenarios
+print(json.dumps({scenario.token: described(scenario) for scenario in scenarios}))
 """
-"""Makes some scenarios of the benchmark, and says what is compared of them."""
+"""Records some scenarios of the benchmark, and prints what is compared of them."""
 
 
-def elsewhere() -> dict[str, str]:
-    """The environment of another machine: its place, its hash seed, its threads, and an older
-    processor for numpy.
+def foreign_environment() -> dict[str, str]:
+    """Make the environment of another machine: another locale, hash seed and number of threads, and
+    an older processor for numpy.
     """
     from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
@@ -72,23 +75,29 @@ def elsewhere() -> dict[str, str]:
     }
 
 
-def made(
-    root: Path, sensors: str, numbers: list[int], environment: dict[str, str]
-) -> dict[str, object]:
-    words = [sys.executable, "-W", "ignore", "-c", MAKE, str(root), sensors, *map(str, numbers)]
-    run = subprocess.run(words, env=environment, check=True, capture_output=True, text=True)
-    found: dict[str, object] = json.loads(run.stdout)
-    return found
+def record_scenarios(root: Path, sensors: str, numbers: list[int]) -> dict[str, object]:
+    arguments = [str(root), sensors, *map(str, numbers)]
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", RECORDING_SCRIPT, *arguments],
+        env=foreign_environment(),
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return dict(json.loads(run.stdout))
 
 
 def test_what_is_published_is_what_is_planned() -> None:
     plans = plan_scenarios(BENCHMARKS["v1"])
-    told = published("v1")["scenarios"]
-    assert sorted(told) == sorted(plan.token for plan in plans)
+    scenarios = published("v1")["scenarios"]
+    assert sorted(scenarios) == sorted(plan.token for plan in plans)
     assert Counter(plan.accident for plan in plans) == {True: 120, False: 120}
     assert {plan.design for plan in plans} == set(range(1, 13))
-    numbers = {kind: {len(scenario[kind]) for scenario in told.values()} for kind in TOLERANCES}
-    assert numbers == {
+
+    lengths = {
+        kind: {len(scenario[kind]) for scenario in scenarios.values()} for kind in TOLERANCES
+    }
+    assert lengths == {
         "num_lidar_pts": {1},
         "images": {5 * 6 * 8},
         "clouds": {5 * 8},
@@ -98,51 +107,47 @@ def test_what_is_published_is_what_is_planned() -> None:
         published("v2")
 
 
-def test_the_page_has_what_is_kept_of_the_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_shows_the_stored_numbers_of_each_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOP))
     rows = importlib.import_module("benchmarks.pages.benchmark")
     page = (TOP / "docs" / "benchmark.md").read_text(encoding="utf-8")
+
     for name in rows.ROWS:
-        assert (
-            f"| `{name}` | {' | '.join(rows.text(name, column) for column in rows.NUMBERS)} |"
-            in page
-        )
+        numbers = [rows.text(name, column) for column in rows.NUMBERS]
+        assert f"| `{name}` | {' | '.join(numbers)} |" in page
         for task in rows.TASKS:
-            bundle = read_bundle(rows.KEPT / name / task)
+            bundle = read_bundle(rows.ROWS_FOLDER / name / task)
             assert checksums_of(bundle.folder) == bundle.checksums()
-            assert (bundle.setup.protocol, bundle.selection.split, bundle.selection.samples) == (
-                "paper",
-                "test",
-                "evaluate",
-            )
+            assert bundle.setup.protocol == "paper"
+            assert (bundle.selection.split, bundle.selection.samples) == ("test", "evaluate")
 
 
-def test_its_seed_is_of_no_release_that_anything_shipped_was_tuned_with() -> None:
+def test_nothing_shipped_was_tuned_with_its_seed() -> None:
     recipes = [read_recipe(path) for path in sorted(SHIPPED_RECIPES.glob("*.yaml"))]
     configs = [synth_config_of(source) for recipe in recipes for source in recipe.releases.values()]
     seeds = {config.seed for config in configs if config is not None}
+
     assert len(seeds) > 5
-    assert BENCHMARKS["v1"].seed not in seeds | {
-        12,
-        208,
-    }  # of the baselines' page, and of the shipped weights' scores
+    # 12: the baselines' page; 208: the scores of the shipped weights
+    assert BENCHMARKS["v1"].seed not in seeds | {12, 208}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("sensors", "numbers"), [("none", [0, 1, 67, 118, 239]), ("all", [102])])
-def test_it_is_made_elsewhere_too(tmp_path: Path, sensors: str, numbers: list[int]) -> None:
-    """Labels, meta and calib byte for byte."""
-    told = published("v1")
-    found = made(tmp_path / "there", sensors, numbers, elsewhere())
-    wanted = {token: told["scenarios"][token] for token in found}
-    assert len(found) == len(numbers)
-    assert (
-        differences({"splits": None, "scenarios": found}, {"splits": None, "scenarios": wanted})
-        == []
+def test_another_machine_makes_the_same(tmp_path: Path, sensors: str, numbers: list[int]) -> None:
+    """Labels, meta and calib are compared byte for byte."""
+    scenarios = record_scenarios(tmp_path / "there", sensors, numbers)
+    assert len(scenarios) == len(numbers)
+
+    stored = published("v1")["scenarios"]
+    expected = {token: stored[token] for token in scenarios}
+    assert not differences(
+        {"splits": None, "scenarios": scenarios},
+        {"splits": None, "scenarios": expected},
     )
 
 
-def edited(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+def edit_file(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     if path.suffix == ".jpg":
         write_image(path, change(read_image(path)))
     else:
@@ -150,91 +155,100 @@ def edited(path: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
         write_lidar(path, change(cloud.xyz), cloud.intensity)
 
 
-def each_edited(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Sequence[Path]], object]:
-    return lambda paths: [edited(path, change) for path in paths]
+def edit_each(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Sequence[Path]], object]:
+    return lambda paths: [edit_file(path, change) for path in paths]
 
 
-def one_frame_late(paths: Sequence[Path]) -> None:
+def delay_by_one_frame(paths: Sequence[Path]) -> None:
     for folder in {path.parent for path in paths}:
-        own = sorted(path for path in paths if path.parent == folder)
-        for path, content in zip(own[1:], [path.read_bytes() for path in own[:-1]], strict=True):
+        frames = sorted(path for path in paths if path.parent == folder)
+        contents = [path.read_bytes() for path in frames[:-1]]
+        for path, content in zip(frames[1:], contents, strict=True):
             path.write_bytes(content)
 
 
-def first_point_unknown(points: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.full((1, 3), np.nan), points[1:]])
+def lose_first_point(points: np.ndarray) -> np.ndarray:
+    return np.concatenate(
+        [
+            np.full((1, 3), np.nan),
+            points[1:],
+        ]
+    )
 
 
 IMAGES, CLOUDS = "*/*/Camera_Front/*/*.jpg", "*/*/lidar01/*/*.npz"
 
 
 @pytest.fixture(scope="module")
-def wanted(release_root: Path) -> dict[str, object]:
-    """What is compared of the release."""
+def description(release_root: Path) -> dict[str, object]:
     return described_release(release_root, workers=1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("files", "change", "told"),
+    ("files", "change", "kind"),
     [
         (
             "*/*/label/*/*_002.txt",
             lambda paths: [path.write_bytes(b"9" + path.read_bytes()) for path in paths],
             "boxes",
         ),
-        ("*/*/label/*/*.txt", lambda paths: [more_points(path) for path in paths], "num_lidar_pts"),
+        ("*/*/label/*/*.txt", lambda paths: [add_points(path) for path in paths], "num_lidar_pts"),
         ("*/*/calib/*/*_002.pkl", lambda paths: [path.unlink() for path in paths], "calib"),
         ("*/meta/*.txt", lambda paths: [path.unlink() for path in paths], "meta"),
         ("*/*/Camera_Back/*/*_003.jpg", lambda paths: [path.unlink() for path in paths], "images"),
-        (IMAGES, each_edited(lambda pixels: cv2.flip(pixels, 1)), "images"),
-        (IMAGES, each_edited(lambda pixels: cv2.add(pixels, 8.0)), "images"),
+        (IMAGES, edit_each(lambda pixels: cv2.flip(pixels, 1)), "images"),
+        (IMAGES, edit_each(lambda pixels: cv2.add(pixels, 8.0)), "images"),
         (
             IMAGES,
-            each_edited(lambda pixels: np.full_like(pixels, pixels.mean(axis=(0, 1)))),
+            edit_each(lambda pixels: np.full_like(pixels, pixels.mean(axis=(0, 1)))),
             "images",
         ),
-        (IMAGES, one_frame_late, "images"),
-        ("*/ego_vehicle/BEV_instance_camera/*/*.npz", one_frame_late, "BEV pictures"),
-        (CLOUDS, each_edited(lambda points: np.add(points, (0, 0, 0.2))), "clouds"),
-        (CLOUDS, each_edited(lambda points: points * (1, -1, 1)), "clouds"),
-        (CLOUDS, each_edited(first_point_unknown), "clouds"),
-        (CLOUDS, one_frame_late, "clouds"),
+        (IMAGES, delay_by_one_frame, "images"),
+        ("*/ego_vehicle/BEV_instance_camera/*/*.npz", delay_by_one_frame, "BEV pictures"),
+        (CLOUDS, edit_each(lambda points: np.add(points, (0, 0, 0.2))), "clouds"),
+        (CLOUDS, edit_each(lambda points: points * (1, -1, 1)), "clouds"),
+        (CLOUDS, edit_each(lose_first_point), "clouds"),
+        (CLOUDS, delay_by_one_frame, "clouds"),
         ("train.txt", lambda paths: paths[0].write_text("Scenario\n"), "split files"),
     ],
 )
-def test_what_differs_is_told(
+def test_what_differs_is_named(
     release_root: Path,
-    wanted: dict[str, object],
+    description: dict[str, object],
     tmp_path: Path,
     files: str,
     change: Callable[..., object],
-    told: str,
+    kind: str,
 ) -> None:
     root = tmp_path / "copy"
     shutil.copytree(release_root, root, ignore=shutil.ignore_patterns(".deepaccident"))
     change(sorted(root.glob(files)))
-    found = differences(described_release(root, workers=1), wanted)
-    assert found
-    assert all(re.search(rf"\b{told} differ", line) for line in found)
+
+    messages = differences(described_release(root, workers=1), description)
+    assert messages
+    assert all(re.search(rf"\b{kind} differ", message) for message in messages)
 
 
-def test_scenarios_that_are_missing_or_new_are_told_and_missing_sensors_are_not() -> None:
-    points = {"num_lidar_pts": {"all agents": (0,) * 8}}
-    nothing = {
+def test_missing_and_new_scenarios_are_named_and_missing_sensors_are_not() -> None:
+    bare = {
         "boxes": "1",
         "meta": "2",
         "calib": "3",
-        **points,
+        "num_lidar_pts": {"all agents": (0,) * 8},
         "images": {},
         "clouds": {},
         "BEV pictures": {},
     }
-    seen = {**nothing, "images": {"front": (1,) * 8}, "clouds": {"lidar": (2,) * 8}}
-    wanted = {"splits": "4", "scenarios": {"a": seen, "b": seen}}
-    found = {"splits": "4", "scenarios": {"a": nothing, "c": nothing}}
-    assert differences(found, wanted) == ["b: is missing", "c: is not of the benchmark"]
-    assert compared_kinds(found) == ["num_lidar_pts"]
-    partly = {"splits": "4", "scenarios": {"a": {**seen, "clouds": {}}, "b": seen}}
-    (told,) = differences(partly, wanted)
-    assert told.startswith("a: clouds differ ")
+    full = {**bare, "images": {"front": (1,) * 8}, "clouds": {"lidar": (2,) * 8}}
+    expected = {"splits": "4", "scenarios": {"a": full, "b": full}}
+
+    other = {"splits": "4", "scenarios": {"a": bare, "c": bare}}
+    assert differences(other, expected) == ["b: is missing", "c: is not part of the benchmark"]
+    assert compared_kinds(other) == ["num_lidar_pts"]
+
+    without_clouds = {**full, "clouds": {}}
+    (message,) = differences(
+        {"splits": "4", "scenarios": {"a": without_clouds, "b": full}}, expected
+    )
+    assert message.startswith("a: clouds differ ")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ConfigError
@@ -34,53 +34,54 @@ from deepaccident_devkit.validation import release_completeness, validate_releas
 
 
 @pytest.mark.slow
-def test_every_file_is_there_and_nothing_else(release_root, scenarios, config, digests):
-    found = release_completeness(release_root, workers=1)
-    assert (found.scenarios, found.whole) == (2, 2)
-    names = {f"{name}.txt" for name in (*SPLITS, *MINI_SPLITS)}
-    assert len(digests(release_root)) == len(names) + 2 * (
-        1 + config.frames * len(AGENTS) * (2 + len(CHANNELS))
-    )
-    assert {path.name for path in release_root.glob("*.txt")} == names
+def test_every_file_is_present_and_nothing_else(release_root, scenarios, config, digests):
+    completeness = release_completeness(release_root, workers=1)
+    assert (completeness.scenarios, completeness.whole) == (2, 2)
+
+    files_per_agent = 2 + len(CHANNELS)
+    files_per_scenario = 1 + config.frames * len(AGENTS) * files_per_agent
+    split_files = {f"{name}.txt" for name in (*SPLITS, *MINI_SPLITS)}
+    assert len(digests(release_root)) == len(split_files) + 2 * files_per_scenario
+    assert {path.name for path in release_root.glob("*.txt")} == split_files
     assert [path.name for path in release_root.parent.iterdir()] == [release_root.name]
 
 
 @pytest.mark.slow
 def test_accident_and_twin_share_name_and_scene(scenarios):
-    assert [(s.scenario_type, s.name) for s in scenarios] == [
-        (f"type1_subtype1_{kind}", scenarios[0].name) for kind in ("accident", "normal")
+    name = scenarios[0].name
+    assert [(scenario.scenario_type, scenario.name) for scenario in scenarios] == [
+        ("type1_subtype1_accident", name),
+        ("type1_subtype1_normal", name),
     ]
-    accident, normal = (read_meta(s.meta_path) for s in scenarios)
+
+    accident, normal = (read_meta(scenario.meta_path) for scenario in scenarios)
+    agents = {"ego_vehicle", "other_vehicle"}
     assert normal.collision is None
-    assert (
-        set(normal.planned_agents)
-        == set(accident.collision.agents)
-        == {"ego_vehicle", "other_vehicle"}
-    )
+    assert set(normal.planned_agents) == set(accident.collision.agents) == agents
     assert set(accident.collision.ids) == {accident.agent_ids[0], accident.agent_ids[2]}
-    shared = [
-        (each.agent_ids, each.weather, each.spawn_side, each.road_type)
-        for each in (accident, normal)
-    ]
-    assert shared[0] == shared[1]
+    for field in ("agent_ids", "weather", "spawn_side", "road_type"):
+        assert getattr(accident, field) == getattr(normal, field)
 
 
 @pytest.mark.slow
-def test_layout_b_has_a_folder_a_split(tmp_path):
+def test_layout_b_has_a_folder_for_each_split(tmp_path):
     config = SynthConfig(scenarios=5, frames=1, layout="B", sensors=False)
     release = find_release(make_release(tmp_path / "b", config, workers=1))
-    folders = [s.folder for s in sorted(release.scenarios, key=lambda s: s.name[-5:])]
+    scenarios = sorted(release.scenarios, key=lambda scenario: scenario.name[-5:])
+    folders = [scenario.folder for scenario in scenarios]
     assert (release.layout, folders) == ("B", ["train", "train", "val", "val", "test"])
+
     for split, path in release.split_files.items():
+        folder = split.removesuffix("_mini")
         assert set(read_split_file(path)) == {
-            s.token for s in release.scenarios if s.folder == split.removesuffix("_mini")
+            scenario.token for scenario in release.scenarios if scenario.folder == folder
         }
     assert len(read_label(release.scenarios[-1].label_path("infrastructure", 1))) > 5
 
 
 @pytest.mark.slow
 def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
-    """Calib files are those of 1600x900 images, whether images are there or not."""
+    """Calib files describe images of 1600x900 pixels even if there are no images."""
     config = SynthConfig(
         scenarios=4, frames=1, sensors=False, for_released_code=True, designed=True
     )
@@ -88,16 +89,15 @@ def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
     release = find_release(root)
     assert release.layout == "A"
     for split in (*SPLITS, *MINI_SPLITS):
-        content = (root / f"{split}.txt").read_bytes()
+        path = root / f"{split}.txt"
+        content = path.read_bytes()
         assert (root / "split_txt_files" / f"{split}.txt").read_bytes() == content
-        assert (release.split_files[split], bool(content)) == (
-            root / f"{split}.txt",
-            split != "test",
-        )
+        assert release.split_files[split] == path
+        assert bool(content) == (split != "test")
+
     intrinsic = read_calib(release.scenarios[0].calib_path("ego_vehicle", 1)).intrinsic
-    np.testing.assert_allclose(
-        [intrinsic[channel][:2, 2] for channel in CAMERAS], [(800, 450)] * len(CAMERAS)
-    )
+    centers = [intrinsic[channel][:2, 2] for channel in CAMERAS]
+    np.testing.assert_allclose(centers, [(800, 450)] * len(CAMERAS))
     assert validate_release(root, workers=1).is_good
 
 
@@ -105,17 +105,17 @@ def test_a_release_for_the_released_code_has_its_split_files_twice(tmp_path):
 def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, digests):
     """Three processes share one scenario."""
     config = SynthConfig(scenarios=1, frames=4, image_size=(32, 18), seed=7)
-    one, three = (
-        digests(make_release(tmp_path / str(count), config, workers=count)) for count in (1, 3)
-    )
-    assert one == three
+    one = make_release(tmp_path / "1", config, workers=1)
+    three = make_release(tmp_path / "3", config, workers=3)
+    assert digests(one) == digests(three)
 
 
 @pytest.mark.slow
 def test_another_configuration_does_not_go_on_with_it(tmp_path, stop_at):
-    out, config = tmp_path / "out", SynthConfig(scenarios=2, frames=2, sensors=False)
+    out = tmp_path / "out"
+    config = SynthConfig(scenarios=2, frames=2, sensors=False)
     stop_at(out, 1, config)
-    assert_refused(
+    assert_raises(
         (
             lambda: make_release(out, replace(config, seed=1), workers=1),
             ConfigError,
@@ -131,39 +131,44 @@ def test_another_configuration_does_not_go_on_with_it(tmp_path, stop_at):
 
 
 @pytest.mark.slow
-def test_an_unlabelled_test_split_has_calib_images_and_points_alone(tmp_path):
-    """As the real one has; the other splits lack nothing."""
+def test_an_unlabelled_test_split_has_only_calib_images_and_points(tmp_path):
+    """The real one is like that; the other splits lack nothing."""
     config = SynthConfig(
         scenarios=5, frames=1, image_size=(32, 18), layout="B", unlabelled_test=True
     )
     root = make_release(tmp_path / "out", config, workers=1)
-    kinds = {
-        split: {path.parts[-3] for path in (root / split).rglob("*_001.*")}
-        for split in ("train", "test")
-    }
-    assert kinds == {
-        "train": {"calib", "label", *CHANNELS},
-        "test": {"calib", *CHANNELS} - {BEV_CAMERA},
-    }
-    assert [len([*(root / split).rglob("meta/*.txt")]) for split in ("train", "test")] == [2, 0]
+
+    for split, kinds, meta_files in (
+        ("train", {"calib", "label", *CHANNELS}, 2),
+        ("test", {"calib", *CHANNELS} - {BEV_CAMERA}, 0),
+    ):
+        folder = root / split
+        assert {path.parts[-3] for path in folder.rglob("*_001.*")} == kinds
+        assert len([*folder.rglob("meta/*.txt")]) == meta_files
+
     assert len(DeepAccident("v1", root, verbose=False).split_scenarios("test")) == 1
 
 
 @pytest.mark.slow
 def test_rounded_numbers_are_the_same_ones_with_fewer_digits(tmp_path):
-    def made(decimals):
+    def record_scenario(decimals):
         config = SynthConfig(scenarios=1, frames=2, sensors=False, seed=7, decimals=decimals)
-        return find_release(make_release(tmp_path / str(decimals), config, workers=1)).scenarios[0]
+        root = make_release(tmp_path / str(decimals), config, workers=1)
+        return find_release(root).scenarios[0]
 
-    full, rounded = made(None), made(4)
+    full = record_scenario(None)
+    rounded = record_scenario(4)
     for agent, frame in itertools.product(AGENTS, (1, 2)):
-        one, other = (read_label(scenario.label_path(agent, frame)) for scenario in (full, rounded))
+        full_label = read_label(full.label_path(agent, frame))
+        label = read_label(rounded.label_path(agent, frame))
         for name in ("agent_velocity", "center", "size", "yaw", "velocity"):
-            np.testing.assert_array_equal(getattr(one, name).round(4), getattr(other, name))
-        one, other = (
-            read_calib(scenario.calib_path(agent, frame), raw=True) for scenario in (full, rounded)
-        )
-        assert all(np.array_equal(matrix.round(4), other[name]) for name, matrix in one.items())
+            expected = getattr(full_label, name).round(4)
+            np.testing.assert_array_equal(expected, getattr(label, name))
+
+        full_calib = read_calib(full.calib_path(agent, frame), raw=True)
+        calib = read_calib(rounded.calib_path(agent, frame), raw=True)
+        for name, matrix in full_calib.items():
+            assert np.array_equal(matrix.round(4), calib[name])
     assert not validate_release(rounded.root, workers=1).findings
 
 
@@ -175,10 +180,8 @@ def test_rounded_numbers_are_the_same_ones_with_fewer_digits(tmp_path):
         ({"sensors": "cameras"}, r"\.(txt|pkl|jpg)$"),
         ({"sensors": "clouds"}, r"\.(txt|pkl)$|/lidar01/"),
         ({"sensors": "accidents"}, r"_accident/|\.(txt|pkl)$"),
-        (
-            {"sensor_step": 2},
-            r"\.(txt|pkl)$|_00[13]\.\w+$",
-        ),  # counted back from the last of three frames
+        # sensor steps are counted back from the last of three frames
+        ({"sensor_step": 2}, r"\.(txt|pkl)$|_00[13]\.\w+$"),
         ({"sensor_step": 9, "sensors": "cameras"}, r"\.(txt|pkl)$|_003\.jpg$"),
     ],
     ids=str,
@@ -186,32 +189,34 @@ def test_rounded_numbers_are_the_same_ones_with_fewer_digits(tmp_path):
 def test_with_fewer_sensors_the_other_files_are_the_same(
     tmp_path, release_root, config, digests, fields, files
 ):
-    fewer = digests(make_release(tmp_path / "fewer", replace(config, **fields), workers=1))
-    assert fewer == {
+    fewer = make_release(tmp_path / "fewer", replace(config, **fields), workers=1)
+    expected = {
         name: content for name, content in digests(release_root).items() if re.search(files, name)
     }
 
+    assert digests(fewer) == expected
+
 
 @pytest.mark.slow
-def test_sensors_of_some_frames_alone_are_missing_files_and_no_errors(tmp_path):
+def test_frames_without_sensors_are_missing_files_and_no_errors(tmp_path):
     config = SynthConfig(
         scenarios=2, frames=3, seed=3, image_size=(32, 18), sensors="cameras", sensor_step=2
     )
     root = make_release(tmp_path / "out", config, workers=1)
-    found = validate_release(root, deep=True, workers=1)
-    assert {(each.code, each.severity) for each in found.findings} == {
+    findings = validate_release(root, deep=True, workers=1).findings
+    assert {(finding.code, finding.severity) for finding in findings} == {
         ("sensor-frames-missing", "warning")
     }
-    counts = [
-        each
-        for split in release_completeness(root).splits.values()
-        for each in split.files
-        if each.missing
-    ]
-    assert {each.channel for each in counts if each.missing == each.expected} == {LIDAR, BEV_CAMERA}
+
+    missing_channels = set()
+    for split in release_completeness(root).splits.values():
+        for count in split.files:
+            if count.missing and count.missing == count.expected:
+                missing_channels.add(count.channel)
+    assert missing_channels == {LIDAR, BEV_CAMERA}
 
 
-# On executors and by several processes: the very bytes of one call, whatever was interrupted.
+# Executors, several processes and interrupted calls all make the same bytes as one call.
 
 LABELS = SynthConfig(scenarios=3, frames=2, sensors=False, seed=7)
 
@@ -233,28 +238,28 @@ def unfinished(out) -> Unfinished:
 
 @pytest.fixture
 def recorded(monkeypatch) -> list[str]:
-    """The parts that are recorded in this process, in order."""
+    """The names of the parts that are recorded in this process, in order."""
     names: list[str] = []
     record = generate.record_scenario
 
-    def record_and_tell(job):
+    def record_and_note(job):
         names.append(job.root.name)
         record(job)
 
-    monkeypatch.setattr(generate, "record_scenario", record_and_tell)
+    monkeypatch.setattr(generate, "record_scenario", record_and_note)
     return names
 
 
 @pytest.fixture
 def stop_at(monkeypatch):
-    """Stop as Ctrl-C does, once so many parts are recorded."""
+    """A function that starts a release and stops it, as Ctrl-C does, after a number of parts."""
     record = generate.record_scenario
 
     def stop(out: Path, count: int, config: SynthConfig = LABELS) -> None:
-        left = iter(range(count))
+        remaining = iter(range(count))
 
         def record_or_stop(job):
-            if next(left, None) is None:
+            if next(remaining, None) is None:
                 raise KeyboardInterrupt
             record(job)
 
@@ -279,7 +284,7 @@ def test_an_executor_makes_the_same_bytes(out, whole, digests):
 
 @pytest.mark.slow
 def test_several_calls_share_the_parts(out, whole, digests, recorded):
-    def make_or_come_late(_: int) -> Path | None:
+    def make_or_arrive_late(_: int) -> Path | None:
         try:
             return make(out)
         except ConfigError as error:
@@ -287,24 +292,30 @@ def test_several_calls_share_the_parts(out, whole, digests, recorded):
             return None
 
     with ThreadPoolExecutor(3) as threads:
-        assert out in list(threads.map(make_or_come_late, range(3)))
+        assert out in list(threads.map(make_or_arrive_late, range(3)))
     assert len(recorded) == len(set(recorded)) == 3
-    assert (digests(out), [path.name for path in out.parent.iterdir()]) == (whole, ["out"])
+    assert digests(out) == whole
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
 @pytest.mark.slow
-def test_what_broke_off_goes_on(out, unfinished, whole, digests, recorded, stop_at):
-    """Of a part that was cut off some files are there, some half-written, and no note."""
+def test_an_interrupted_release_is_continued(out, unfinished, whole, digests, recorded, stop_at):
+    """An interrupted part has some of its files, some of them half-written, and no note."""
     stop_at(out, 2)
     assert not out.exists()
-    del recorded[:]
-    cut, kept = sorted(path.name for path in (unfinished.folder / "kept").iterdir())
-    (unfinished.folder / "kept" / cut).unlink()
+    recorded.clear()
+
+    notes = unfinished.folder / "kept"
+    cut, finished = sorted(path.name for path in notes.iterdir())
+    (notes / cut).unlink()
     shutil.rmtree(next(unfinished.part(cut).rglob("calib")))
-    for name in (cut, kept):
+    for name in (cut, finished):
         temporary_path(next(unfinished.part(name).rglob("*_001.txt"))).touch()
+
     assert digests(make(out)) == whole
-    assert (len(recorded), cut in recorded, kept in recorded) == (2, True, False)
+    assert len(recorded) == 2
+    assert cut in recorded
+    assert finished not in recorded
 
 
 def test_a_call_that_makes_nothing_leaves_nothing(out, stop_at):
@@ -312,7 +323,9 @@ def test_a_call_that_makes_nothing_leaves_nothing(out, stop_at):
     assert list(out.parent.iterdir()) == []
 
 
-def test_a_worker_whose_caller_was_stopped_marks_nothing_in_what_comes_later(unfinished):
-    told = ("was removed while parts of the release were recorded; make it again",)
-    assert_refused((lambda: unfinished.note("a part"), ConfigError, told))
+def test_a_worker_of_a_stopped_call_leaves_no_note(unfinished):
+    message = "was removed while the release was being made; run the command again"
+    assert_raises(
+        (lambda: unfinished.note("a part"), ConfigError, (message,)),
+    )
     assert not unfinished.folder.exists()

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth.plan import SynthConfig, plan_scenarios
@@ -24,24 +24,31 @@ def built():
     return [build_scenario(CONFIG, plan) for plan in plans if plan.accident or plan.pair < 3]
 
 
-def gaps(scenario, first, second, times):
-    """Separation of two actors, by id, at times."""
-    rows = [scenario.actors.row_of(actor) for actor in (first, second)]
-    poses = [scenario.actors.all[row].motion.poses(times) for row in rows]
-    size = scenario.actors.size[:, :2]
-    return separation(poses[0], size[rows[0]], poses[1], size[rows[1]])
+def measure_gaps(scenario, ids, times):
+    """Measure the separation of two actors at times, metres."""
+    first, second = (scenario.actors.row_of(actor) for actor in ids)
+    actors = scenario.actors.all
+    sizes = scenario.actors.size[:, :2]
+    return separation(
+        actors[first].motion.poses(times),
+        sizes[first],
+        actors[second].motion.poses(times),
+        sizes[second],
+    )
 
 
-def test_each_design_is_told_by_its_meta(built):
+def test_the_meta_file_reveals_the_design(built):
     accidents = [scenario for scenario in built if scenario.plan.accident]
     types = [
-        accident_type(each.meta, signalized=each.plan.traits.subtype == 1) for each in accidents
+        accident_type(scenario.meta, signalized=scenario.plan.traits.subtype == 1)
+        for scenario in accidents
     ]
+
     assert sorted(types) == list(DESIGN_NUMBERS)
-    assert types == [each.plan.design for each in accidents]
+    assert types == [scenario.plan.design for scenario in accidents]
 
 
-def test_clean_accidents_are_those_of_older_releases(built):
+def test_designed_accidents_equal_the_ones_of_older_releases(built):
     """Whoever cites numbers of a designed release finds the same scenes again."""
     metas = [scenario.meta for scenario in built if scenario.plan.accident][:4]
     assert [(meta.recorded_frames, meta.agent_ids[0], meta.collision.impact) for meta in metas] == [
@@ -56,50 +63,53 @@ def test_the_last_frame_is_the_impact(built):
     for scenario in built:
         if scenario.plan.accident:
             end = (scenario.frames - 1) / 10
-            apart = gaps(
-                scenario, *scenario.meta.collision.ids, [*np.arange(0, end - 0.01, 0.02), end]
-            )
-            assert -0.3 < apart[-1] <= 1e-9
-            assert (apart[:-1] > 0).all()
+            times = [*np.arange(0, end - 0.01, 0.02), end]
+            gaps = measure_gaps(scenario, scenario.meta.collision.ids, times)
+            assert -0.3 < gaps[-1] <= 1e-9
+            assert (gaps[:-1] > 0).all()
 
 
 def test_recordings_are_of_natural_length(built):
     frames = [scenario.frames for scenario in built]
-    assert (min(frames) >= 40, max(frames) <= 100, len({*frames}) > 5) == (True, True, True)
+    assert 40 <= min(frames) <= max(frames) <= 100
+    assert len({*frames}) > 5
     assert [scenario.meta.simulated_frames - 10 for scenario in built] == frames
 
 
 def test_ids_are_unique_and_of_their_kind(built):
     for scenario in built:
-        ids = scenario.actors.actor_id
-        assert len(set(ids.tolist())) == len(set(scenario.actors.object_id.tolist())) == len(ids)
+        actors = scenario.actors
+        ids = actors.actor_id
+        assert len(set(ids.tolist())) == len(set(actors.object_id.tolist())) == len(ids)
         assert list(scenario.agents) == list(VEHICLE_AGENTS)
-        np.testing.assert_array_equal(
-            np.hypot(*scenario.actors.at(1.0).velocities.T)[ids >= 20000], 0
-        )
+
+        speeds = np.hypot(*actors.at(1.0).velocities.T)
+        np.testing.assert_array_equal(speeds[ids >= 20000], 0)
         assert ids[ids < 20000].max() < 3000
 
 
 @pytest.mark.parametrize("frames", [1, 4, 60, 130])
-def test_so_many_frames_are_recorded(frames):
+def test_the_requested_number_of_frames_is_recorded(frames):
     config = replace(CONFIG, scenarios=2, frames=frames)
-    for scenario in (build_scenario(config, plan) for plan in plan_scenarios(config)):
-        first = min(actor.motion.start for actor in scenario.actors.all if not actor.parked)
-        assert (scenario.frames, first <= 0.0) == (frames, True)
+
+    for plan in plan_scenarios(config):
+        scenario = build_scenario(config, plan)
+        starts = [actor.motion.start for actor in scenario.actors.all if not actor.parked]
+        assert scenario.frames == frames
+        assert min(starts) <= 0.0
 
 
 def test_unplanned_accidents_are_with_someone_who_records_nothing():
     config = replace(CONFIG, scenarios=8, unplanned=1.0)
+
     for plan in plan_scenarios(config)[::2]:
         meta = build_scenario(config, plan).meta
         assert accident_type(meta, signalized=plan.traits.subtype == 1) is None
-        assert (None in meta.collision.agents, {*meta.collision.ids} <= {*meta.agent_ids}) == (
-            True,
-            False,
-        )
+        assert None in meta.collision.agents
+        assert not {*meta.collision.ids} <= {*meta.agent_ids}
 
 
-LATE = """\
+LATE_MEETING = """\
 name: late
 road: {signalized: false}
 actors:
@@ -112,7 +122,7 @@ background: {vehicles: 0, two_wheelers: 0, parked: 0, walking: 0, crossing: 0}
 
 @pytest.fixture
 def build_own(tmp_path):
-    """A function: text of a scenario file → its first scenario, or the twin of it."""
+    """A function that builds the first scenario of a scenario file's text, or its twin."""
 
     def build(text, *, twin=False):
         path = tmp_path / "own.yaml"
@@ -124,18 +134,18 @@ def build_own(tmp_path):
 
 
 def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch):
-    """The message names the line, says how near the two came, and what to change."""
+    """The message names the line, how near the two came, and what to change."""
     monkeypatch.setattr("deepaccident_devkit.plugins.synth.scenario.MAX_DRAWS", 2)
-    walker = "  - {role: pedestrian, from: north}\nmeet: {actors: [ego, pedestrian]"
-    crossing = LATE.replace("meet: {actors: [ego, other]", walker)
-    told = (
+    pedestrian = "  - {role: pedestrian, from: north}\nmeet: {actors: [ego, pedestrian]"
+    with_pedestrian = LATE_MEETING.replace("meet: {actors: [ego, other]", pedestrian)
+    pattern = (
         r"own.yaml:6: meet: the two did not collide in 2 draws; the least "
         r"distance was 1\d\.\d m; choose"
     )
-    assert_refused(
-        (lambda: build_own(LATE), ConfigError, told),
+    assert_raises(
+        (lambda: build_own(LATE_MEETING), ConfigError, pattern),
         (
-            lambda: build_own(crossing),
+            lambda: build_own(with_pedestrian),
             ConfigError,
             ("own.yaml:7: meet: ", "their paths do not cross, ", "change"),
         ),
@@ -144,31 +154,37 @@ def test_a_scenario_in_which_nobody_meets_is_given_up(build_own, monkeypatch):
 
 def test_a_twin_that_cannot_be_made_is_named_by_its_file(build_own, monkeypatch):
     monkeypatch.setattr("deepaccident_devkit.plugins.synth.scenario.perform_twin", lambda *_: None)
-    told, alone, timed = (
-        "own.yaml:3: actors: the road users collide",
-        LATE.partition("meet:")[0],
-        LATE.replace("offset: 3", "offset: 0"),
-    )
-    assert_refused(
-        (lambda: build_own(alone), ConfigError, (f"{told} although all obey the rules",)),
+    without_meeting, _, _ = LATE_MEETING.partition("meet:")
+    on_time = LATE_MEETING.replace("offset: 3", "offset: 0")
+    message = "own.yaml:3: actors: the road users collide"
+    assert_raises(
         (
-            lambda: build_own(timed, twin=True),
+            lambda: build_own(without_meeting),
             ConfigError,
-            (f"{told} in the normal twin too, even if",),
+            (f"{message} although all obey the rules",),
+        ),
+        (
+            lambda: build_own(on_time, twin=True),
+            ConfigError,
+            (f"{message} in the normal twin too, even if",),
         ),
     )
 
 
 def test_a_slow_cyclist_is_hit(build_own):
-    """It needs more than 24 s from its usual start to the crossing, and once never came there."""
-    cyclist = (
-        "  - {role: background, category: cyclist, from: west, max_speed: 3}\nmeet: "
-        "{actors: [background, ego]"
-    )
-    text = LATE.replace("ego, from: west", "ego, from: south, turn: right").replace(
-        "other, from: south", "other, from: east"
-    )
-    scenario = build_own(
-        text.replace("meet: {actors: [ego, other], offset: 3", f"{cyclist}, offset: 0.5")
-    )
-    assert (scenario.draws, scenario.meta.collision.classes) == (1, ("cyclist", "car"))
+    """It needs more than 24 s from its usual start to the crossing, and once never arrived."""
+    cyclist = "  - {role: background, category: cyclist, from: west, max_speed: 3}\n"
+    text = LATE_MEETING
+    for old, new in (
+        ("ego, from: west", "ego, from: south, turn: right"),
+        ("other, from: south", "other, from: east"),
+        (
+            "meet: {actors: [ego, other], offset: 3",
+            f"{cyclist}meet: {{actors: [background, ego], offset: 0.5",
+        ),
+    ):
+        text = text.replace(old, new)
+
+    scenario = build_own(text)
+    assert scenario.draws == 1
+    assert scenario.meta.collision.classes == ("cyclist", "car")

@@ -2,46 +2,44 @@ import numpy as np
 import pytest
 
 from deepaccident_devkit.plugins.synth.actors import MEDIAN_SIZES
-from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE, INSET, MODELS, shape_of
+from deepaccident_devkit.plugins.synth.shapes import BOX_CLEARANCE, INSET, MODELS, make_shape
 from deepaccident_devkit.plugins.synth.solids import face_corners, face_planes
 
-ALL = [(category, model) for category, models in MODELS.items() for model in range(len(models))]
+ALL_MODELS = [
+    (category, model) for category, models in MODELS.items() for model in range(len(models))
+]
 
 
-@pytest.fixture(params=ALL, ids=[f"{category}-{model}" for category, model in ALL])
+@pytest.fixture(params=ALL_MODELS, ids=[f"{category}-{model}" for category, model in ALL_MODELS])
 def shape(request):
     category, model = request.param
-    return (
-        category,
-        model,
-        shape_of(category, MEDIAN_SIZES[category], (200, 30, 30), (30, 60, 200), model),
-    )
+    solids = make_shape(category, MEDIAN_SIZES[category], (200, 30, 30), (30, 60, 200), model)
+    return category, model, solids
 
 
 def test_shapes_fill_their_boxes_and_keep_within(shape):
-    """Also the smallest and the largest that are drawn: all solids keep `INSET` from the box's
+    """The smallest and largest drawn sizes, too: all solids stay `INSET` away from the box's
     faces.
     """
     category, model, _ = shape
     for factor in (0.95, 1.0, 1.05):
         size = np.array(MEDIAN_SIZES[category]) * factor
-        corners = shape_of(
-            category, tuple(size.tolist()), (0, 0, 0), (0, 0, 0), model
-        ).corners.reshape(-1, 3)
-        half = size[:2] / 2 - INSET + 1e-9
-        (x, y), (low, high) = (
-            np.abs(corners[:, :2]).max(axis=0),
-            (corners[:, 2].min(), corners[:, 2].max()),
-        )
-        assert (0.35 if category == "pedestrian" else 0.49) * size[0] < x <= half[0]
-        assert 0.4 * size[1] < y <= half[1]
-        assert BOX_CLEARANCE <= low < 0.05
-        assert 0.98 * size[2] < high <= BOX_CLEARANCE + size[2] - INSET + 1e-9
+        solids = make_shape(category, tuple(size.tolist()), (0, 0, 0), (0, 0, 0), model)
+        corners = solids.corners.reshape(-1, 3)
+
+        x, y = np.abs(corners[:, :2]).max(axis=0)
+        half_length, half_width = size[:2] / 2 - INSET + 1e-9
+        least_length = (0.35 if category == "pedestrian" else 0.49) * size[0]
+        assert least_length < x <= half_length
+        assert 0.4 * size[1] < y <= half_width
+
+        z = corners[:, 2]
+        assert BOX_CLEARANCE <= z.min() < 0.05
+        assert 0.98 * size[2] < z.max() <= BOX_CLEARANCE + size[2] - INSET + 1e-9
 
 
 def test_solids_are_convex_and_turned_outwards(shape):
     _, _, solids = shape
     normals, offsets = face_planes(face_corners(solids.corners))
-    assert (
-        np.einsum("fk,fk->f", normals, np.repeat(solids.corners.mean(axis=1), 6, axis=0)) < offsets
-    ).all()
+    centers = np.repeat(solids.corners.mean(axis=1), 6, axis=0)
+    assert (np.einsum("fk,fk->f", normals, centers) < offsets).all()

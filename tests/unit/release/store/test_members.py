@@ -1,4 +1,4 @@
-"""Lists of stores' files: each is found where it was said to be."""
+"""Check the lists of stores' files: each file is found at its place."""
 
 from pathlib import Path
 
@@ -29,11 +29,12 @@ _PATHS = st.tuples(st.lists(_PARTS, max_size=3).map("/".join), st.one_of(_FRAMES
 def test_every_file_is_found_and_no_other(
     tmp_path: Path, files: dict[tuple[str, str], int], archives: int
 ) -> None:
-    listings, expected = [], {}
+    listings = []
+    expected = {}
     for number in range(archives):
-        chosen = [(*path, size) for path, size in files.items() if size % archives == number]
-        folders = sorted({folder for folder, *_ in chosen})
-        sizes = np.array([size for *_, size in chosen], np.int64)
+        in_archive = [(*path, size) for path, size in files.items() if size % archives == number]
+        folders = sorted({folder for folder, _, _ in in_archive})
+        sizes = np.array([size for _, _, size in in_archive], np.int64)
         numbers = {
             "offset": sizes * 2,
             "stored": sizes,
@@ -41,30 +42,33 @@ def test_every_file_is_found_and_no_other(
             "version": sizes % 7,
             "deflated": sizes % 2,
         }
-        positions = np.array([folders.index(folder) for folder, *_ in chosen], int)
-        names = [name for _, name, _ in chosen]
         listings.append(
             Listing(
                 archive=f"{number}.zip",
                 folders=folders,
-                folder=positions,
-                names=names,
+                folder=np.array([folders.index(folder) for folder, _, _ in in_archive], int),
+                names=[name for _, name, _ in in_archive],
                 numbers=numbers,
             )
         )
-        for folder, name, size in chosen:
+        for folder, name, size in in_archive:
             path = f"{folder}/{name}" if folder else name
             expected[path] = Member(number, 2 * size, size, size, size % 7, size % 2)
+
     write_members(tmp_path / "list.arrow", listings, {"0.zip": (3, "x")})
     members = Members(tmp_path / "list.arrow")
+
     assert {path: members.find(path) for path in expected} == expected
-    assert (len(members), members.states) == (len(files), {"0.zip": (3, "x")})
+    assert len(members) == len(files)
+    assert members.states == {"0.zip": (3, "x")}
     for folder, name in files:
-        assert members.find(f"{folder}/{name}x") in (None, expected.get(f"{folder}/{name}x"))
+        longer_path = f"{folder}/{name}x"
+        assert members.find(longer_path) in (None, expected.get(longer_path))
         assert members.has_folder(folder)
         assert name in dict(members.files_in(folder))
-        above, _, last = folder.rpartition("/")
-        assert not folder or last in members.folders_in(above)
+        if folder:
+            parent, _, last_folder = folder.rpartition("/")
+            assert last_folder in members.folders_in(parent)
 
 
 KIND = "type1_subtype2_normal"

@@ -1,4 +1,4 @@
-"""Results that several tests of reports look at."""
+"""Results that several tests of reports draw."""
 
 import math
 
@@ -12,14 +12,16 @@ from deepaccident_devkit.selection.samples import samples
 
 @pytest.fixture(scope="session")
 def tokens(da_motion: DeepAccident) -> list[str]:
-    """Of two agents, in an accident and its twin."""
-    listed = samples(da_motion, "train", "evaluate", "paper", scope="all")
-    return [token for token in listed if token.split("/")[-2] in ("ego_vehicle", "infrastructure")]
+    """The samples of two agents in an accident and its twin."""
+    all_tokens = samples(da_motion, "train", "evaluate", "paper", scope="all")
+    return [
+        token for token in all_tokens if token.split("/")[-2] in ("ego_vehicle", "infrastructure")
+    ]
 
 
 @pytest.fixture
 def detected() -> DetectionResult:
-    """Two classes at two thresholds; nobody of the third is there."""
+    """Detections of two classes at two thresholds; the truth has none of the third class."""
     precision = np.zeros((3, 1, 2, 4))
     precision[0] = [[[1, 0.5, 0.5, 0], [1, 1, 1, 0]]]
     precision[1] = 0.25

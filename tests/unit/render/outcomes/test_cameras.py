@@ -1,18 +1,21 @@
-"""Predictions over the truth in cameras: where lines are, what they mean, and what stands around
-them.
-"""
+"""Predictions over the truth in cameras: where the lines are and what they mean."""
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from drawing import has_color, new_axes, of_kind, on_canvas, rendered
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgba
-from picture_texts import text_faults
+from support.figure_texts import STYLES, find_text_faults
+from support.rendered_pixels import (
+    canvas_positions,
+    collections_of_kind,
+    has_color,
+    new_axes,
+    render_canvas,
+)
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import (
@@ -38,229 +41,277 @@ from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR, OUT
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.poses import camera_of
 
-IN_ORDER = [
-    f"Camera_{place}"
-    for place in ("FrontLeft", "Front", "FrontRight", "BackLeft", "Back", "BackRight")
+CAMERAS_IN_ORDER = [
+    "Camera_FrontLeft",
+    "Camera_Front",
+    "Camera_FrontRight",
+    "Camera_BackLeft",
+    "Camera_Back",
+    "Camera_BackRight",
 ]
-AHEAD = (10.0, 14.0, -1.0, 1.0)
-"""First and last x, first and last y of an instance in front of the ego, metres."""
+AHEAD_M = (10.0, 14.0, -1.0, 1.0)  # first and last x, first and last y, in front of the ego
 
 
-def lines_in(ax: Any, color: str, *, dashed: bool | None = None) -> list[Any]:
-    """The lines (V, 2) of a colour, without casings, which are not opaque."""
-    found = []
-    for each in of_kind(ax, LineCollection):
-        lines, fits = each.get_segments(), dashed in (None, each.get_linestyle()[0][1] is not None)
-        colors = np.broadcast_to(each.get_colors(), (len(lines), 4))
-        shown = [np.allclose(own, to_rgba(color), atol=1e-3) for own in colors]
-        found += [line for line, its in zip(lines, shown, strict=True) if its and fits]
-    return found
+def find_lines(ax: Any, color: str, *, dashed: bool | None = None) -> list[Any]:
+    """Return the lines (V, 2) of a colour, without their casings, which are not opaque."""
+    lines_of_color = []
+    for collection in collections_of_kind(ax, LineCollection):
+        is_dashed = collection.get_linestyle()[0][1] is not None
+        if dashed not in (None, is_dashed):
+            continue
+        lines = collection.get_segments()
+        line_colors = np.broadcast_to(collection.get_colors(), (len(lines), 4))
+        for line, line_color in zip(lines, line_colors, strict=True):
+            if np.allclose(line_color, to_rgba(color), atol=1e-3):
+                lines_of_color.append(line)
+    return lines_of_color
 
 
-def gaps(places: Any, lines: Sequence[Any]) -> Any:
-    """Pixels from each of some places (N, 2) to the nearest corner of lines."""
+def distances_to_lines(pixels: Any, lines: Sequence[Any]) -> Any:
+    """Return the distances (N,), in pixels, from pixels (N, 2) to the nearest corner of lines."""
     corners = np.concatenate([*lines, np.full((1, 2), np.inf)])
-    return np.linalg.norm(places[:, None] - corners, axis=-1).min(axis=1)
+    distances = np.linalg.norm(pixels[:, None] - corners, axis=-1)
+    return distances.min(axis=1)
 
 
-def on_the_ground(
-    dataset: DeepAccident, sample: str, channel: str, places: Any, ground: float = 0.0
+def ground_in_camera(
+    dataset: DeepAccident, sample: str, channel: str, positions: Any, ground: float = 0.0
 ) -> Any:
-    """Points (N, 3) of the optical frame of places (N, 2) of the ego frame."""
-    points = np.column_stack([places, np.full(len(places), ground)])
+    """Transform ground positions (N, 2) of the ego frame to points (N, 3) of the optical frame."""
+    points = np.column_stack([positions, np.full(len(positions), ground)])
     return dataset.ego_from(sample, channel).inverse().apply(points)
 
 
-def perfect(dataset: DeepAccident, sample: str) -> DetectedBoxes:
+def predict_labels(dataset: DeepAccident, sample: str) -> DetectedBoxes:
+    """Predict exactly the boxes of the labels."""
     truth = detection_truth(dataset, sample, "released")
     return DetectedBoxes(boxes=truth, scores=np.ones(len(truth)))
 
 
-def blocks(labels: MotionLabels, *frames: tuple[float, float, float, float]) -> MotionOutput:
-    """An instance whose cells fill a rectangle in each frame: first and last x, first and last y,
+def predict_rectangles(
+    labels: MotionLabels, *frames: tuple[float, float, float, float]
+) -> MotionOutput:
+    """Predict an instance that fills a rectangle in each frame: first and last x, first and last y,
     metres.
     """
     grid = labels.config.grid.with_orientation("devkit")
+    min_x, _, x_step = grid.x
+    min_y, _, y_step = grid.y
     instance = np.zeros((len(labels.instance), *grid.shape), dtype=np.int32)
     for cells, (first_x, last_x, first_y, last_y) in zip(instance, frames, strict=False):
-        columns = slice(*(round((x - grid.x[0]) / grid.x[2]) for x in (first_x, last_x)))
-        cells[slice(*(round((y - grid.y[0]) / grid.y[2]) for y in (first_y, last_y))), columns] = 1
+        first_column, last_column = (round((x - min_x) / x_step) for x in (first_x, last_x))
+        first_row, last_row = (round((y - min_y) / y_step) for y in (first_y, last_y))
+        cells[first_row:last_row, first_column:last_column] = 1
     return instances_of(instance, grid)
 
 
-def corners_of(rectangle: tuple[float, float, float, float]) -> Any:
+def rectangle_corners(rectangle: tuple[float, float, float, float]) -> Any:
     first_x, last_x, first_y, last_y = rectangle
     return np.array([(x, y) for x in (first_x, last_x) for y in (first_y, last_y)])
 
 
-def verdict_of(sample: str, true: Accident | None, *alarms: Accident) -> AccidentVerdict:
-    return AccidentVerdict(
-        sample=sample, compared=ComparedAccidents(true=true, predicted=alarms), truth=None, words=""
-    )
+def make_verdict(sample: str, true: Accident | None, *alarms: Accident) -> AccidentVerdict:
+    compared = ComparedAccidents(true=true, predicted=alarms)
+    return AccidentVerdict(sample=sample, compared=compared, truth=None, words="")
 
 
-def outcomes(ax: Any) -> list[str]:
-    """The kinds of outcomes that have lines."""
-    return [kind for kind, color in OUTCOME_COLORS.items() if lines_in(ax, color)]
+def find_outcomes(ax: Any) -> list[str]:
+    """Return the kinds of outcomes that have lines."""
+    return [kind for kind, color in OUTCOME_COLORS.items() if find_lines(ax, color)]
 
 
-def in_camera(da: DeepAccident, verdict: Any, channel: str = "Camera_Front", **how: Any) -> Any:
-    return draw_outcome_in_camera(da, verdict, channel, ax=new_axes(how.pop("size", (5, 5))), **how)
+def draw_in_camera(
+    da: DeepAccident,
+    verdict: Any,
+    channel: str = "Camera_Front",
+    *,
+    size: tuple[float, float] = (5, 5),
+    frame: int | None = None,
+) -> Any:
+    return draw_outcome_in_camera(da, verdict, channel, ax=new_axes(size), frame=frame)
 
 
-def test_detected_boxes_are_where_the_labels_have_them(da: DeepAccident, approach: str) -> None:
-    given, seen = perfect(da, approach), 0
-    verdict: Any = sample_verdict(da, approach, given)
-    counted = set(given.boxes.actor_id[verdict.matches.truth].tolist()) - {OWN_ACTOR_ID}
+def test_detected_boxes_are_where_the_labels_have_them(
+    da: DeepAccident, approach_sample: str
+) -> None:
+    detected = predict_labels(da, approach_sample)
+    verdict: Any = sample_verdict(da, approach_sample, detected)
+    matched_ids = set(detected.boxes.actor_id[verdict.matches.truth].tolist()) - {OWN_ACTOR_ID}
+    num_corners = 0
     for channel in CAMERAS:
-        ax, boxes = in_camera(da, verdict, channel, size=(4, 2.5)), da.boxes(approach, channel)
-        lens = camera_of(da, f"{approach}/{channel}")
-        corners = boxes.corners()[np.isin(boxes.actor_id, [*counted])].reshape(-1, 3)
-        pixels, depth = lens.project(corners[corners[:, 2] > NEAR_PLANE_M])
+        ax = draw_in_camera(da, verdict, channel, size=(4, 2.5))
+
+        boxes = da.boxes(approach_sample, channel)
+        corners = boxes.corners()[np.isin(boxes.actor_id, [*matched_ids])].reshape(-1, 3)
+        camera = camera_of(da, f"{approach_sample}/{channel}")
+        pixels, depth = camera.project(corners[corners[:, 2] > NEAR_PLANE_M])
         for color in (OUTCOME_COLORS["right"], "black"):
-            assert gaps(pixels, lines_in(ax, color, dashed=False)).max(initial=0) < 1e-6
-        assert set(outcomes(ax)) <= {"right"}
-        inside = pixels[lens.in_image(pixels, depth, min_depth=NEAR_PLANE_M, margin=2)]
-        seen += len(inside)
+            distances = distances_to_lines(pixels, find_lines(ax, color, dashed=False))
+            assert distances.max(initial=0) < 1e-6
+        assert set(find_outcomes(ax)) <= {"right"}
+
+        in_image = camera.in_image(pixels, depth, min_depth=NEAR_PLANE_M, margin=2)
+        num_corners += in_image.sum()
         if channel == "Camera_Front":
-            picture = rendered(ax)
-            assert {
-                has_color(picture, place, OUTCOME_COLORS["right"])
-                for place in on_canvas(ax, inside)
-            } == {True}
-    assert seen > 20
+            canvas = render_canvas(ax)
+            assert in_image.any()
+            for position in canvas_positions(ax, pixels[in_image]):
+                assert has_color(canvas, position, OUTCOME_COLORS["right"])
+    assert num_corners > 20
 
 
-def test_a_shifted_box_is_false_and_the_true_one_missed(da: DeepAccident, approach: str) -> None:
-    given = perfect(da, approach)
-    verdict: Any = sample_verdict(da, approach, given)
-    to_camera = da.world_from(approach, "Camera_Front").inverse() @ da.world_from(
-        approach, given.boxes.frame
+def test_a_shifted_box_is_false_and_the_true_one_missed(
+    da: DeepAccident, approach_sample: str
+) -> None:
+    exact = predict_labels(da, approach_sample)
+    verdict: Any = sample_verdict(da, approach_sample, exact)
+    camera_from_boxes = da.world_from(approach_sample, "Camera_Front").inverse() @ da.world_from(
+        approach_sample, exact.boxes.frame
     )
-    depth, center = to_camera.apply(given.boxes.center)[:, 2], given.boxes.center.copy()
-    row = min(
-        (each for each in verdict.matches.truth.tolist() if depth[each] > 5),
-        key=lambda each: depth[each],
-    )
+    depth = camera_from_boxes.apply(exact.boxes.center)[:, 2]
+    rows_ahead = [row for row in verdict.matches.truth.tolist() if depth[row] > 5]
+    row = min(rows_ahead, key=lambda candidate: depth[candidate])
+    center = exact.boxes.center.copy()
     center[row] = [*center[row, :2] * 0.5, center[row, 2] + 30.0]
-    moved = DetectedBoxes(boxes=replace(given.boxes, center=center), scores=given.scores)
-    ax = in_camera(da, sample_verdict(da, approach, moved))
-    shown = {}
-    for kind, boxes in (("false", moved.boxes), ("missed", given.boxes)):
-        corners = boxes.select([row]).transform(to_camera, "Camera_Front").corners()[0]
-        shown[kind], _ = camera_of(da, f"{approach}/Camera_Front").project(corners)
-        lines = lines_in(ax, OUTCOME_COLORS[kind], dashed=kind == "missed")
-        assert (len(lines), gaps(shown[kind], lines).max() < 1e-6) == (12, True)
+    shifted = DetectedBoxes(boxes=replace(exact.boxes, center=center), scores=exact.scores)
+
+    ax = draw_in_camera(da, sample_verdict(da, approach_sample, shifted))
+
+    camera = camera_of(da, f"{approach_sample}/Camera_Front")
+    for kind, boxes in (("false", shifted.boxes), ("missed", exact.boxes)):
+        box_in_camera = boxes.select([row]).transform(camera_from_boxes, "Camera_Front")
+        pixels, _ = camera.project(box_in_camera.corners()[0])
+        lines = find_lines(ax, OUTCOME_COLORS[kind], dashed=kind == "missed")
+        assert len(lines) == 12
+        assert distances_to_lines(pixels, lines).max() < 1e-6
+    missed_pixels = pixels
     for color in (OUTCOME_COLORS["right"], "black"):
-        assert gaps(shown["missed"], lines_in(ax, color)).max() > 0.1
+        assert distances_to_lines(missed_pixels, find_lines(ax, color)).max() > 0.1
 
 
 def test_cells_are_polygons_on_the_ground(
     da_motion: DeepAccident, sample: str, labels: MotionLabels
 ) -> None:
-    later, color = (20.0, 22.0, 3.0, 4.0), OUTCOME_COLORS["false"]
-    verdict = sample_verdict(da_motion, sample, blocks(labels, AHEAD, AHEAD, later), label=labels)
-    for frame, rectangle in ((None, AHEAD), (0, AHEAD), (2, later)):
-        ax = in_camera(da_motion, verdict, frame=frame)
-        (line,) = lines_in(ax, color, dashed=False)
-        ground = on_the_ground(da_motion, sample, "Camera_Front", corners_of(rectangle))
-        corners, _ = camera_of(da_motion, f"{sample}/Camera_Front").project(ground)
-        assert gaps(corners, [line]).max() < 1e-6
+    later = (20.0, 22.0, 3.0, 4.0)
+    output = predict_rectangles(labels, AHEAD_M, AHEAD_M, later)
+    verdict = sample_verdict(da_motion, sample, output, label=labels)
+    camera = camera_of(da_motion, f"{sample}/Camera_Front")
+    color = OUTCOME_COLORS["false"]
+    for frame, rectangle in ((None, AHEAD_M), (0, AHEAD_M), (2, later)):
+        ax = draw_in_camera(da_motion, verdict, frame=frame)
+
+        (line,) = find_lines(ax, color, dashed=False)
+        ground_corners = rectangle_corners(rectangle)
+        points = ground_in_camera(da_motion, sample, "Camera_Front", ground_corners)
+        corners, _ = camera.project(points)
+        assert distances_to_lines(corners, [line]).max() < 1e-6
         np.testing.assert_allclose(
             [line[:, 1].min(), line[:, 1].max()],
             [corners[:, 1].min(), corners[:, 1].max()],
             atol=1e-6,
         )
-        shapes = [
-            each
-            for each in ax.collections
-            if isinstance(each, PolyCollection) and len(each.get_paths())
+
+        (filled,) = [
+            shape
+            for shape in ax.collections
+            if isinstance(shape, PolyCollection)
+            and len(shape.get_paths())
+            and to_hex(shape.get_facecolor()[0]) == color
         ]
-        (filled,) = [each for each in shapes if to_hex(each.get_facecolor()[0]) == color]
         assert filled.get_paths()[0].contains_point(corners.mean(axis=0))
-        assert "right" not in outcomes(ax)
+        assert "right" not in find_outcomes(ax)
 
 
 def test_instances_are_judged_frame_by_frame(
     da_motion: DeepAccident, sample: str, labels: MotionLabels
 ) -> None:
-    shown = labels.instance.copy()
-    shown[1:] = 0  # exact now, and nothing later
-    verdict = sample_verdict(
-        da_motion, sample, instances_of(shown, labels.config.grid), label=labels
+    instance = labels.instance.copy()
+    instance[1:] = 0  # exact now, and nothing later
+    output = instances_of(instance, labels.config.grid)
+    verdict = sample_verdict(da_motion, sample, output, label=labels)
+    present, later = (
+        draw_in_camera(da_motion, verdict, "Camera_Back", frame=frame) for frame in (0, 2)
     )
-    kinds = [
-        outcomes(in_camera(da_motion, verdict, "Camera_Back", frame=frame)) for frame in (0, 2)
-    ]
-    assert kinds == [["right"], ["missed"]]
+
+    assert find_outcomes(present) == ["right"]
+    assert find_outcomes(later) == ["missed"]
 
 
 @pytest.mark.parametrize(("agent", "ground"), [("ego_vehicle", 0.0), ("infrastructure", -4.0)])
-def test_places_of_accidents_are_on_the_ground(
-    da: DeepAccident, approach: str, agent: str, ground: float
+def test_positions_of_accidents_are_on_the_ground(
+    da: DeepAccident, approach_sample: str, agent: str, ground: float
 ) -> None:
-    sample = approach.replace("ego_vehicle", agent)
-    assert abs(np.median(da.boxes(sample, "ego").bottom_corners()[..., 2]) - ground) < 0.7
-    true = Accident(positions=np.array([[15.0, 2.0], [18.0, -1.0]]), time=1.5)
+    sample = approach_sample.replace("ego_vehicle", agent)
+    box_bottoms = da.boxes(sample, "ego").bottom_corners()[..., 2]
+    assert abs(np.median(box_bottoms) - ground) < 0.7
+    true_accident = Accident(positions=np.array([[15.0, 2.0], [18.0, -1.0]]), time=1.5)
     alarm = Accident(positions=np.array([[14.0, 3.0], [17.0, 0.0]]), time=1.2, score=0.8)
-    ax = in_camera(da, verdict_of(sample, true, alarm), size=(8, 4.5))
-    lens, ego_from_camera = (
-        camera_of(da, f"{sample}/Camera_Front"),
-        da.ego_from(sample, "Camera_Front"),
-    )
 
-    def grounded(pixels: Any) -> Any:
-        """Where rays through pixels meet the ground, in the ego frame."""
-        rays = ego_from_camera.rotate(
-            np.insert(pixels, 2, 1, axis=1) @ np.linalg.inv(lens.intrinsic).T
-        )
+    ax = draw_in_camera(da, make_verdict(sample, true_accident, alarm), size=(8, 4.5))
+
+    camera = camera_of(da, f"{sample}/Camera_Front")
+    ego_from_camera = da.ego_from(sample, "Camera_Front")
+
+    def project_to_ground(pixels: Any) -> Any:
+        """Return where the rays through pixels meet the ground, in the ego frame."""
+        directions = np.insert(pixels, 2, 1, axis=1) @ np.linalg.inv(camera.intrinsic).T
+        rays = ego_from_camera.rotate(directions)
         share = (ground - ego_from_camera.translation[2]) / rays[:, 2]
         return (ego_from_camera.translation + share[:, None] * rays)[:, :2]
 
-    lines = lines_in(ax, COLLIDER_COLOR)
-    rings = [grounded(line) for line in lines if len(line) > 4]
-    for ring, place in zip(rings, true.positions, strict=True):
-        np.testing.assert_allclose(np.linalg.norm(ring - place, axis=1), 1.0)
-    crosses = np.array(
-        [grounded(line) for line in lines_in(ax, FORESEEN_COLOR) if len(line) == 2][-4:]
-    )
+    rings = [line for line in find_lines(ax, COLLIDER_COLOR) if len(line) > 4]
+    for ring, position in zip(rings, true_accident.positions, strict=True):
+        radii = np.linalg.norm(project_to_ground(ring) - position, axis=1)
+        np.testing.assert_allclose(radii, 1.0)
+
+    strokes = [line for line in find_lines(ax, FORESEEN_COLOR) if len(line) == 2]
+    crosses = np.array([project_to_ground(stroke) for stroke in strokes[-4:]])
     np.testing.assert_allclose(
         crosses.mean(axis=1), np.repeat(alarm.positions, 2, axis=0), atol=1e-9
     )
 
 
-def predictions(
+def make_predictions(
     dataset: DeepAccident, token: str, labels: MotionLabels
 ) -> list[tuple[Any, dict[str, Any]]]:
+    """Make predictions of every kind, each with the options to judge it with."""
     accident: Any = box_truth(dataset, token).accident
     near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
     motion = instances_of(np.roll(labels.instance, 2, axis=-1), labels.config.grid)
-    hows = ({}, {"task": "accident", "protocol": "boxes"}, {"label": labels})
     return [
-        *((given, {}) for given in (perfect(dataset, token), [near], [])),
-        *((motion, how) for how in hows),
+        (predict_labels(dataset, token), {}),
+        ([near], {}),
+        ([], {}),
+        (motion, {}),
+        (motion, {"task": "accident", "protocol": "boxes"}),
+        (motion, {"label": labels}),
     ]
 
 
 def test_a_missing_image_is_a_grey_panel_with_the_prediction(
-    da_partial: DeepAccident, approach: str
+    da_partial: DeepAccident, approach_sample: str
 ) -> None:
-    given = perfect(da_partial, approach)
-    figure = render_outcome_in_cameras(da_partial, approach, given, fig=detached_figure((10, 4)))
-    front, back = (figure.axes[IN_ORDER.index(f"Camera_{place}")] for place in ("Front", "Back"))
-    assert (len(front.images), len(back.images), to_hex(front.get_facecolor())) == (
-        0,
-        1,
-        MISSING_COLOR,
+    figure = render_outcome_in_cameras(
+        da_partial,
+        approach_sample,
+        predict_labels(da_partial, approach_sample),
+        fig=detached_figure((10, 4)),
     )
-    assert len(lines_in(front, OUTCOME_COLORS["right"])) >= 12
+    panels = dict(zip(CAMERAS_IN_ORDER, figure.axes, strict=False))
+    front = panels["Camera_Front"]
+
+    assert len(front.images) == 0
+    assert to_hex(front.get_facecolor()) == MISSING_COLOR
+    assert len(find_lines(front, OUTCOME_COLORS["right"])) >= 12
+    assert len(panels["Camera_Back"].images) == 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [None, "paper", "slide"])
+@pytest.mark.parametrize("medium", STYLES)
 def test_words_are_in_the_picture_and_apart(
-    da_motion: DeepAccident, sample: str, labels: MotionLabels, where: Any
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, medium: Any
 ) -> None:
-    with style(where) if where else nullcontext():
-        for given, how in predictions(da_motion, sample, labels):
-            assert text_faults(render_outcome_in_cameras(da_motion, sample, given, **how)) == []
+    with style(medium):
+        for prediction, options in make_predictions(da_motion, sample, labels):
+            figure = render_outcome_in_cameras(da_motion, sample, prediction, **options)
+            assert find_text_faults(figure) == []

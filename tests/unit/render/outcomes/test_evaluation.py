@@ -1,16 +1,15 @@
 """Predictions beside labels, with the verdict of a protocol."""
 
-from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import pytest
-from drawing import of_kind, title_of
 from matplotlib import pyplot as plt
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
-from picture_texts import text_faults
+from support.figure_texts import STYLES, find_text_faults
+from support.rendered_pixels import collections_of_kind, read_title
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import (
@@ -31,85 +30,98 @@ from deepaccident_devkit.taxonomy import short_name
 
 
 def test_accidents_have_their_metres_and_verdict(da_motion: DeepAccident, sample: str) -> None:
-    true: Any = box_truth(da_motion, sample).accident
+    true_accident: Any = box_truth(da_motion, sample).accident
     near = Accident(
-        positions=true.positions + np.array([3.0, 0.0]), time=true.time + 0.5, score=0.9
+        positions=true_accident.positions + np.array([3.0, 0.0]),
+        time=true_accident.time + 0.5,
+        score=0.9,
     )
-    figure, silent = (
-        render_evaluation(da_motion, sample, given, fig=detached_figure((10, 6)))
-        for given in ([near], [])
+    foreseen, missed = (
+        render_evaluation(da_motion, sample, alarms, fig=detached_figure((10, 6)))
+        for alarms in ([near], [])
     )
-    above = figure.axes[1]
-    assert title_of(figure).endswith("accident: 5 m: FP + FN, 10 m: TP, 15 m: TP")
-    marked = {
-        line.get_marker(): line.get_xydata()
-        for line in above.lines
-        if line.get_marker() in ("o", "x")
-    }
-    np.testing.assert_allclose([marked["o"], marked["x"]], [true.positions, near.positions])
-    assert title_of(silent).endswith("5 m: FN, 10 m: FN, 15 m: FN")
+
+    verdict = "accident prediction: FP + FN within 5 m, TP within 10/15 m"
+    assert read_title(foreseen).endswith(verdict)
+    points = {line.get_marker(): line.get_xydata() for line in foreseen.axes[1].lines}
+    np.testing.assert_allclose(
+        [points["o"], points["x"]], [true_accident.positions, near.positions]
+    )
+    assert read_title(missed).endswith("FN within 5/10/15 m")
 
 
 def test_an_accident_is_shown_on_the_road_and_in_the_camera_that_sees_both_best(
-    da: DeepAccident, approach: str
+    da: DeepAccident, approach_sample: str
 ) -> None:
-    true: Any = box_truth(da, approach).accident
-    named = Accident(positions=true.positions + 2.0, time=true.time, ids=true.ids)
-    camera, above = render_evaluation(da, approach, [named], fig=detached_figure((12, 6))).axes
-    own = da.boxes(approach, "world")
-    pair = own.select(np.isin(own.actor_id, [*collider_ids(da, approach)]))
-    moment = da.get("sample", approach)["frame_token"]
-    best: Any = best_view(da, [each["token"] for each in da.samples_of(moment)], pair)
-    agent, _, channel = best.camera.rsplit("/", 3)[1:]
+    true_accident: Any = box_truth(da, approach_sample).accident
+    foreseen = Accident(
+        positions=true_accident.positions + 2.0, time=true_accident.time, ids=true_accident.ids
+    )
+    camera, above = render_evaluation(
+        da, approach_sample, [foreseen], fig=detached_figure((12, 6))
+    ).axes
+
+    boxes = da.boxes(approach_sample, "world")
+    pair = boxes.select(np.isin(boxes.actor_id, [*collider_ids(da, approach_sample)]))
+    frame = da.get("sample", approach_sample)["frame_token"]
+    view: Any = best_view(da, [sample["token"] for sample in da.samples_of(frame)], pair)
+    agent, _, channel = view.camera.rsplit("/", 3)[1:]
     assert camera.get_title() == f"{short_name(agent)}, {camera_name(channel)}"
-    np.testing.assert_array_equal(camera.images[0].get_array(), da.load_image(best.camera))
+    np.testing.assert_array_equal(camera.images[0].get_array(), da.load_image(view.camera))
+
     (road,) = above.images
-    assert BEV_COLORS["road"] in {
-        to_hex(color / 255) for color in np.unique(road.get_array().reshape(-1, 3), axis=0)
-    }
-    corners = [
-        path.vertices[:4] for each in of_kind(above, PolyCollection) for path in each.get_paths()
+    pixels = road.get_array().reshape(-1, 3)
+    colors = {to_hex(color / 255) for color in np.unique(pixels, axis=0)}
+    assert BEV_COLORS["road"] in colors
+    polygons = [
+        path.vertices[:4]
+        for shape in collections_of_kind(above, PolyCollection)
+        for path in shape.get_paths()
     ]
-    middles = np.mean(corners, axis=1)
-    assert np.linalg.norm(middles[:, None] - true.positions, axis=-1).min(axis=0).max() < 1.0
+    centers = np.mean(polygons, axis=1)
+    distances = np.linalg.norm(centers[:, None] - true_accident.positions, axis=-1)
+    assert distances.min(axis=0).max() < 1.0
 
 
 def test_the_pair_that_collides_is_red_in_every_task(
     da_motion: DeepAccident, sample: str, labels: MotionLabels
 ) -> None:
     assert len(collider_ids(da_motion, sample)) == 2
-    accident, boxes = box_truth(da_motion, sample).accident, da_motion.boxes(sample)
-    detected = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
+
+    accident = box_truth(da_motion, sample).accident
+    detected = predict_labels(da_motion, sample)
     motion = instances_of(labels.instance, labels.config.grid)
-    for prediction, panel, count in ((detected, 0, 2), ([accident], 1, 4), (motion, 0, 2)):
-        ax = render_evaluation(da_motion, sample, prediction, fig=detached_figure((10, 6))).axes[
-            panel
-        ]
-        edges = [each for each in ax.collections if isinstance(each, (ContourSet, PolyCollection))]
-        colors = [to_hex(color) for each in edges for color in each.get_edgecolor()]
-        assert colors.count(COLLIDER_COLOR) == count  # of an accident also at the impact
+    for prediction, panel, num_red in (
+        (detected, 0, 2),
+        ([accident], 1, 4),  # also at the impact
+        (motion, 0, 2),
+    ):
+        figure = render_evaluation(da_motion, sample, prediction, fig=detached_figure((10, 6)))
+        colors = []
+        for shape in figure.axes[panel].collections:
+            if isinstance(shape, (ContourSet, PolyCollection)):
+                colors += [to_hex(color) for color in shape.get_edgecolor()]
+        assert colors.count(COLLIDER_COLOR) == num_red
 
 
-def faults_of_predictions(dataset: DeepAccident, token: str) -> list[str]:
-    """What is wrong with the words of detections, and of accidents that are foreseen exactly,
-    nearly and not at all.
-    """
-    boxes, accident = dataset.boxes(token), box_truth(dataset, token).accident
-    near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
-    detected, faults = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes))), []
-    for given in (detected, [accident], [near], []):
-        picture = render_evaluation(dataset, token, given)
-        faults += text_faults(picture)
-        plt.close(picture)
-    return faults
+def predict_labels(dataset: DeepAccident, sample: str) -> DetectedBoxes:
+    """Predict exactly the boxes of the labels."""
+    boxes = dataset.boxes(sample)
+    return DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [None, "paper"])
+@pytest.mark.parametrize("medium", STYLES)
 def test_words_are_in_the_picture_and_apart(
-    da_motion: DeepAccident, sample: str, labels: MotionLabels, where: Any
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, medium: Any
 ) -> None:
-    with style(where) if where else nullcontext():
-        assert faults_of_predictions(da_motion, sample) == []
-        output = instances_of(labels.instance, labels.config.grid)
-        assert text_faults(render_evaluation(da_motion, sample, output)) == []
+    accident = box_truth(da_motion, sample).accident
+    near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
+    motion = instances_of(labels.instance, labels.config.grid)
+    predictions = (predict_labels(da_motion, sample), [accident], [near], [], motion)
+
+    with style(medium):
+        for prediction in predictions:
+            figure = render_evaluation(da_motion, sample, prediction)
+            assert find_text_faults(figure) == []
+            plt.close(figure)

@@ -1,4 +1,4 @@
-"""Where a replay has actors and agents, and who sees whom."""
+"""A replay's actors and agents are where they were, and it lists which agents see which actors."""
 
 import itertools
 import shutil
@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from refusals import assert_refused
-from replay_page import accident, data_of, normal
+from support.expected_errors import assert_raises
+from support.replay_page import accident_scenario, normal_scenario, read_page_data
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
@@ -30,155 +30,167 @@ from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COL
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
+CENTIMETRE_ROUNDING = 0.00501  # metres
+MILLI_ROUNDING = 0.000501  # radians, or shares of a unit vector
 
-def test_actors_are_where_their_tracks_say(da: DeepAccident, data: dict[str, Any]) -> None:
-    scenario = accident(da)
-    origin, tracks = recording_of(da, scenario, None).origin, scenario_tracks(da, scenario)
+
+def test_actors_are_where_their_tracks_have_them(da: DeepAccident, data: dict[str, Any]) -> None:
+    scenario = accident_scenario(da)
+    origin = recording_of(da, scenario, None).origin
+    tracks = scenario_tracks(da, scenario)
     assert sorted(actor["id"] for actor in data["actors"]) == np.unique(tracks.actor_id).tolist()
+
     for actor in data["actors"]:
         rows = np.flatnonzero(tracks.actor_id == actor["id"])
-        boxes, states = (
-            tracks.boxes.select(rows),
-            np.array([state for state in actor["states"] if state is not None]),
-        )
-        shown = [frame + 1 for frame, state in enumerate(actor["states"]) if state is not None]
-        assert shown == tracks.index[rows].tolist()
+        boxes = tracks.boxes.select(rows)
+        states_by_frame = {
+            frame: state
+            for frame, state in enumerate(actor["states"], start=1)
+            if state is not None
+        }
+        states = np.array([*states_by_frame.values()])
+        assert [*states_by_frame] == tracks.index[rows].tolist()
         assert actor["title"].startswith(f"{boxes.category_names[0]} {actor['id']}")
-        places = np.column_stack([states[:, :2] / 100 + origin, states[:, 4] / 100])
-        np.testing.assert_allclose(places, boxes.center, atol=0.00501)
-        np.testing.assert_allclose(states[:, 2] / 1000, boxes.yaw, atol=0.000501)
-        np.testing.assert_allclose(
-            [actor[side] / 100 for side in ("length", "width", "height")],
-            boxes.size[0],
-            atol=0.00501,
-        )
-        np.testing.assert_allclose(
-            states[:, 5:] / 1000, quaternions.to_matrix(boxes.rotation)[:, :2, 2], atol=0.000501
-        )
+
+        centers = np.column_stack([states[:, :2] / 100 + origin, states[:, 4] / 100])
+        np.testing.assert_allclose(centers, boxes.center, atol=CENTIMETRE_ROUNDING)
+        np.testing.assert_allclose(states[:, 2] / 1000, boxes.yaw, atol=MILLI_ROUNDING)
+        size = [actor[side] / 100 for side in ("length", "width", "height")]
+        np.testing.assert_allclose(size, boxes.size[0], atol=CENTIMETRE_ROUNDING)
+        up_axis = quaternions.to_matrix(boxes.rotation)[:, :2, 2]
+        np.testing.assert_allclose(states[:, 5:] / 1000, up_axis, atol=MILLI_ROUNDING)
 
 
-def test_who_sees_whom_is_the_released_rule(da: DeepAccident, data: dict[str, Any]) -> None:
+def test_actors_are_seen_by_the_released_rule(da: DeepAccident, data: dict[str, Any]) -> None:
     for (bit, agent), frame in itertools.product(enumerate(AGENTS), range(6)):
-        seen = {actor["id"] for actor in data["actors"] if actor["seen"][frame] >> bit & 1}
-        visible = da.visible_instances(f"{accident(da)}/{agent}/{frame + 1:03d}", agents=[agent])
-        assert seen == {int(token.rsplit("/", 1)[1]) for token in visible} != set()
+        seen_ids = {actor["id"] for actor in data["actors"] if actor["seen"][frame] >> bit & 1}
+        sample = f"{accident_scenario(da)}/{agent}/{frame + 1:03d}"
+        visible = da.visible_instances(sample, agents=[agent])
+        assert seen_ids == {int(token.rsplit("/", 1)[1]) for token in visible} != set()
 
 
 def test_the_pair_is_red_and_first_and_the_other_agents_have_their_hues(
     da: DeepAccident, data: dict[str, Any]
 ) -> None:
-    pair = da.get("scenario", accident(da))["collision"]["ids"]
-    agents = {agent["actor"]: agent for agent in data["agents"]}
+    pair = da.get("scenario", accident_scenario(da))["collision"]["ids"]
     assert [actor["id"] for actor in data["actors"][:2]] == sorted(pair)
+
+    agents = {agent["actor"]: agent for agent in data["agents"]}
     for actor in data["actors"]:
         agent = agents.get(actor["id"])
-        color = AGENT_COLORS[agent["name"]] if agent else CATEGORY_COLORS[actor["category"]]
-        expected = agent["short"] if agent else "", COLLIDER_COLOR if actor["id"] in pair else color
-        assert (actor["tag"], actor["color"]) == expected
+        assert actor["tag"] == (agent["short"] if agent else "")
+        if actor["id"] in pair:
+            assert actor["color"] == COLLIDER_COLOR
+        elif agent:
+            assert actor["color"] == AGENT_COLORS[agent["name"]]
+        else:
+            assert actor["color"] == CATEGORY_COLORS[actor["category"]]
 
 
 def test_cameras_are_where_they_record(da: DeepAccident, data: dict[str, Any]) -> None:
-    """A point that is 20 m before a camera has the same pixel with the page's numbers."""
-    scenario, ahead = accident(da), np.array([[3.0, -2.0, 20.0]])
+    """A point 20 m in front of a camera has the same pixel with the page's numbers."""
+    scenario = accident_scenario(da)
     origin = np.array([*recording_of(da, scenario, None).origin, 0.0])
+    point = np.array([3.0, -2.0, 20.0])
     for agent, cameras in zip(AGENTS, data["cameras"], strict=True):
         assert [camera["title"] for camera in cameras] == [*map(camera_name, CAMERAS)]
-        moments = (
-            (*each, *at)
-            for each in zip(CAMERAS, cameras, strict=True)
-            for at in enumerate(each[1]["poses"], 1)
-        )
-        for channel, camera, frame, pose in moments:
-            sample = f"{scenario}/{agent}/{frame:03d}"
-            lens, there = da.camera(sample, channel), da.world_from(sample, channel)
-            np.testing.assert_allclose(
-                np.array(pose[:3]) / 100 + origin, there.translation, atol=0.00501
-            )
-            turned = quaternions.to_matrix(np.array(pose[3:]) / 10_000) @ ahead[0]
-            np.testing.assert_allclose(turned, there.rotation @ ahead[0], atol=0.01)
-            width, height, fx, fy, cx, cy = camera["lens"]
-            assert (width, height) == (lens.width, lens.height)
-            pixel = np.array([fx, fy]) * ahead[0, :2] / ahead[0, 2] + [cx, cy]
-            np.testing.assert_allclose([pixel], lens.project(ahead)[0], atol=0.01)
+        for channel, camera in zip(CAMERAS, cameras, strict=True):
+            for frame, pose in enumerate(camera["poses"], start=1):
+                sample = f"{scenario}/{agent}/{frame:03d}"
+                world_from_camera = da.world_from(sample, channel)
+                position = np.array(pose[:3]) / 100 + origin
+                np.testing.assert_allclose(
+                    position, world_from_camera.translation, atol=CENTIMETRE_ROUNDING
+                )
+                rotated = quaternions.to_matrix(np.array(pose[3:]) / 10_000) @ point
+                np.testing.assert_allclose(rotated, world_from_camera.rotation @ point, atol=0.01)
+
+                expected_camera = da.camera(sample, channel)
+                width, height, fx, fy, cx, cy = camera["lens"]
+                assert (width, height) == (expected_camera.width, expected_camera.height)
+                pixel = np.array([fx, fy]) * point[:2] / point[2] + [cx, cy]
+                expected_pixels, _ = expected_camera.project(point[None])
+                np.testing.assert_allclose([pixel], expected_pixels, atol=0.01)
 
 
 def test_the_countdown_ends_at_the_impact(da: DeepAccident, data: dict[str, Any]) -> None:
-    scenario = da.get("scenario", accident(da))
-    contact = da.collision(scenario)
+    scenario = accident_scenario(da)
     assert data["countdown"] == [0.5, 0.4, 0.3, 0.2, 0.1, 0.0]
-    origin = recording_of(da, scenario["token"], None).origin
-    np.testing.assert_allclose(
-        np.array(data["impact"]) / 100 + origin, contact.point[:2], atol=0.00501
-    )
+    impact = np.array(data["impact"]) / 100 + recording_of(da, scenario, None).origin
+    np.testing.assert_allclose(impact, da.collision(scenario).point[:2], atol=CENTIMETRE_ROUNDING)
 
 
-def test_the_pair_is_as_near_as_its_interactions_say(
-    da: DeepAccident, data: dict[str, Any]
-) -> None:
-    found, pair = (
-        interactions(da, accident(da)),
-        da.get("scenario", accident(da))["collision"]["ids"],
-    )
-    own = (found.actor_ids == sorted(pair)).all(axis=1)
-    gap, ttc = (
-        np.array(data["pair"][name], dtype=float)[found.frame[own] - 1] for name in ("gap", "ttc")
-    )
-    assert len(gap) == len(data["countdown"])
-    np.testing.assert_allclose(gap / 100, found.gap[own], atol=0.00501)
-    np.testing.assert_allclose(
-        ttc / 10, np.where(np.isinf(found.ttc[own]), np.nan, found.ttc[own]), atol=0.0501
-    )
+def test_the_pair_is_as_near_as_in_its_interactions(da: DeepAccident, data: dict[str, Any]) -> None:
+    scenario = accident_scenario(da)
+    pair = da.get("scenario", scenario)["collision"]["ids"]
+    table = interactions(da, scenario)
+    is_pair = (table.actor_ids == sorted(pair)).all(axis=1)
+    rows = table.frame[is_pair] - 1
+    gap_cm, ttc_ds = (np.array(data["pair"][name], dtype=float)[rows] for name in ("gap", "ttc"))
+
+    assert len(gap_cm) == len(data["countdown"])
+    np.testing.assert_allclose(gap_cm / 100, table.gap[is_pair], atol=CENTIMETRE_ROUNDING)
+    ttc = table.ttc[is_pair]
+    np.testing.assert_allclose(ttc_ds / 10, np.where(np.isinf(ttc), np.nan, ttc), atol=0.0501)
 
 
-def test_where_nobody_collides_nothing_is_red(da_b: DeepAccident, tmp_path: Path) -> None:
-    data = data_of(render_replay(da_b, normal(da_b), tmp_path / "normal.html"))
+def test_without_a_collision_nothing_is_red(da_b: DeepAccident, tmp_path: Path) -> None:
+    data = read_page_data(render_replay(da_b, normal_scenario(da_b), tmp_path / "normal.html"))
     assert (data["countdown"], data["impact"], data["pair"]) == ([None] * 4, None, None)
-    roles, colors = ({actor[name] for actor in data["actors"]} for name in ("role", "color"))
-    assert (roles, COLLIDER_COLOR in colors) == ({"agent", "other"}, False)
+    assert {actor["role"] for actor in data["actors"]} == {"agent", "other"}
+    assert all(actor["color"] != COLLIDER_COLOR for actor in data["actors"])
 
 
-def test_labels_alone_are_enough(da_b: DeepAccident, tmp_path: Path) -> None:
-    data = data_of(render_replay(da_b, None, tmp_path / "replay.html"))
-    assert (data["scenario"], data["cameras"], data["points"]) == (accident(da_b), [[]] * 5, None)
-    assert all(any(state for state in actor["states"]) for actor in data["actors"])
+def test_labels_are_enough(da_b: DeepAccident, tmp_path: Path) -> None:
+    data = read_page_data(render_replay(da_b, None, tmp_path / "replay.html"))
+    assert data["scenario"] == accident_scenario(da_b)
+    assert (data["cameras"], data["points"]) == ([[]] * 5, None)
+    assert all(any(actor["states"]) for actor in data["actors"])
 
 
 def test_without_labels_there_are_the_agents(own_release: Path, tmp_path: Path) -> None:
     for folder in sorted(own_release.rglob("label")):
         shutil.rmtree(folder)
-    data = data_of(
-        render_replay(
-            DeepAccident("v1", own_release, verbose=False), None, tmp_path / "replay.html"
-        )
-    )
-    assert (data["actors"], [len(agent["poses"]) for agent in data["agents"]]) == ([], [4] * 5)
+    dataset = DeepAccident("v1", own_release, verbose=False)
+    data = read_page_data(render_replay(dataset, None, tmp_path / "replay.html"))
+
+    assert data["actors"] == []
+    assert [len(agent["poses"]) for agent in data["agents"]] == [4] * 5
     assert data["countdown"][-1] == 0
 
 
 def test_each_sample_has_its_verdict(
     da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
 ) -> None:
-    data = data_of(render_replay(da_motion, None, tmp_path / "a.html", prediction=predictions))
-    right, far, _, many = samples = data["prediction"]["samples"]
-    assert [(each["frame"], each["agent"], each["verdict"]) for each in samples] == [
+    page = render_replay(da_motion, None, tmp_path / "a.html", prediction=predictions)
+    data = read_page_data(page)
+
+    samples = data["prediction"]["samples"]
+    assert [(sample["frame"], sample["agent"], sample["verdict"]) for sample in samples] == [
         (19, 0, "TP"),
         (24, 0, "FP + FN"),
         (29, 0, "FN"),
         (29, 4, "4 FP + FN"),
     ]
-    (hit,), (miss,), (unknown, *others) = right["alarms"], far["alarms"], many["alarms"]
+    (hit,) = samples[0]["alarms"]
     assert (hit["right"], hit["time"]) == (True, 1.5)
-    assert (miss["right"], "places off by 40.0 m" in miss["text"]) == (False, True)
-    assert (len(others), many["more"], "names an unknown actor" in unknown["text"]) == (2, 1, True)
-    # the foreseen places are those of the pair at the end, in the page's own ground: centimetres; a
+    (miss,) = samples[1]["alarms"]
+    assert miss["right"] is False
+    assert "position error 40.0 m" in miss["text"]
+    unknown, *far_alarms = samples[3]["alarms"]
+    assert (len(far_alarms), samples[3]["more"]) == (2, 1)
+    assert "names an unknown actor" in unknown["text"]
+
+    # the foreseen positions are the pair's last ones on the page's own ground, in centimetres; a
     # slope takes a few
     pair = [actor["states"][-1][:2] for actor in data["actors"] if actor["role"] == "pair"]
     np.testing.assert_allclose(sorted(hit["places"]), sorted(pair), atol=8)
 
 
-def stored(path: Path, task: Any, given: Mapping[str, Any], **how: Any) -> Results:
-    with ResultsWriter(path, task, **how) as writer:
-        for token, prediction in given.items():
+def write_results(path: Path, task: Any, predictions: Mapping[str, Any]) -> Results:
+    """Write predictions by sample to a results file and open it."""
+    with ResultsWriter(path, task) as writer:
+        for token, prediction in predictions.items():
             writer.add(token, prediction)
     return read_results(path)
 
@@ -186,25 +198,34 @@ def stored(path: Path, task: Any, given: Mapping[str, Any], **how: Any) -> Resul
 def test_results_files_give_the_same_page(
     da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
 ) -> None:
-    results = stored(tmp_path / "results.json", "accident", predictions)
-    by_token = render_replay(da_motion, None, tmp_path / "a.html", prediction=predictions)
-    by_file = render_replay(da_motion, None, tmp_path / "b.html", prediction=results)
-    assert by_file.read_bytes() == by_token.read_bytes()
+    results = write_results(tmp_path / "results.json", "accident", predictions)
+    page = render_replay(da_motion, None, tmp_path / "a.html", prediction=predictions)
+    page_of_file = render_replay(da_motion, None, tmp_path / "b.html", prediction=results)
+    assert page_of_file.read_bytes() == page.read_bytes()
 
 
 def test_motion_is_read_for_accidents(da_motion: DeepAccident, tmp_path: Path) -> None:
-    """The pair as the labels draw it, and nobody else, as prediction: the true accident is
-    foreseen.
+    """The prediction is the pair as the labels draw it, and no other actor: it foresees the true
+    accident.
     """
-    config, ego, given = MotionLabelConfig(), f"{accident(da_motion)}/ego_vehicle", {}
-    ids = da_motion.get("scenario", accident(da_motion))["collision"]["ids"]
-    for token in (f"{ego}/020", f"{ego}/030"):
+    config = MotionLabelConfig()
+    scenario = da_motion.get("scenario", accident_scenario(da_motion))
+    motion = {}
+    for frame in ("020", "030"):
+        token = f"{scenario['token']}/ego_vehicle/{frame}"
         label = labels_at_present(motion_labels(da_motion, token, config))
-        pair = [label.id_map[each] for each in (OWN_BOX_ID, *ids) if each in label.id_map]
-        shown = np.where(np.isin(label.instance, pair), label.instance, 0)
-        given[token] = instances_of(shown, config.grid)
-    by_token = render_replay(da_motion, None, tmp_path / "a.html", prediction=given)
-    assert [each["verdict"] for each in data_of(by_token)["prediction"]["samples"]] == ["TP", "TP"]
+        pair = [
+            label.id_map[actor_id]
+            for actor_id in (OWN_BOX_ID, *scenario["collision"]["ids"])
+            if actor_id in label.id_map
+        ]
+        instance = np.where(np.isin(label.instance, pair), label.instance, 0)
+        motion[token] = instances_of(instance, config.grid)
+
+    page = render_replay(da_motion, None, tmp_path / "a.html", prediction=motion)
+
+    samples = read_page_data(page)["prediction"]["samples"]
+    assert [sample["verdict"] for sample in samples] == ["TP", "TP"]
 
 
 def test_predictions_of_something_else_are_refused(
@@ -213,20 +234,21 @@ def test_predictions_of_something_else_are_refused(
     token = next(iter(predictions))
     boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
     detected = DetectedBoxes(boxes=boxes, scores=np.zeros(0))
-    detection = stored(tmp_path / "boxes.json", "detection", {token: detected})
+    detection = write_results(tmp_path / "boxes.json", "detection", {token: detected})
+    normal = normal_scenario(da_motion)
 
     def replay(prediction: Any, scenario: str | None = None) -> Callable[[], object]:
         return lambda: render_replay(
             da_motion, scenario, tmp_path / "a.html", prediction=prediction
         )
 
-    assert_refused(
+    assert_raises(
         (
-            replay(predictions, normal(da_motion)),
+            replay(predictions, normal),
             NotAvailableError,
-            ("prediction", normal(da_motion), "ego_vehicle"),
+            ("prediction", normal, "ego_vehicle"),
         ),
-        (replay(detection), EvaluationError, ("holds detection results", "motion or accident")),
+        (replay(detection), EvaluationError, ("contains detection results", "motion or accident")),
         (
             replay({token: [7]}),
             EvaluationError,

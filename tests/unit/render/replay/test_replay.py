@@ -1,4 +1,4 @@
-"""Replays: one page that asks for nothing else, and the command that writes it."""
+"""Replays are a single page that requests nothing else, written by a function or a command."""
 
 import base64
 import hashlib
@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from refusals import assert_refused
-from replay_page import accident, data_of
+from support.expected_errors import assert_raises
+from support.replay_page import accident_scenario, read_page_data
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.cli.render import replay
@@ -22,20 +22,19 @@ from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.replay.page import replay_page
 
 
-def test_a_page_keeps_its_limit(
+def test_a_page_keeps_its_size_limit(
     da: DeepAccident, page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    whole = page.stat().st_size
-    assert whole < 15_000_000
-    monkeypatch.setattr(
-        sys.modules[render_replay.__module__], "SIZE_LIMIT", whole - 10_000
-    )  # its pictures would fit
-    assert render_replay(da, None, tmp_path / "small.html").stat().st_size <= whole - 10_000
+    full_size = page.stat().st_size
+    assert full_size < 15_000_000
+    limit = full_size - 10_000  # only the pictures would fit
+    monkeypatch.setattr(sys.modules[render_replay.__module__], "SIZE_LIMIT", limit)
+    assert render_replay(da, None, tmp_path / "small.html").stat().st_size <= limit
 
 
-def test_the_policy_allows_this_script_and_style_alone(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', text)
+def test_the_policy_only_allows_this_script_and_style(page: Path) -> None:
+    html = page.read_text(encoding="utf-8")
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', html)
     expected = {
         "default-src": "'none'",
         "img-src": "data:",
@@ -43,33 +42,37 @@ def test_the_policy_allows_this_script_and_style_alone(page: Path) -> None:
         "form-action": "'none'",
     }
     for name, tag in (("style-src", "style"), ("script-src", "script")):
-        (content,) = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)
+        (content,) = re.findall(rf"<{tag}>(.*?)</{tag}>", html, re.DOTALL)
         digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
         expected[name] = f"'sha256-{digest}'"
     assert dict(rule.split(" ", 1) for rule in policy.split("; ")) == expected
+
+    html_without_comments = re.sub(r"//.*\n", "", html)
     assert not re.search(
-        r"(?:https?:)?//\w|\bsrc=|\bhref=|@import|url\(|\bon\w+=", re.sub(r"//.*\n", "", text)
+        r"(?:https?:)?//\w|\bsrc=|\bhref=|@import|url\(|\bon\w+=", html_without_comments
     )
 
 
 def test_text_stays_text() -> None:
-    wild = "</script><script>alert(1)</script> & <!--title--> \u2028 é"
-    text = replay_page(wild, {"scenario": wild})
-    assert data_of(text) == {"scenario": wild}
-    assert "<title>&lt;/script&gt;&lt;script&gt;alert(1)" in text
-    assert ("alert(1)</script>" in text, text.count("<script")) == (False, 2)
+    malicious = "</script><script>alert(1)</script> & <!--title--> \u2028 é"
+    html = replay_page(malicious, {"scenario": malicious})
+    assert read_page_data(html) == {"scenario": malicious}
+    assert "<title>&lt;/script&gt;&lt;script&gt;alert(1)" in html
+    assert "alert(1)</script>" not in html
+    assert html.count("<script") == 2
 
 
-def test_what_cannot_be_is_refused(da: DeepAccident, tmp_path: Path) -> None:
+def test_unknown_scenarios_agents_and_paths_are_refused(da: DeepAccident, tmp_path: Path) -> None:
     def replay(
-        scenario: str | None = None, path: Path | str = tmp_path / "no.html", **how: Any
+        scenario: str | None = None, path: Path | str = tmp_path / "no.html", **options: Any
     ) -> Callable[[], object]:
-        return lambda: render_replay(da, scenario, path, **how)
+        return lambda: render_replay(da, scenario, path, **options)
 
-    assert_refused(
+    assert_raises(
         (replay("type1_subtype1_accident/nowhere"), TokenError, ("nowhere",)),
         (replay(agents=["pedestrian"]), ChoiceError, ("agent", "ego_vehicle", "pedestrian")),
         (replay(path="."), ChoiceError, ("is a folder", "such as replay.html")),
+        (replay(path="r.png"), ChoiceError, ("r.png: expected a file that ends in .html, .htm",)),
     )
     assert list(tmp_path.iterdir()) == []
 
@@ -80,21 +83,22 @@ def test_a_release_without_an_accident_shows_its_first_scenario(
     for folder in sorted(own_release.rglob("*_accident")):
         shutil.rmtree(folder)
     dataset = DeepAccident("v1", own_release, verbose=False)
-    page = render_replay(dataset, None, tmp_path / "first.html")
-    assert (
-        page.read_bytes()
-        == render_replay(dataset, dataset.scenario[0], tmp_path / "named.html").read_bytes()
-    )
+    default_page = render_replay(dataset, None, tmp_path / "first.html")
+    first_page = render_replay(dataset, dataset.scenario[0], tmp_path / "named.html")
+    assert default_page.read_bytes() == first_page.read_bytes()
 
 
 def test_the_command_writes_the_page(
     da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
 ) -> None:
-    results, out = tmp_path / "results.json", tmp_path / "replay.html"
+    results = tmp_path / "results.json"
     with ResultsWriter(results, "accident") as writer:
         for token, alarms in predictions.items():
             writer.add(token, alarms)
-    options = [
+    out = tmp_path / "replay.html"
+    arguments = [
+        str(da_motion.dataroot),
+        accident_scenario(da_motion),
         "--out",
         str(out),
         "--results",
@@ -102,9 +106,13 @@ def test_the_command_writes_the_page(
         "--agents",
         "ego_vehicle,infrastructure",
     ]
-    ran = CliRunner().invoke(replay, [str(da_motion.dataroot), accident(da_motion), *options])
-    assert (ran.exit_code, f"written: {out}, " in ran.output) == (0, True), ran.output
-    data = data_of(out)
+
+    result = CliRunner().invoke(replay, arguments)
+
+    assert result.exit_code == 0, result.output
+    assert f"wrote {out} (" in result.output
+    data = read_page_data(out)
     assert [agent["name"] for agent in data["agents"]] == ["ego_vehicle", "infrastructure"]
-    judged = [(each["verdict"], each["agent"]) for each in data["prediction"]["samples"]]
-    assert judged == [("TP", 0), ("FP + FN", 0), ("FN", 0), ("4 FP + FN", 1)]
+    samples = data["prediction"]["samples"]
+    verdicts = [(sample["verdict"], sample["agent"]) for sample in samples]
+    assert verdicts == [("TP", 0), ("FP + FN", 0), ("FN", 0), ("4 FP + FN", 1)]

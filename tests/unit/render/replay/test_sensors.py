@@ -1,4 +1,4 @@
-"""The pictures and points of a replay, which keep its size."""
+"""The pictures and points of a replay, which respect its size limit."""
 
 import base64
 import io
@@ -12,120 +12,140 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from replay_page import accident, data_of, picture
 from scipy.spatial import cKDTree
+from support.replay_page import accident_scenario, decode_image, read_page_data
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry.camera import IN_FRONT_DEPTH
 from deepaccident_devkit.render.replay import render_replay, sensors
 from deepaccident_devkit.render.replay.entries import ReplayRecording, actor_entries, recording_of
 from deepaccident_devkit.render.replay.sensors import (
-    PAGE_CLOUD_BYTES,
     Followed,
     Jpegs,
     PictureSettings,
     camera_files,
     camera_pictures,
+    cloud_size,
+    cloud_text,
     follow_pair,
-    max_cloud_points,
     steady_choice,
 )
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 
-def test_points_lie_on_those_of_the_lidar(da: DeepAccident, data: dict[str, Any]) -> None:
-    scenario = accident(da)
-    origin = recording_of(da, scenario, None).origin
-    most = max_cloud_points(30, PAGE_CLOUD_BYTES)
+def decode_points(encoded: str, origin: list[float]) -> Any:
+    """Return the points of an encoded cloud in world, metres."""
+    centimetres = np.frombuffer(base64.b64decode(encoded), dtype="<i2").reshape(-1, 3)
+    return centimetres / 100 + origin
+
+
+def test_a_small_page_has_all_lidar_points(da: DeepAccident, data: dict[str, Any]) -> None:
+    scenario = accident_scenario(da)
+    origin = [*recording_of(da, scenario, None).origin, 0.0]
     for agent, clouds in zip(AGENTS, data["points"], strict=True):
-        for frame, coded in enumerate(clouds, 1):
-            shown = np.frombuffer(base64.b64decode(coded), dtype="<i2").reshape(-1, 3) / 10 + [
-                *origin,
-                0.0,
-            ]
-            sample = f"{scenario}/{agent}/{frame:03d}"
-            height = da.load_point_cloud(sample, "ego").xyz[:, 2]
-            raised = da.load_point_cloud(sample, "world").xyz[
-                height > np.percentile(height, 5) + 0.2
-            ]
-            assert 100 < len(shown) <= most
-            assert cKDTree(raised).query(shown)[0].max() < 0.0867  # half a decimetre along all axes
+        for frame, encoded in enumerate(clouds, start=1):
+            points = decode_points(encoded, origin)
+            cloud = da.load_point_cloud(f"{scenario}/{agent}/{frame:03d}", "world").xyz
+            assert len(points) == len(cloud)
+            distances, _ = cKDTree(cloud).query(points)
+            assert distances.max() < 0.0088  # half a centimetre along all axes
+    assert not any("points per cloud" in note for note in data["notes"])
+
+
+def test_a_limited_cloud_has_the_points_above_the_road_first(da: DeepAccident) -> None:
+    scenario = accident_scenario(da)
+    recording = recording_of(da, scenario, None)
+    whole = cloud_text(recording, "ego_vehicle", 1)
+    part = cloud_text(recording, "ego_vehicle", 1, 500)
+    assert whole is not None
+    assert part is not None
+    assert whole.startswith(part)
+    assert len(part) == cloud_size(500)
+
+    sample = f"{scenario}/ego_vehicle/001"
+    height = da.load_point_cloud(sample, "ego").xyz[:, 2]
+    raised = da.load_point_cloud(sample, "world").xyz[height > np.percentile(height, 5) + 0.2]
+    points = decode_points(part, [*recording.origin, 0.0])
+    distances, _ = cKDTree(raised).query(points)
+    assert distances.max() < 0.0088
 
 
 def test_each_agent_has_six_cameras(da: DeepAccident, data: dict[str, Any]) -> None:
-    shown = {
-        f"{accident(da)}/{agent}/006/{channel}": np.asarray(
-            picture(camera["pictures"][5]), dtype=float
-        )
-        for agent, cameras in zip(AGENTS, data["cameras"], strict=True)
-        for channel, camera in zip(CAMERAS, cameras, strict=True)
-    }
-    true = {token: da.load_image(token) for token in shown}
-    nearest = {
-        token: min(true, key=lambda each: np.abs(true[each] - shown[token]).mean())
-        for token in shown
-    }
-    assert nearest == {token: token for token in shown}
+    pictures = {}
+    for agent, cameras in zip(AGENTS, data["cameras"], strict=True):
+        for channel, camera in zip(CAMERAS, cameras, strict=True):
+            token = f"{accident_scenario(da)}/{agent}/006/{channel}"
+            pictures[token] = np.asarray(decode_image(camera["pictures"][5]), dtype=float)
+
+    images = {token: da.load_image(token) for token in pictures}
+    for token, picture in pictures.items():
+        differences = {key: np.abs(image - picture).mean() for key, image in images.items()}
+        assert min(differences, key=differences.__getitem__) == token
 
 
-def taken(dataset: DeepAccident, limit: float) -> tuple[PictureSettings | None, Jpegs]:
-    """The pictures of a page on which each agent's back camera follows the pair from frame 4 on."""
-    files = camera_files(recording_of(dataset, accident(dataset), None))
+def select_pictures(dataset: DeepAccident, limit: float) -> tuple[PictureSettings | None, Jpegs]:
+    """Select the pictures of a page on which each agent's back camera follows the pair from frame 4
+    on.
+    """
+    files = camera_files(recording_of(dataset, accident_scenario(dataset), None))
     channels = (*[CAMERAS[0]] * 3, *["Camera_Back"] * 3)
     followed = Followed(channels=dict.fromkeys(AGENTS, channels), agents=(AGENTS[0],) * 6)
     return camera_pictures(files, followed, limit)
 
 
-def weight(jpegs: Jpegs) -> int:
+def count_bytes(jpegs: Jpegs) -> int:
     return sum(
-        len(each)
+        len(jpeg)
         for cameras in jpegs.values()
-        for all_ in cameras.values()
-        for each in all_
-        if each
+        for camera_jpegs in cameras.values()
+        for jpeg in camera_jpegs
+        if jpeg
     )
 
 
-def test_pictures_keep_the_limit_and_at_last_become_fewer(da: DeepAccident) -> None:
+def test_pictures_keep_the_limit_and_in_the_end_become_fewer(da: DeepAccident) -> None:
     sizes = []
     for limit in (math.inf, 145_000, 45_000, 20_000, 12_000):
-        settings, jpegs = taken(da, limit)
-        sizes.append(weight(jpegs))
-        assert (set(jpegs), sizes[-1] <= limit) == (set(AGENTS), True)
-        given = {
-            channel: [each is not None for each in all_]
-            for channel, all_ in jpegs["infrastructure"].items()
-        }
-        follows = [frame % settings.frame_step == 0 for frame in range(6)]
-        others = [
+        settings, jpegs = select_pictures(da, limit)
+        sizes.append(count_bytes(jpegs))
+        assert set(jpegs) == set(AGENTS)
+        assert sizes[-1] <= limit
+
+        followed_frames = [frame % settings.frame_step == 0 for frame in range(6)]
+        other_frames = [
             bool(settings.other_frame_step) and frame % settings.other_frame_step == 0
             for frame in range(6)
         ]
-        expected = {
-            CAMERAS[0]: follows,
-            "Camera_BackLeft": others,
-            "Camera_Back": others[:3] + follows[3:],
-        }
-        assert {channel: given.get(channel, [False] * 6) for channel in expected} == expected
+        for channel, expected in (
+            (CAMERAS[0], followed_frames),
+            ("Camera_BackLeft", other_frames),
+            ("Camera_Back", other_frames[:3] + followed_frames[3:]),
+        ):
+            camera_jpegs = jpegs["infrastructure"].get(channel, [None] * 6)
+            assert [jpeg is not None for jpeg in camera_jpegs] == expected
     assert sizes == sorted(sizes, reverse=True)
-    assert (settings.other_frame_step, settings.frame_step > 1) == (0, True)
-    assert taken(da, 10)[1] == {}
+    assert settings.other_frame_step == 0
+    assert settings.frame_step > 1
+    assert select_pictures(da, 10)[1] == {}
 
 
 def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> None:
     root = tmp_path / "release"
-    shutil.copytree(
-        da.dataroot, root, copy_function=os.link, ignore=shutil.ignore_patterns(".deepaccident")
-    )
-    part = DeepAccident("v1", root, verbose=False)
-    for gone in ("other_vehicle/003/Camera_Front", "ego_vehicle/002/lidar01"):
-        part.get_sample_data_path(f"{accident(part)}/{gone}").unlink()
-    data = data_of(render_replay(part, None, tmp_path / "replay.html"))
-    shown = data["cameras"][2][0]["pictures"], data["points"][0]
-    assert [[each is None for each in row] for row in shown] == [
-        [at == gone for at in range(6)] for gone in (2, 1)
-    ]
+    ignore = shutil.ignore_patterns(".deepaccident")
+    shutil.copytree(da.dataroot, root, copy_function=os.link, ignore=ignore)
+    dataset = DeepAccident("v1", root, verbose=False)
+    for file in ("other_vehicle/003/Camera_Front", "ego_vehicle/002/lidar01"):
+        dataset.get_sample_data_path(f"{accident_scenario(dataset)}/{file}").unlink()
+
+    data = read_page_data(render_replay(dataset, None, tmp_path / "replay.html"))
+
+    pictures = data["cameras"][2][0]["pictures"]
+    assert [frame for frame, picture in enumerate(pictures) if picture is None] == [2]
+    assert len(pictures) == 6
+    clouds = data["points"][0]
+    assert [frame for frame, cloud in enumerate(clouds) if cloud is None] == [1]
+    assert len(clouds) == 6
     assert (
         "1 of 30 LiDAR files are missing in the release; unpack the archives of lidar01."
         in data["notes"]
@@ -138,49 +158,47 @@ def test_a_missing_picture_leaves_a_hole(da: DeepAccident, tmp_path: Path) -> No
 
 @pytest.fixture(scope="module")
 def recording(da_motion: DeepAccident) -> ReplayRecording:
-    return recording_of(da_motion, accident(da_motion), None)
+    return recording_of(da_motion, accident_scenario(da_motion), None)
 
 
-def followed(recording: ReplayRecording, missing: tuple[str, str] = ("", "")) -> Followed:
-    seen = {actor["id"]: actor["seen"] for actor in actor_entries(recording)}
-    keys = itertools.product(recording.agents, CAMERAS)
-    return follow_pair(
-        recording, seen, {key: [key != missing] * len(recording.frames) for key in keys}
-    )
+def follow_in_recording(recording: ReplayRecording) -> Followed:
+    """Choose the cameras that follow the pair where no image is missing."""
+    visibility = {actor["id"]: actor["seen"] for actor in actor_entries(recording)}
+    has_image = [True] * len(recording.frames)
+    cameras = itertools.product(recording.agents, CAMERAS)
+    return follow_pair(recording, visibility, dict.fromkeys(cameras, has_image))
 
 
-def changes(names: tuple[str, ...]) -> int:
-    return sum(one != other for one, other in itertools.pairwise(names))
+def count_changes(names: tuple[str, ...]) -> int:
+    return sum(name != next_name for name, next_name in itertools.pairwise(names))
 
 
 def test_the_pair_is_in_the_picture_at_the_impact(
     da_motion: DeepAccident, recording: ReplayRecording
 ) -> None:
-    found = followed(recording)
-    assert {agent: len(channels) for agent, channels in found.channels.items()} == dict.fromkeys(
-        AGENTS, 35
-    )
-    assert (
-        max(map(changes, [*found.channels.values(), found.agents])) <= 3
-    )  # in 3.5 s: it does not flicker
+    followed = follow_in_recording(recording)
+    assert list(followed.channels) == list(AGENTS)
+    for channels in followed.channels.values():
+        assert len(channels) == 35
+    for names in (*followed.channels.values(), followed.agents):
+        assert count_changes(names) <= 3  # in 3.5 s: it does not flicker
+
+    tracks = scenario_tracks(da_motion, recording.scenario)
     for frame in range(26, 36):
-        agent = found.agents[frame - 1]
-        sample, channel = recording.sample(agent, frame), found.channels[agent][frame - 1]
-        boxes, lens = (
-            scenario_tracks(da_motion, recording.scenario).at(frame),
-            da_motion.camera(sample, channel),
-        )
+        agent = followed.agents[frame - 1]
+        channel = followed.channels[agent][frame - 1]
+        sample = recording.sample(agent, frame)
+        boxes = tracks.at(frame)
         pair = boxes.select(np.isin(boxes.actor_id, recording.pair))
-        centers = pair.transform(da_motion.world_from(sample, channel).inverse(), channel).center
-        assert lens.in_image(*lens.project(centers), min_depth=IN_FRONT_DEPTH).any(), (
-            frame,
-            agent,
-            channel,
-        )
+        camera_from_world = da_motion.world_from(sample, channel).inverse()
+        centers = pair.transform(camera_from_world, channel).center
+        camera = da_motion.camera(sample, channel)
+        in_image = camera.in_image(*camera.project(centers), min_depth=IN_FRONT_DEPTH)
+        assert in_image.any(), (frame, agent, channel)
 
 
 @pytest.mark.parametrize(
-    ("scores", "chosen"),
+    ("scores", "cameras"),
     [
         (
             [[0.9, 0.1], [0.0, 0.8], [0.9, 0.1], [0.9, 0.1]],
@@ -191,8 +209,8 @@ def test_the_pair_is_in_the_picture_at_the_impact(
         ([[0.2, 0.2, 0.7]], [2]),
     ],
 )
-def test_changes_are_worth_their_cost(scores: list[list[float]], chosen: list[int]) -> None:
-    assert steady_choice(np.array(scores)) == chosen
+def test_changes_are_worth_their_cost(scores: list[list[float]], cameras: list[int]) -> None:
+    assert steady_choice(np.array(scores)) == cameras
 
 
 def test_other_cameras_have_smaller_pictures(
@@ -200,11 +218,13 @@ def test_other_cameras_have_smaller_pictures(
 ) -> None:
     monkeypatch.setattr(sensors, "MIN_OTHER_WIDTH_PX", 8)
     monkeypatch.setattr(sensors, "PICTURE_LADDER", [(40, 60)])
-    jpegs = taken(da, math.inf)[1]["other_vehicle"]
+    _, jpegs = select_pictures(da, math.inf)
     large, small = (40, 22), (20, 11)
-    expected = {"Front": [large] * 6, "Back": [small] * 3 + [large] * 3, "FrontRight": [small] * 6}
-    sizes = {
-        name: [Image.open(io.BytesIO(each)).size for each in jpegs[f"Camera_{name}"]]
-        for name in expected
-    }
-    assert sizes == expected
+
+    for channel, expected in (
+        ("Camera_Front", [large] * 6),
+        ("Camera_Back", [small] * 3 + [large] * 3),
+        ("Camera_FrontRight", [small] * 6),
+    ):
+        pictures = [Image.open(io.BytesIO(jpeg)) for jpeg in jpegs["other_vehicle"][channel]]
+        assert [picture.size for picture in pictures] == expected

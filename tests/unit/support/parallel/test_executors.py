@@ -9,16 +9,16 @@ from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.cli import deepaccident
 from deepaccident_devkit.errors import MissingExtraError, WorkerError
 from deepaccident_devkit.support.parallel import cluster_executor, run_batch
-from deepaccident_devkit.support.parallel.executors import fault_of_workers
+from deepaccident_devkit.support.parallel.executors import describe_worker_fault
 
 
-def test_a_dead_scheduler() -> None:
-    import distributed  # noqa: F401 - sets its own settings, which have to be there before one is changed
+def test_a_dead_scheduler_is_an_error() -> None:
+    import distributed  # noqa: F401 - sets its own settings, which must exist before one is changed
     from dask import config
 
     message = (
@@ -51,7 +51,7 @@ def test_a_dead_scheduler() -> None:
         f'{{"address": "{"x" * 100}://"}}',
     ],
 )
-def test_a_wrong_scheduler_file(
+def test_a_wrong_scheduler_file_is_an_error(
     tmp_path: Path, content: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import distributed  # noqa: F401 - as above
@@ -68,18 +68,17 @@ def test_a_wrong_scheduler_file(
     ):
         pass
     assert len(str(error.value)) < 700 + len(str(path))
-    # one that is left would be closed when it is collected, which may hang the next one
-    assert not [
-        each
-        for each in gc.get_objects()
-        if type(each).__name__ == "Client" and getattr(each, "status", "closed") != "closed"
-    ]
+    # a client left open would be closed by the garbage collector, which may hang the next one
+    clients = [value for value in gc.get_objects() if type(value).__name__ == "Client"]
+    assert all(getattr(client, "status", "closed") == "closed" for client in clients)
 
 
 @pytest.mark.parametrize(
     ("package", "address"), [("distributed", "tcp://127.0.0.1:1"), ("mpi4py", "mpi")]
 )
-def test_without_the_package(monkeypatch: pytest.MonkeyPatch, package: str, address: str) -> None:
+def test_a_scheduler_without_its_package_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch, package: str, address: str
+) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingExtraError, match="pip install"), cluster_executor(address):
         pass
@@ -93,21 +92,20 @@ def test_without_the_package(monkeypatch: pytest.MonkeyPatch, package: str, addr
         ValueError("deepaccident_devkit"),
     ],
 )
-def test_errors_of_the_work_are_not_those_of_workers(error: Exception) -> None:
-    assert fault_of_workers(error) is None
+def test_errors_of_the_work_are_not_blamed_on_workers(error: Exception) -> None:
+    assert describe_worker_fault(error) is None
 
 
-def test_the_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_scheduler_option_of_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["index", "release", "--scheduler"]
-    refused = CliRunner().invoke(deepaccident, [*words, "tcp://x", "--workers", "2"])
-    assert (refused.exit_code, "--workers changes nothing with a scheduler" in refused.output) == (
-        2,
-        True,
-    )
+    result = CliRunner().invoke(deepaccident, [*words, "tcp://x", "--workers", "2"])
+    assert result.exit_code == 2
+    assert "--workers has no effect with a scheduler" in result.output
+
     monkeypatch.setattr("deepaccident_devkit.support.parallel.executors.ADDRESS_WAIT", 0.2)
-    absent = [*words, str(tmp_path / "absent.json")]
-    invoke = partial(CliRunner().invoke, deepaccident, absent, catch_exceptions=False)
-    assert_refused((invoke, WorkerError, f"^{absent[-1]}: no dask scheduler answers"))
+    path = str(tmp_path / "absent.json")
+    invoke = partial(CliRunner().invoke, deepaccident, [*words, path], catch_exceptions=False)
+    assert_raises((invoke, WorkerError, f"^{path}: no dask scheduler answers"))
 
 
 def test_processes_that_cannot_be_started_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,9 +114,9 @@ def test_processes_that_cannot_be_started_are_named(monkeypatch: pytest.MonkeyPa
         concurrent.futures, "ProcessPoolExecutor", Mock(side_effect=OSError(28, "No space left"))
     )
     facts = ("cannot be started", "No space left", "/dev/shm", "fewer workers")  # noqa: S108
-    assert_refused((lambda: run_batch(abs, range(9), workers=2), WorkerError, facts))
+    assert_raises((lambda: run_batch(abs, range(9), workers=2), WorkerError, facts))
 
 
-def test_none_without_a_scheduler() -> None:
+def test_there_is_no_executor_without_a_scheduler() -> None:
     with cluster_executor() as executor:
         assert executor is None

@@ -1,5 +1,3 @@
-"""Maps of the ground."""
-
 import numpy as np
 import pytest
 
@@ -18,60 +16,65 @@ from deepaccident_devkit.plugins.synth.roads import (
 from deepaccident_devkit.plugins.synth.roads.layout import OUTWARD
 
 
-def test_cells_are_found_by_their_middles():
+def test_cells_are_found_by_their_centres():
     codes = np.zeros((3000, 3000), dtype=np.uint8)
     codes[1500, 1520] = ROAD
-    ground, beyond = GroundMap(codes), [[200.0, 0.0], [0.0, -151.0]]
-    assert ground.at(np.array([[2.05, 0.05], [0.05, 2.05], *beyond])).tolist() == [
-        ROAD,
-        TERRAIN,
-        TERRAIN,
-        TERRAIN,
-    ]
+    ground = GroundMap(codes)
     assert (ground.codes.flags.writeable, codes.flags.writeable) == (False, True)
+
+    points = np.array(
+        [
+            [2.05, 0.05],
+            [0.05, 2.05],
+            [200.0, 0.0],  # beyond the map
+            [0.0, -151.0],
+        ]
+    )
+    assert ground.at(points).tolist() == [ROAD, TERRAIN, TERRAIN, TERRAIN]
 
 
 @pytest.mark.parametrize(
-    ("spec", "quarters"), [(RoadSpec(), 1), (RoadSpec(lanes=2), 1), (RoadSpec(signalized=False), 2)]
+    ("spec", "same_after_quarter_turn"),
+    [
+        (RoadSpec(), True),
+        (RoadSpec(lanes=2), True),
+        (RoadSpec(signalized=False), False),
+    ],
 )
-def test_a_four_way_map_is_its_own_quarter_turn_or_half_turn_where_one_road_gives_way(
-    spec, quarters
-):
+def test_a_four_way_map_stays_the_same_when_turned(spec, same_after_quarter_turn):
+    """By a half turn; by a quarter turn only if no road gives way."""
     codes = Junction(spec).ground_map().codes
-    turned = [codes.T[:, ::-1], codes[::-1, ::-1]]  # counter-clockwise: x takes the place of y
-    assert [(each == codes).all() for each in turned] == [quarters == 1, True]
+    # counter-clockwise: x takes the place of y
+    quarter_turned = codes.T[:, ::-1]
+    half_turned = codes[::-1, ::-1]
+
+    assert (quarter_turned == codes).all() == same_after_quarter_turn
+    assert (half_turned == codes).all()
 
 
 def test_from_the_middle_line_outward(junction):
-    """Yellow line, lane, kerb, sidewalk, grass, 80 m from the middle; behind the kerb's end all is
-    as before it.
+    """Yellow line, lane, kerb, sidewalk and grass 80 m from the middle; the stop line on the way in
+    and none on the way out.
     """
-    spec, ground = junction.spec, junction.ground_map()
+    spec = junction.spec
+    ground = junction.ground_map()
+    bands = np.array(
+        [0.12, 1.75, spec.road_edge - 0.15, spec.road_edge + 0.15, spec.sidewalk_edge + 0.15]
+    )
+    lane = np.arange(0.35, 3.4, 0.1)
+
     for arm in junction.arms:
         out = np.array(OUTWARD[arm])
         left = np.array([-out[1], out[0]])
+        for side in (left, -left):
+            across = ground.at(80.0 * out + bands[:, None] * side).tolist()
+            assert across[:2] == [YELLOW, ROAD]
+            assert across[2] in ROAD_CODES
+            assert across[3:] == [SIDEWALK, GRASS]
 
-        def codes(along, beside, out=out, left=left):
-            return ground.at(along * out + np.multiply.outer(beside, left)).tolist()
-
-        for side in (1, -1):
-            bands = (
-                0.12,
-                1.75,
-                spec.road_edge - 0.15,
-                spec.road_edge + 0.15,
-                spec.sidewalk_edge + 0.15,
-            )
-            yellow, lane, kerb, *beyond = codes(80.0, side * np.array(bands))
-            assert (yellow, lane, kerb in ROAD_CODES, beyond) == (
-                YELLOW,
-                ROAD,
-                True,
-                [SIDEWALK, GRASS],
-            )
-        towards, away = (
-            set(codes(np.mean(spec.stop_line), side * np.arange(0.35, 3.4, 0.1)))
-            for side in (1, -1)
-        )
-        gives_way = {WHITE, ROAD} if arm in ("south", "north") else {ROAD}
-        assert (towards, away) == ({WHITE} if spec.signalized else gives_way, {ROAD})
+        line = np.mean(spec.stop_line) * out
+        inward_codes = set(ground.at(line + lane[:, None] * left).tolist())
+        outward_codes = set(ground.at(line - lane[:, None] * left).tolist())
+        yields = {WHITE, ROAD} if arm in ("south", "north") else {ROAD}
+        assert inward_codes == ({WHITE} if spec.signalized else yields)
+        assert outward_codes == {ROAD}

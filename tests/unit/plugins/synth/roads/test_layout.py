@@ -1,10 +1,9 @@
-"""What a junction can be like."""
-
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.plugins.synth.roads import ROAD_CODES, Hump, RoadSpec
 
 
@@ -27,7 +26,9 @@ from deepaccident_devkit.plugins.synth.roads import ROAD_CODES, Hump, RoadSpec
     ],
 )
 def test_impossible_junctions_are_refused(fields, sentence):
-    assert_refused((lambda: RoadSpec(**fields), ConfigError, sentence))
+    assert_raises(
+        (lambda: RoadSpec(**fields), ConfigError, sentence),
+    )
 
 
 @pytest.mark.parametrize(
@@ -42,17 +43,19 @@ def test_who_has_a_yield_line(fields, arms):
     assert RoadSpec(**fields).yielding_arms == arms
 
 
-def corners(places, length, width):
-    signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [length / 2, width / 2]
-    cos, sin = np.cos(places[:, 2, None]), np.sin(places[:, 2, None])
-    x = places[:, 0, None] + cos * signs[:, 0] - sin * signs[:, 1]
-    y = places[:, 1, None] + sin * signs[:, 0] + cos * signs[:, 1]
-    return np.stack([x, y], axis=-1)
-
-
 def test_a_parked_van_stands_on_its_strip(junction):
-    vans, spec = corners(junction.parking_places(), 5.0, 2.1), junction.spec
-    assert np.isin(junction.ground_map().at(vans.reshape(-1, 2)), ROAD_CODES).all()
-    beside = np.abs(vans).min(axis=2)
-    assert spec.lanes_edge < beside.min() < beside.max() < spec.road_edge
-    assert np.abs(vans).max(axis=2).min() > spec.stop_line[1] + 5
+    spec = junction.spec
+    poses = junction.parking_places()
+    vans = Boxes.from_arrays(
+        poses * (1, 1, 0),
+        np.tile([5.0, 2.1, 2.0], (len(poses), 1)),
+        poses[:, 2],
+    )
+    corners = vans.corners()[..., :2]
+    codes = junction.ground_map().at(corners.reshape(-1, 2))
+    assert np.isin(codes, ROAD_CODES).all()
+
+    from_road_centre = np.abs(corners).min(axis=2)
+    assert spec.lanes_edge < from_road_centre.min() < from_road_centre.max() < spec.road_edge
+    from_junction = np.abs(corners).max(axis=2)
+    assert from_junction.min() > spec.stop_line[1] + 5

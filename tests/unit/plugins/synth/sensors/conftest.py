@@ -1,5 +1,7 @@
 """A junction with a few road users set by hand, and the sensors of their agents."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,28 +9,32 @@ from deepaccident_devkit.plugins.synth import solids
 from deepaccident_devkit.plugins.synth.actors import MEDIAN_SIZES, Actor, Actors, SampledMotion
 from deepaccident_devkit.plugins.synth.roads import Hump, Junction, RoadSpec
 from deepaccident_devkit.plugins.synth.sensors.rig import make_rig
-from deepaccident_devkit.plugins.synth.shapes import shape_of
+from deepaccident_devkit.plugins.synth.shapes import make_shape
 from deepaccident_devkit.plugins.synth.world import random_world
 from deepaccident_devkit.taxonomy import STATIC_ACTOR_ID, VEHICLE_AGENTS
 
 RED, BLUE = (200, 30, 30), (30, 60, 200)
 FOUR_WAY = RoadSpec(kind="four-way", signalized=True)
-AGENT_PLACES = {
+AGENT_POSES = {
     "ego_vehicle": (-30.0, -1.75, 0.0),
     "ego_vehicle_behind": (-42.0, -1.75, 0.0),
     "other_vehicle": (1.75, -40.0, np.pi / 2),
     "other_vehicle_behind": (1.75, -52.0, np.pi / 2),
 }
+"""x, y and yaw of the vehicles with sensors."""
 
 
-def straight_on(x, y, yaw, speed):
-    """A motion straight on for 100 s before and after time 0."""
+def make_motion(x, y, yaw, speed):
+    """Make a motion straight on for 100 s before and after time 0."""
     velocity = speed * np.array([np.cos(yaw), np.sin(yaw)])
-    samples = np.array([[*((x, y) + seconds * velocity), yaw] for seconds in (-100.0, 100.0)])
+    offset = 100.0 * velocity
+
     return SampledMotion(
         start=-100.0,
         period=200.0,
-        samples=samples,
+        samples=np.array(
+            [[x - offset[0], y - offset[1], yaw], [x + offset[0], y + offset[1], yaw]]
+        ),
         sample_velocities=np.stack([velocity, velocity]),
     )
 
@@ -41,7 +47,7 @@ def world():
 
 @pytest.fixture(scope="session")
 def hilly_world():
-    """The same with a hump on the arm of the ego."""
+    """The same crossing with a hump on the arm of the ego."""
     spec = RoadSpec(
         kind="four-way",
         signalized=True,
@@ -52,8 +58,6 @@ def hilly_world():
 
 @pytest.fixture(scope="session")
 def actor():
-    """Make a road user: category, x, y, yaw, speed, colour."""
-
     def make(number, category, x, y, yaw=0.0, speed=0.0, *, color=RED, parked=False):
         size = MEDIAN_SIZES[category]
         return Actor(
@@ -61,8 +65,8 @@ def actor():
             object_id=number + 1,
             category=category,
             size=size,
-            shape=shape_of(category, size, color, BLUE),
-            motion=straight_on(x, y, yaw, speed),
+            shape=make_shape(category, size, color, BLUE),
+            motion=make_motion(x, y, yaw, speed),
         )
 
     return make
@@ -70,11 +74,13 @@ def actor():
 
 @pytest.fixture(scope="session")
 def rig_of(actor):
-    """Make the rig of the four agents and of others in a world; `places` moves agents."""
+    """A function that makes the rig of the four agents and of other actors in a world; `places`
+    moves agents.
+    """
 
     def make(
         world,
-        others=(),
+        actors=(),
         *,
         places=None,
         sky=("Clear", "Noon"),
@@ -82,12 +88,12 @@ def rig_of(actor):
         seed=(0,),
         **options,
     ):
-        where = {**AGENT_PLACES, **(places or {})}
-        cars = [actor(k, "car", *where[name]) for k, name in enumerate(VEHICLE_AGENTS)]
+        poses = {**AGENT_POSES, **(places or {})}
+        cars = [actor(k, "car", *poses[name]) for k, name in enumerate(VEHICLE_AGENTS)]
         ids = {name: car.actor_id for name, car in zip(VEHICLE_AGENTS, cars, strict=True)}
         return make_rig(
             world,
-            Actors.of([*cars, *others]),
+            Actors.of([*cars, *actors]),
             ids,
             sky=sky,
             image_size=image_size,
@@ -100,8 +106,7 @@ def rig_of(actor):
 
 @pytest.fixture(scope="session")
 def bare():
-    """A copy of a world with other things on it than its own: blocks."""
-    from dataclasses import replace
+    """A function that copies a world with only the given blocks on it."""
 
     def make(world, blocks=()):
         return replace(world, props=solids.build(blocks), signals=())

@@ -1,5 +1,5 @@
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth.spec import parse_spec
@@ -8,7 +8,7 @@ from deepaccident_devkit.plugins.synth.spec import parse_spec
 @pytest.mark.parametrize(
     ("entries", "sentence"),
     [
-        ("gap: 3", r"f.yaml:4: actors\[1\].gap: is not possible for the role other; leave it out"),
+        ("gap: 3", r"f.yaml:4: actors\[1\].gap: is not possible for the role other; remove it"),
         (
             "category: cyclist",
             (
@@ -23,11 +23,11 @@ from deepaccident_devkit.plugins.synth.spec import parse_spec
         (
             "start_distance: 30",
             (
-                r"f.yaml:4: actors\[1\].start_distance: follows from meet \(f.yaml:5\) "
-                r"for other, who is timed; leave it"
+                r"f.yaml:4: actors\[1\].start_distance: is computed from meet \(f.yaml:5\) "
+                r"for the timed role other; remove it"
             ),
         ),
-        ("start_distance: 0", "start_distance: follows from meet"),
+        ("start_distance: 0", "start_distance: is computed from meet"),
         (
             "lane: 1",
             (
@@ -38,15 +38,14 @@ from deepaccident_devkit.plugins.synth.spec import parse_spec
         ("lane: [0, 1]", "there is no lane 1"),
         (
             "lane_change: 50",
-            (
-                "there is no other lane where the road has one lane in each "
-                "direction; leave it out, or"
-            ),
+            ("there is no other lane where the road has one lane in each direction; remove it, or"),
         ),
     ],
 )
 def test_an_impossible_entry_is_refused(with_other, entries, sentence):
-    assert_refused((lambda: parse_spec(with_other(entries), "f.yaml"), ConfigError, sentence))
+    assert_raises(
+        (lambda: parse_spec(with_other(entries), "f.yaml"), ConfigError, sentence),
+    )
 
 
 @pytest.mark.parametrize(
@@ -67,11 +66,14 @@ def test_an_impossible_entry_is_refused(with_other, entries, sentence):
     ],
 )
 def test_an_impossible_road_is_refused(small, more, sentence):
-    assert_refused((lambda: parse_spec(f"{small}\n{more}", "f.yaml"), ConfigError, sentence))
+    assert_raises(
+        (lambda: parse_spec(f"{small}\n{more}", "f.yaml"), ConfigError, sentence),
+    )
 
 
-def scenario(*actors: str, more: str = "") -> str:
-    return "actors:\n" + "".join(f"  - {{{actor}}}\n" for actor in actors) + more
+def write_scenario(*actors: str, more: str = "") -> str:
+    lines = [f"  - {{{actor}}}\n" for actor in actors]
+    return "actors:\n" + "".join(lines) + more
 
 
 EGO, OTHER = "role: ego, from: west", "role: other, from: south"
@@ -81,84 +83,89 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
     ("text", "sentence"),
     [
         (
-            scenario(EGO, OTHER, *["role: background, from: west"] * 99),
-            "f.yaml:1: actors: there are 101; no road has room for so many; keep 100",
+            write_scenario(EGO, OTHER, *["role: background, from: west"] * 99),
+            "f.yaml:1: actors: there are 101, but a road has room for only 100; keep 100",
         ),
-        (scenario(EGO), "f.yaml:1: actors: there is no actor with role other; add one"),
+        (write_scenario(EGO), "f.yaml:1: actors: there is no actor with role other; add one"),
         (
-            scenario(EGO, OTHER + ", turn: left, lane_change: [40, 50]", more="road: {lanes: 2}"),
-            "lane_change: is possible only with the turn straight; leave it out, or go straight on",
+            write_scenario(
+                EGO, OTHER + ", turn: left, lane_change: [40, 50]", more="road: {lanes: 2}"
+            ),
+            (
+                "lane_change: is possible only with the turn straight; remove it, or use the turn "
+                "straight"
+            ),
         ),
         (
-            scenario(EGO, OTHER, EGO),
+            write_scenario(EGO, OTHER, EGO),
             r"f.yaml:4: actors\[2\].role: there are 2 actors with role ego; keep one",
         ),
         (
-            scenario("role: ego", OTHER),
+            write_scenario("role: ego", OTHER),
             r"actors\[0\].from: is missing; the role ego needs it; add one of west, ",
         ),
         (
-            scenario(EGO, OTHER, "role: ego_behind, from: west"),
+            write_scenario(EGO, OTHER, "role: ego_behind, from: west"),
             "from: is not possible for the role ego_behind",
         ),
         (
-            scenario(EGO, OTHER, "role: pedestrian, category: car, from: east"),
+            write_scenario(EGO, OTHER, "role: pedestrian, category: car, from: east"),
             "the role pedestrian cannot be a car",
         ),
         (
-            scenario(EGO, OTHER, "role: parked, category: cyclist, from: east"),
+            write_scenario(EGO, OTHER, "role: parked, category: cyclist, from: east"),
             "choose car, truck, van, motorcycle; ",
         ),
         (
-            scenario(EGO, OTHER, "role: pedestrian, from: east, max_speed: [2, 3.5]"),
+            write_scenario(EGO, OTHER, "role: pedestrian, from: east, max_speed: [2, 3.5]"),
             (
                 r"actors\[2\].max_speed: expected 0.5 to 3 m/s for a pedestrian, found "
                 r"3.5; walking is 1 to 2 m/s"
             ),
         ),
         (
-            scenario(EGO, OTHER, "role: parked, from: east, turn: left"),
+            write_scenario(EGO, OTHER, "role: parked, from: east, turn: left"),
             "turn: is not possible for the role parked",
         ),
         (
-            scenario(EGO, OTHER, more="road: {kind: three-way}"),
+            write_scenario(EGO, OTHER, more="road: {kind: three-way}"),
             (
-                r"f.yaml:3: actors\[1\].turn: nobody can go straight from the south arm "
+                r"f.yaml:3: actors\[1\].turn: the turn straight is impossible from the south arm "
                 r"of a three-way junction; choose"
             ),
         ),
         (
-            scenario(EGO, "role: other, from: west", more="meet: {actors: [ego, other]}"),
+            write_scenario(EGO, "role: other, from: west", more="meet: {actors: [ego, other]}"),
             (
-                "do not meet; in one lane they follow each other; let one of them come "
-                "by the other lane, with a"
+                "do not cross; in one lane they follow each other; let one of them start "
+                "in the other lane, with a"
             ),
         ),
         (
-            scenario(EGO, OTHER, more="meet: {actors: [ego, ego]}"),
+            write_scenario(EGO, OTHER, more="meet: {actors: [ego, ego]}"),
             "f.yaml:4: meet.actors: ego cannot meet itself",
         ),
         (
-            scenario(EGO, OTHER, more="meet: {actors: [ego]}"),
+            write_scenario(EGO, OTHER, more="meet: {actors: [ego]}"),
             r"meet.actors: expected a list of 2, found \['ego'\]",
         ),
         (
-            scenario(EGO, OTHER, more="meet: {actors: [ego, ego_behind]}"),
+            write_scenario(EGO, OTHER, more="meet: {actors: [ego, ego_behind]}"),
             "ego_behind cannot be timed",
         ),
         (
-            scenario(EGO, OTHER, more="meet: {actors: [ego, pedestrian]}"),
+            write_scenario(EGO, OTHER, more="meet: {actors: [ego, pedestrian]}"),
             "there are 0 actors with role pedestrian",
         ),
         (
-            scenario(EGO, "role: other, from: [south, east]", more="meet: {}"),
+            write_scenario(EGO, "role: other, from: [south, east]", more="meet: {}"),
             (
-                r"meet.actors: the ways of ego \(west straight 0\) and other \(east "
-                r"straight 0\) do not meet"
+                r"meet.actors: the paths of ego \(west straight 0\) and other \(east "
+                r"straight 0\) do not cross"
             ),
         ),
         (
-            scenario(EGO, "role: other, from: [south, east]", more="view: hidden"),
+            write_scenario(EGO, "role: other, from: [south, east]", more="view: hidden"),
             (
                 "f.yaml:4: view: no house can stand between ego from the west and other "
                 "from the east; choose open, or"
@@ -167,29 +174,39 @@ EGO, OTHER = "role: ego, from: west", "role: other, from: south"
     ],
 )
 def test_an_impossible_scenario_is_refused(text, sentence):
-    assert_refused((lambda: parse_spec(text, "f.yaml"), ConfigError, sentence))
+    assert_raises(
+        (lambda: parse_spec(text, "f.yaml"), ConfigError, sentence),
+    )
 
 
 def test_actors_that_record_nothing_may_be_several():
-    walkers = ["role: pedestrian, from: east", "role: pedestrian, from: west"]
-    parse_spec(
-        scenario(EGO, OTHER, "role: parked, from: south", *walkers, "role: background, from: north")
-    )
-    parse_spec(scenario(EGO, OTHER, walkers[0], more="meet: {actors: [ego, pedestrian]}"))
-    parse_spec(scenario(EGO, OTHER, more="view: [open, hidden]"))
+    pedestrian = "role: pedestrian, from: east"
+    texts = [
+        write_scenario(
+            EGO,
+            OTHER,
+            "role: parked, from: south",
+            pedestrian,
+            "role: pedestrian, from: west",
+            "role: background, from: north",
+        ),
+        write_scenario(EGO, OTHER, pedestrian, more="meet: {actors: [ego, pedestrian]}"),
+        write_scenario(EGO, OTHER, more="view: [open, hidden]"),
+    ]
+    for text in texts:
+        parse_spec(text)
 
 
 def test_a_start_may_be_given_where_it_counts():
-    """A pedestrian's is its place on the arm; with `null` among the values of `meet` some draws
-    time nobody.
+    """A pedestrian's start is its place on the arm; with `null` among the values of `meet`, some
+    draws time nobody.
     """
-    walker = "role: pedestrian, from: west, start_distance: 20"
-    parse_spec(
-        scenario(
-            EGO, OTHER + ", start_distance: 30", walker, more="meet: {actors: [ego, pedestrian]}"
-        )
-    )
-    parse_spec(
-        scenario(EGO, OTHER + ", start_distance: 30", more="meet: [null, {actors: [ego, other]}]")
-    )
-    parse_spec(scenario(EGO, OTHER + ", start_distance: null", more="meet: {}"))
+    other = OTHER + ", start_distance: 30"
+    pedestrian = "role: pedestrian, from: west, start_distance: 20"
+    texts = [
+        write_scenario(EGO, other, pedestrian, more="meet: {actors: [ego, pedestrian]}"),
+        write_scenario(EGO, other, more="meet: [null, {actors: [ego, other]}]"),
+        write_scenario(EGO, OTHER + ", start_distance: null", more="meet: {}"),
+    ]
+    for text in texts:
+        parse_spec(text)

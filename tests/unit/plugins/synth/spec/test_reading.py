@@ -1,7 +1,7 @@
 import os
 
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth.spec import parse_spec, read_spec
@@ -40,7 +40,7 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
         ("max_speed: 20.1", "expected a number, 0.5 to 20 m/s, found 20.1"),
         ("max_speed: [1, 2, 3]", r"expected a number, .*, or \[low, high\], found \[1, 2, 3\]"),
         ("max_speed: [5, 40]", r"max_speed\[1\]: expected a number, 0.5 to 20 m/s, found 40"),
-        ("max_speed: [9, 3]", r"expected \[low, high\], found \[9, 3\]; exchange the two"),
+        ("max_speed: [9, 3]", r"expected \[low, high\], found \[9, 3\]; swap the two"),
         (
             "max_speed: '8'",
             (
@@ -69,7 +69,9 @@ FIELDS = "name, design, road, view, exchange, actors, meet, background, weather,
     ],
 )
 def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sentence):
-    assert_refused((lambda: parse_spec(with_other(entries), "f.yaml"), ConfigError, sentence))
+    assert_raises(
+        (lambda: parse_spec(with_other(entries), "f.yaml"), ConfigError, sentence),
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,7 +82,7 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
             rf"f.yaml:7: actor: no such field; possible: {FIELDS}.*; did you mean 'actors'\?$",
         ),
         ("design: 13", "design: expected a whole number, 1 to 12, found 13"),
-        ("exchange: [true, false]", "exchange: expected true or false, one value and not several"),
+        ("exchange: [true, false]", "exchange: expected true or false, one value, not several"),
         ("background: none", "f.yaml:7: background: expected keys and values, found 'none'"),
         (
             f"road: {{hump: {{height: {'9' * 400}}}}}",
@@ -88,14 +90,16 @@ def test_a_wrong_value_is_refused_with_line_and_field(with_other, entries, sente
         ),
         (
             "exchange: 'true'",
-            "exchange: expected true or false, found 'true'; leave the quotes out",
+            "exchange: expected true or false, found 'true'; remove the quotes",
         ),
         ("view: 3", "view: expected one of open, hidden, found 3"),
         ("road: {signalized: 1}", "road.signalized: expected true or false, found 1"),
     ],
 )
 def test_a_wrong_line_is_refused(small, line, sentence):
-    assert_refused((lambda: parse_spec(f"{small}\n{line}", "f.yaml"), ConfigError, sentence))
+    assert_raises(
+        (lambda: parse_spec(f"{small}\n{line}", "f.yaml"), ConfigError, sentence),
+    )
 
 
 @pytest.mark.parametrize(
@@ -110,19 +114,23 @@ def test_a_wrong_line_is_refused(small, line, sentence):
     ],
 )
 def test_a_file_that_is_no_scenario_is_refused(text, sentence):
-    assert_refused((lambda: parse_spec(text), ConfigError, sentence))
+    assert_raises(
+        (lambda: parse_spec(text), ConfigError, sentence),
+    )
 
 
 def test_a_file_is_read_in_utf8_and_named_in_its_errors(tmp_path, small):
     path = tmp_path / "mein.yaml"
     path.write_text(small.replace("small", "Straße"), encoding="utf-8")
     assert read_spec(path).name == "Straße"
+
     path.write_text(small + "\nview: x", encoding="utf-8")
-    assert_refused(
+    assert_raises(
         (lambda: read_spec(path), ConfigError, r"mein.yaml:7: view: expected one of open, hidden")
     )
+
     path.write_bytes(b"\xff")
-    assert_refused(
+    assert_raises(
         (
             lambda: read_spec(path),
             ConfigError,
@@ -141,12 +149,13 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path):
     (tmp_path / "loop.yaml").symlink_to("loop.yaml")
     with (tmp_path / "giant.yaml").open("wb") as file:
         file.truncate(3 << 30)
-    for name, told in {
+
+    for name, words in {
         "pipe": "a named pipe",
         "loop": "symbolic links",
         "giant": "has 3,221,225,472 bytes",
     }.items():
-        with pytest.raises(ConfigError, match=rf"{name}.yaml: .*{told}"):
+        with pytest.raises(ConfigError, match=rf"{name}.yaml: .*{words}"):
             read_spec(tmp_path / f"{name}.yaml")
 
 
@@ -156,15 +165,17 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path):
 def test_long_words_are_cut_in_messages(tmp_path, text):
     path = tmp_path / "long.yaml"
     path.write_text(text, encoding="utf-8")
+
     with pytest.raises(ConfigError, match=r"long.yaml:1: ") as raised:
         read_spec(path)
+
     assert len(str(raised.value)) < 1000
 
 
 def test_what_is_too_large_for_a_scenario_is_not_parsed(tmp_path, small):
     path = tmp_path / "big.yaml"
     path.write_text(small + "# comment\n" * 20_000, encoding="utf-8")
-    assert_refused(
+    assert_raises(
         (
             lambda: read_spec(path),
             ConfigError,

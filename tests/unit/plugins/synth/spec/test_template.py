@@ -12,7 +12,7 @@ from deepaccident_devkit.plugins.synth.spec import (
     parse_spec,
 )
 
-EXCHANGING = """
+EXCHANGED_ROLES = """
 exchange: true
 road: {hump: {arm: west}}
 actors:
@@ -24,75 +24,81 @@ meet: {offset: [0.1, 0.3]}
 """
 
 
-def draws(text: str, count: int = 200) -> list[ScenarioSpec]:
+def draw_specs(text: str, count: int = 200) -> list[ScenarioSpec]:
     template = parse_spec(text)
     return [draw(template, np.random.default_rng(seed)) for seed in range(count)]
 
 
 def test_a_draw_has_what_the_file_says_and_defaults_for_the_rest(small):
-    (spec,) = draws(small, 1)
-    said = {"ego": "west", "other": "north", "ego_behind": None, "other_behind": None}
-    actors = tuple(
-        ActorSpec(role=role, from_arm=arm) if arm else ActorSpec(role=role)
-        for role, arm in said.items()
-    )
+    (spec,) = draw_specs(small, 1)
     assert spec == ScenarioSpec(
-        name="small", actors=actors, meet=MeetSpec(actors=("ego", "other"), offset=0.5)
+        name="small",
+        actors=(
+            ActorSpec(role="ego", from_arm="west"),
+            ActorSpec(role="other", from_arm="north"),
+            ActorSpec(role="ego_behind"),
+            ActorSpec(role="other_behind"),
+        ),
+        meet=MeetSpec(actors=("ego", "other"), offset=0.5),
     )
 
 
 def test_ranges_are_filled_and_kept(with_other):
-    made = draws(
-        with_other("max_speed: [8, 12], turn: [straight, left, left]")
-        + "background: {parked: [3, 5]}\n"
-    )
-    speeds = [spec.actor("other").max_speed for spec in made]
-    assert (min(speeds), max(speeds)) == pytest.approx((8.1, 11.9), abs=0.1)
-    assert {spec.background.parked for spec in made} == {3, 4, 5}
-    left = np.mean([spec.actor("other").turn == "left" for spec in made])
+    text = with_other("max_speed: [8, 12], turn: [straight, left, left]")
+    specs = draw_specs(text + "background: {parked: [3, 5]}\n")
+    speeds = [spec.actor("other").max_speed for spec in specs]
+    assert min(speeds) == pytest.approx(8.1, abs=0.1)
+    assert max(speeds) == pytest.approx(11.9, abs=0.1)
+    assert {spec.background.parked for spec in specs} == {3, 4, 5}
+
+    left = np.mean([spec.actor("other").turn == "left" for spec in specs])
     assert left == pytest.approx(2 / 3, abs=0.1), "a word that stands twice is twice as likely"
 
 
 def test_an_exchange_keeps_the_scene_but_for_the_names():
-    made = draws(EXCHANGING)
-    assert 0.4 < np.mean([spec.exchange for spec in made]) < 0.6
-    assert {spec.spawn_side for spec in made if spec.exchange} == {"left", "right"}
-    for spec in made:
-        mover, turner = (
-            spec.actor(role) for role in (("other", "ego") if spec.exchange else ("ego", "other"))
-        )
-        assert (spec.actor("ego").from_arm, turner.ignores, mover.category) == (
-            "west",
-            ("priority",),
-            "van",
-        )
-        assert (spec.actor(f"{mover.role}_behind").gap, spec.meet.actors) == (
-            7,
-            (mover.role, turner.role),
-        )
+    specs = draw_specs(EXCHANGED_ROLES)
+    assert 0.4 < np.mean([spec.exchange for spec in specs]) < 0.6
+    assert {spec.spawn_side for spec in specs if spec.exchange} == {"left", "right"}
+
+    for spec in specs:
+        roles = ("other", "ego") if spec.exchange else ("ego", "other")
+        mover, turner = (spec.actor(role) for role in roles)
+        assert spec.actor("ego").from_arm == "west"
+        assert (mover.category, turner.ignores) == ("van", ("priority",))
+        assert spec.actor(f"{mover.role}_behind").gap == 7
+        assert spec.meet.actors == roles
         assert spec.road.hump.arm == mover.from_arm, "the hump turns with the arms"
-        assert spec.actor("pedestrian").from_arm == ARMS[(ARMS.index(mover.from_arm) + 2) % 4]
+
+        opposite_arm = ARMS[(ARMS.index(mover.from_arm) + 2) % 4]
+        assert spec.actor("pedestrian").from_arm == opposite_arm
 
 
 def test_a_three_way_junction_keeps_its_arms_in_an_exchange():
-    text = (
-        "exchange: true\nroad: {kind: three-way}\nactors:\n  - {role: ego, "
-        "from: west, turn: right}\n"
-    )
-    made = draws(text + "  - {role: other, from: east, turn: left}\n", 40)
-    assert {spec.actor("ego").from_arm for spec in made} == {"west", "east"}
+    text = """
+exchange: true
+road: {kind: three-way}
+actors:
+  - {role: ego, from: west, turn: right}
+  - {role: other, from: east, turn: left}
+"""
+    assert {spec.actor("ego").from_arm for spec in draw_specs(text, 40)} == {"west", "east"}
 
 
 @pytest.mark.parametrize(("turn", "lanes"), [("left", {1}), ("right", {0}), ("straight", {0, 1})])
-def test_a_lane_that_is_not_said_follows_from_the_turn(with_other, turn, lanes):
-    made = draws(with_other(f"turn: {turn}").replace("meet: {offset: 0.5}", "road: {lanes: 2}"), 30)
-    assert {spec.actor("other").lane for spec in made} == lanes
+def test_a_missing_lane_follows_from_the_turn(with_other, turn, lanes):
+    text = with_other(f"turn: {turn}")
+    specs = draw_specs(text.replace("meet: {offset: 0.5}", "road: {lanes: 2}"), 30)
+    assert {spec.actor("other").lane for spec in specs} == lanes
 
 
 @given(st.sampled_from(ARMS), st.sampled_from(ARMS))
-def test_spawn_sides_are_seen_from_ego(ego, other):
+def test_spawn_sides_are_seen_from_ego(ego_arm, other_arm):
     spec = ScenarioSpec(
-        actors=(ActorSpec(role="ego", from_arm=ego), ActorSpec(role="other", from_arm=other))
+        actors=(
+            ActorSpec(role="ego", from_arm=ego_arm),
+            ActorSpec(role="other", from_arm=other_arm),
+        )
     )
-    turned = (ARMS.index(other) - ARMS.index(ego)) % 4  # the arms go round counter-clockwise
-    assert spec.spawn_side == ("same", "right", "opposite", "left")[turned]
+    # the arms go round counter-clockwise
+    quarter_turns = (ARMS.index(other_arm) - ARMS.index(ego_arm)) % 4
+    assert spec.spawn_side == ("same", "right", "opposite", "left")[quarter_turns]

@@ -1,5 +1,3 @@
-"""Road users to simulate."""
-
 from functools import lru_cache
 
 import numpy as np
@@ -17,8 +15,6 @@ def _junction(kind, signalized, lanes):
 
 @pytest.fixture(scope="session")
 def junction():
-    """Makes a junction."""
-
     def make(kind="four-way", *, signalized=False, lanes=1):
         return _junction(kind, signalized, lanes)
 
@@ -27,14 +23,14 @@ def junction():
 
 @pytest.fixture(scope="session")
 def driver(junction):
-    """Makes a driver that starts so many metres before its stop line."""
+    """A function that makes a driver; it starts `before` metres before its stop line."""
 
     def make(
         arm="west", turn="straight", *, before=40.0, speed=8.0, category="car", on=None, **fields
     ):
         route = (on or junction()).route(arm, turn)
         body = random_body(np.random.default_rng(1), category)
-        given = {
+        defaults = {
             "role": "background",
             "path": route.path,
             "start": route.stop_s - before - body.size[0] / 2,
@@ -42,18 +38,17 @@ def driver(junction):
             "max_speed": 10.0,
             "span": lane_span(route),
         }
-        return RoadUser(body=body, route=route, **{**given, **fields})
+        return RoadUser(body=body, route=route, **{**defaults, **fields})
 
     return make
 
 
 @pytest.fixture(scope="session")
 def walker():
-    """Makes one who walks straight over the west arm, or wherever it is said."""
+    """A function that makes a pedestrian, who walks straight over the west arm by default."""
 
     def make(start=(-12.0, -8.0), yaw=np.pi / 2, length=16.0, **fields):
-        path = straight(start, yaw, length)
-        given = {
+        defaults = {
             "role": "pedestrian",
             "start": 0.0,
             "start_speed": 0.0,
@@ -62,8 +57,8 @@ def walker():
         }
         return RoadUser(
             body=random_body(np.random.default_rng(2), "pedestrian"),
-            path=path,
-            **{**given, **fields},
+            path=straight(start, yaw, length),
+            **{**defaults, **fields},
         )
 
     return make

@@ -11,7 +11,7 @@ from deepaccident_devkit.plugins.synth.traffic.background import background_user
 from deepaccident_devkit.plugins.synth.traffic.placement import cast_actors
 from deepaccident_devkit.plugins.synth.traffic.rights import RED, SignalPlan
 
-MANY = BackgroundSpec(vehicles=12, two_wheelers=6, parked=14, walking=8, crossing=6)
+DENSE_BACKGROUND = BackgroundSpec(vehicles=12, two_wheelers=6, parked=14, walking=8, crossing=6)
 SPEC = ScenarioSpec(
     road=RoadSpec(lanes=2),
     actors=(
@@ -20,72 +20,81 @@ SPEC = ScenarioSpec(
         ActorSpec(role="ego_behind"),
         ActorSpec(role="other_behind"),
     ),
-    background=MANY,
+    background=DENSE_BACKGROUND,
 )
 PLAN = SignalPlan(first="west-east", start=-10.0, green=20.0)
 
 
 @pytest.fixture(scope="module", params=range(3))
 def scene(request):
-    """Named road users and a background."""
-    rng, junction = np.random.default_rng(request.param), Junction(SPEC.road)
+    """A junction, named road users and a background."""
+    rng = np.random.default_rng(request.param)
+    junction = Junction(SPEC.road)
     named = cast_actors(rng, SPEC, junction, 6.0).users
     return junction, named, background_users(rng, SPEC, junction, named, PLAN, -7.0)
 
 
-def test_nobody_starts_between_the_named_ones_and_the_junction(scene):
+def test_nobody_starts_between_a_named_road_user_and_the_junction(scene):
     _, named, background = scene
-    between = [
-        other
-        for user in named
-        for other in background
-        if other.route
-        and (other.route.from_arm, other.route.lane) == (user.route.from_arm, user.route.lane)
-        and user.start < other.start < user.route.exit_s
-    ]
-    assert between == []
+    drivers = [user for user in background if user.route]
+
+    for user in named:
+        route = user.route
+        starts = [
+            driver.start
+            for driver in drivers
+            if (driver.route.from_arm, driver.route.lane) == (route.from_arm, route.lane)
+        ]
+        assert not [start for start in starts if user.start < start < route.exit_s]
 
 
 def test_crosswalks_are_walked_over_while_their_arm_has_red(scene):
     junction, named, background = scene
-    taken = {arm for each in named for arm in (each.route.from_arm, each.route.to_arm)}
-    for user in (each for each in background if each.walks and each.span[1] > 0):
+    used_arms = {user.route.from_arm for user in named} | {user.route.to_arm for user in named}
+    crossing = [user for user in background if user.walks and user.span[1] > 0]
+
+    for user in crossing:
         x, y, _, _ = user.path.at(user.path.length / 2)
-        arm = max(junction.arms, key=lambda each: float(np.dot([x, y], OUTWARD[each])))
-        assert (PLAN.state(arm, -7.0 + user.delay), arm in taken) == (RED, False)
+        distances = {arm: float(np.dot([x, y], OUTWARD[arm])) for arm in junction.arms}
+        arm = max(distances, key=distances.get)
+        assert PLAN.state(arm, -7.0 + user.delay) == RED
+        assert arm not in used_arms
 
 
 def test_parked_vehicles_stand_on_their_own_slots():
-    rng, junction = np.random.default_rng(4), Junction(SPEC.road)
-    named = ActorSpec(
+    van_spec = ActorSpec(
         role="parked", category="van", from_arm="east", side="left", start_distance=40.0
     )
-    vehicles = parked_vehicles(rng, replace(SPEC, actors=(*SPEC.actors, named)), junction, [])
-    poses, size = (
-        np.array(each) for each in zip(*((v.pose, v.body.size[:2]) for v in vehicles), strict=True)
-    )
-    assert (len(vehicles), touching_pairs(poses[None], size, 0.3)) == (MANY.parked + 1, [])
+    spec = replace(SPEC, actors=(*SPEC.actors, van_spec))
+    vehicles = parked_vehicles(np.random.default_rng(4), spec, Junction(SPEC.road), [])
+    assert len(vehicles) == DENSE_BACKGROUND.parked + 1
+
+    poses = np.array([vehicle.pose for vehicle in vehicles])
+    sizes = np.array([vehicle.body.size[:2] for vehicle in vehicles])
+    assert touching_pairs(poses[None], sizes, 0.3) == []
+
+    assert vehicles[0].body.category == "van"
     x, y, yaw = poses[0]
-    assert (
-        y < -SPEC.road.lanes_edge
-    )  # who drives towards the junction from the east has the south on his left
-    assert (vehicles[0].body.category, abs(np.cos(yaw)), x) == (
-        "van",
-        pytest.approx(1),
-        pytest.approx(40, abs=3.5),
-    )
+    assert x == pytest.approx(40, abs=3.5)
+    # south of the road is left of those who drive from the east towards the junction
+    assert y < -SPEC.road.lanes_edge
+    assert abs(np.cos(yaw)) == pytest.approx(1)
 
 
-def test_nobody_parks_where_one_steps_onto_the_road():
-    walking = ActorSpec(
+def test_nobody_parks_where_a_pedestrian_steps_onto_the_road():
+    pedestrian = ActorSpec(
         role="pedestrian", category="pedestrian", from_arm="west", start_distance=40.0
     )
-    spec = replace(SPEC, actors=(*SPEC.actors, walking), background=replace(MANY, parked=40))
-    rng, junction = np.random.default_rng(4), Junction(SPEC.road)
-    users = [user for user in cast_actors(rng, spec, junction, 6.0).users if user.walks]
-    vehicles = parked_vehicles(rng, spec, junction, users)
-    assert (
-        0.5
-        < min(abs(vehicle.pose[0] + 40.0) - vehicle.body.size[0] / 2 for vehicle in vehicles)
-        < 8.0
+    spec = replace(
+        SPEC,
+        actors=(*SPEC.actors, pedestrian),
+        background=replace(DENSE_BACKGROUND, parked=40),
     )
+    rng = np.random.default_rng(4)
+    junction = Junction(SPEC.road)
+    users = [user for user in cast_actors(rng, spec, junction, 6.0).users if user.walks]
+
+    vehicles = parked_vehicles(rng, spec, junction, users)
+
+    gaps = [abs(vehicle.pose[0] + 40.0) - vehicle.body.size[0] / 2 for vehicle in vehicles]
+    assert 0.5 < min(gaps) < 8.0

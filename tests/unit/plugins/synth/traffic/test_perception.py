@@ -8,34 +8,46 @@ BYSTANDER = [50.0, 50.0, 0.0]
 
 
 def crossing_poses(seconds):
-    """Two at right angles and one who stands aside; they touch in so many seconds, at 10 m/s
-    each.
+    """Return poses and velocities of a bystander and of two road users at right angles, who touch
+    after a time at 10 m/s each.
     """
-    back = 10.0 * seconds
-    poses = np.array([BYSTANDER, [-2.0 - back, 0.0, 0.0], [1.0, -3.0 - back, np.pi / 2]])
-    return poses, np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+    distance = 10.0 * seconds
+    poses = np.array(
+        [
+            BYSTANDER,
+            [-2.0 - distance, 0.0, 0.0],
+            [1.0, -3.0 - distance, np.pi / 2],
+        ]
+    )
+    velocities = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+    return poses, velocities
 
 
-def alarm(*alert):
-    return ContactAlarm(np.array([1, 2]), SIZE, np.array(alert))
+def make_alarm(*alert_seconds):
+    return ContactAlarm(
+        np.array([1, 2]),
+        SIZE,
+        np.array(alert_seconds),
+    )
 
 
 @pytest.mark.parametrize("seconds", [0.13, 0.27, 0.44])
-def test_each_notices_the_contact_so_long_before_it(seconds):
-    found = alarm(0.4, 0.2).rows(*crossing_poses(seconds)).tolist()
-    assert found == [row for row, alert in ((1, 0.4), (2, 0.2)) if seconds < alert]
+def test_each_road_user_notices_the_contact_in_its_own_time(seconds):
+    rows = make_alarm(0.4, 0.2).rows(*crossing_poses(seconds))
+    expected = [row for row, alert in ((1, 0.4), (2, 0.2)) if seconds < alert]
+    assert rows.tolist() == expected
 
 
-def test_who_has_noticed_brakes_until_the_end_and_who_is_never_alert_not():
-    both, never = alarm(0.2, 0.6), alarm(0.0, 0.0)
-    assert [both.rows(*crossing_poses(seconds)).tolist() for seconds in (0.13, 0.44, 5.0)] == [
-        [1, 2]
-    ] * 3
-    assert never.rows(*crossing_poses(0.0)).tolist() == []
+def test_a_noticed_contact_stays_noticed_and_is_never_noticed_without_alertness():
+    both = make_alarm(0.2, 0.6)
+    for seconds in (0.13, 0.44, 5.0):
+        assert both.rows(*crossing_poses(seconds)).tolist() == [1, 2]
+
+    assert make_alarm(0.0, 0.0).rows(*crossing_poses(0.0)).tolist() == []
 
 
-def test_nobody_notices_one_who_comes_from_behind():
+def test_nobody_notices_a_road_user_that_comes_from_behind():
     poses = np.array([BYSTANDER, [0.0, 0.0, 0.0], [-6.0, 0.0, 0.0]])
-    assert alarm(1.0, 1.0).rows(
-        poses, np.array([[0.0, 0.0], [2.0, 0.0], [12.0, 0.0]])
-    ).tolist() == [2]
+    velocities = np.array([[0.0, 0.0], [2.0, 0.0], [12.0, 0.0]])
+    rows = make_alarm(1.0, 1.0).rows(poses, velocities)
+    assert rows.tolist() == [2]

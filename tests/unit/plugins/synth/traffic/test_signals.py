@@ -31,19 +31,28 @@ def test_phases_follow_each_other():
     ]
 
 
-def test_never_have_both_roads_anything_but_red():
+def test_one_of_the_two_roads_always_has_red():
     times = np.arange(-60, 60, 0.1)
-    for one, other in (("west", "south"), ("east", "north")):
-        assert ((PLAN.state(one, times) == RED) | (PLAN.state(other, times) == RED)).all()
+
+    for first, second in (("west", "south"), ("east", "north")):
+        first_red = PLAN.state(first, times) == RED
+        second_red = PLAN.state(second, times) == RED
+        assert (first_red | second_red).all()
+
     np.testing.assert_array_equal(PLAN.state("west", times), PLAN.state("east", times))
 
 
 @pytest.mark.parametrize("ignores", [(), ("signal",)])
-def test_one_stops_before_the_line_at_red_and_goes_at_green_if_it_obeys(driver, junction, ignores):
-    users = [driver("west", on=junction(signalized=True), ignores=ignores)]
+def test_an_obedient_driver_stops_before_the_line_at_red_and_goes_at_green(
+    driver, junction, ignores
+):
+    user = driver("west", on=junction(signalized=True), ignores=ignores)
     plan = SignalPlan(first="south-north", start=0.0, green=8.0)  # green for west from 12.5 s on
-    run = simulate(users, begin=0.0, end=20.0, rights=find_rights(users), signals=plan)
-    front = users[0].path.project(run.poses[:, 0, :2])[0] + users[0].body.size[0] / 2
-    at_red, route = front[run.time < 12.5].max(), users[0].route
-    assert (route.stop_s - 3.0 < at_red < route.stop_s) == (not ignores)
-    assert front[-1] > route.enter_s
+    run = simulate([user], begin=0.0, end=20.0, rights=find_rights([user]), signals=plan)
+
+    along, _ = user.path.project(run.poses[:, 0, :2])
+    front = along + user.body.size[0] / 2
+    farthest_at_red = front[run.time < 12.5].max()
+    stop_s = user.route.stop_s
+    assert (stop_s - 3.0 < farthest_at_red < stop_s) == (not ignores)
+    assert front[-1] > user.route.enter_s

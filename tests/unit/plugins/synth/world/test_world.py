@@ -1,12 +1,12 @@
-"""Towns around junctions: nothing stands in the way, the pole sees the middle, lamps are where they
-should be.
+"""Towns around junctions: nothing stands in the way, the pole sees the middle, lamps are in the
+right places.
 """
 
 import itertools
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth.roads import (
@@ -28,52 +28,71 @@ SPECS = {
     "wide": RoadSpec(lanes=2, signalized=False),
     "hilly": RoadSpec(hump=Hump(arm="east", distance=60.0)),
 }
-CORNERS = [("west", "north"), ("south", "west"), ("east", "south"), ("north", "east")]
+NEIGHBOURS = [("west", "north"), ("south", "west"), ("east", "south"), ("north", "east")]
 
 
-def world_of(name, seed=0, view="open", between=("west", "south")):
-    return random_world(np.random.default_rng(seed), Junction(SPECS[name]), view, between=between)
+def make_world(name, seed=0, view="open", between=("west", "south")):
+    return random_world(
+        np.random.default_rng(seed),
+        Junction(SPECS[name]),
+        view,
+        between=between,
+    )
 
 
 @pytest.fixture(params=itertools.product(SPECS, (0, 1)), ids=lambda param: f"{param[0]}-{param[1]}")
-def named(request):
+def town(request):
+    """A junction and the world around it."""
     name, seed = request.param
-    return Junction(SPECS[name]), world_of(name, seed)
+    return Junction(SPECS[name]), make_world(name, seed)
 
 
-def clear_of_props(world, start, end):
-    """Whether the sight from one point to another passes above or beside every block, seen in steps
-    of 5 cm.
-    """
-    line = np.linspace(start, end, int(np.linalg.norm(np.subtract(end, start)) / 0.05))[1:-1]
-    low, high = world.props.corners.min(axis=1), world.props.corners.max(axis=1)
-    return not ((line[:, None] > low) & (line[:, None] < high)).all(axis=2).any()
+def is_visible(world, start, end):
+    """Return whether the line of sight between two points meets no block, in steps of 5 cm."""
+    steps = int(np.linalg.norm(np.subtract(end, start)) / 0.05)
+    line = np.linspace(start, end, steps)[1:-1, None]
+    low = world.props.corners.min(axis=1)
+    high = world.props.corners.max(axis=1)
+    inside = ((line > low) & (line < high)).all(axis=2)
+
+    return not inside.any()
 
 
-def test_nothing_stands_on_the_road_and_no_house_on_the_sidewalk(named):
-    _, world = named
-    covered = world.top.codes != world.ground.codes
-    assert not np.isin(world.ground.codes[covered], ROAD_CODES).any()
-    assert set(world.top.codes[covered & (world.ground.codes == SIDEWALK)].tolist()) == {POLE}
-    assert {TREE, POLE, FIRST_BUILDING} <= set(np.unique(world.top.codes).tolist())
+def test_nothing_stands_on_the_road_and_no_house_on_the_sidewalk(town):
+    _, world = town
+    ground, top = world.ground.codes, world.top.codes
+    covered = top != ground
+
+    assert not np.isin(ground[covered], ROAD_CODES).any()
+    assert set(top[covered & (ground == SIDEWALK)].tolist()) == {POLE}
+    assert {TREE, POLE, FIRST_BUILDING} <= set(np.unique(top).tolist())
 
 
-def test_things_reach_into_the_ground_and_stand_above_it(named):
-    _, world = named
-    above = world.props.corners[..., 2]
-    ground, houses = world.terrain.height(world.props.corners[..., :2]), world.props.facade
-    assert (above[houses].min(axis=1) <= ground[houses].min(axis=1) - 0.19).all()
-    assert (above[houses].max(axis=1) > ground[houses].max(axis=1) + 3).all()
-    assert (above < ground).any(axis=1).mean() > 0.3
+def test_things_reach_into_the_ground_and_stand_above_it(town):
+    _, world = town
+    heights = world.props.corners[..., 2]
+    ground = world.terrain.height(world.props.corners[..., :2])
+    assert (heights < ground).any(axis=1).mean() > 0.3
+
+    houses = world.props.facade
+    house_heights, house_ground = heights[houses], ground[houses]
+    assert (house_heights.min(axis=1) <= house_ground.min(axis=1) - 0.19).all()
+    assert (house_heights.max(axis=1) > house_ground.max(axis=1) + 3).all()
 
 
-def test_the_pole_sees_the_middle(named):
-    _, world = named
-    place, ahead = world.lidar_pole.translation, world.lidar_pole.rotation[:, 0]
-    assert (3 <= place[2] <= 5, world.ground.at(place[None, :2])[0]) == (True, SIDEWALK)
-    np.testing.assert_allclose(ahead[:2], -place[:2] / np.hypot(*place[:2]), atol=1e-9)
+def test_the_pole_sees_the_middle(town):
+    _, world = town
+    position = world.lidar_pole.translation
+    assert 3 <= position[2] <= 5
+    assert world.ground.at(position[None, :2])[0] == SIDEWALK
+
+    ahead = world.lidar_pole.rotation[:, 0]
+    to_middle = -position[:2] / np.hypot(*position[:2])
+    np.testing.assert_allclose(ahead[:2], to_middle, atol=1e-9)
+
     targets = ([0.0, 0.0, 0.5], [3.0, -3.0, 0.5], [-3.0, -3.0, 0.5], [2.0, 3.0, 0.5])
-    assert [target for target in targets if not clear_of_props(world, place, target)] == []
+    for target in targets:
+        assert is_visible(world, position, target)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -87,56 +106,64 @@ def test_the_pole_sees_the_middle(named):
     ],
 )
 def test_the_pole_stands_where_the_two_come_from(seed, between, corners):
-    place = world_of("wide", seed, between=between).lidar_pole.translation
-    assert tuple(np.sign(place[:2]).astype(int).tolist()) in corners
+    position = make_world("wide", seed, between=between).lidar_pole.translation
+    corner = np.sign(position[:2]).astype(int)
+    assert tuple(corner.tolist()) in corners
 
 
-def test_each_arm_sees_its_lamps(named):
-    junction, world = named
-    assert [head.arm for head in world.signals] == (
-        list(junction.arms) if junction.spec.signalized else []
-    )
+def test_each_arm_sees_its_lamps(town):
+    junction, world = town
+    expected_arms = list(junction.arms) if junction.spec.signalized else []
+    assert [head.arm for head in world.signals] == expected_arms
+
     for head in world.signals:
-        lamps = world.props.corners[list(head.rows)].mean(axis=1)
+        rows = list(head.rows)
+        lamps = world.props.corners[rows].mean(axis=1)
         assert (np.diff(lamps[:, 2]) < 0).all()
-        line, shining = (
-            junction.stop_line(head.arm).mean(axis=0),
-            np.array(OUTWARD[head.arm], dtype=np.float64),
-        )
+
+        outward = np.array(OUTWARD[head.arm], dtype=np.float64)
+        line = junction.stop_line(head.arm).mean(axis=0)
         waiting = np.append(line * (1 + 8 / np.hypot(*line)), 1.5)
-        assert shining @ (waiting - lamps[1])[:2] > 5
-        assert clear_of_props(world, lamps[1] + 0.2 * np.append(shining, 0), waiting)
-        red, _, green = world.props.colors[list(head.rows), 0].astype(int)
+        assert outward @ (waiting - lamps[1])[:2] > 5
+        front_of_lamp = lamps[1] + 0.2 * np.append(outward, 0)
+        assert is_visible(world, front_of_lamp, waiting)
+
+        red, _, green = world.props.colors[rows, 0].astype(int)
         assert red[0] == red.max() < LAMP_COLORS[0][0]
         assert green[1] == green.max() < LAMP_COLORS[2][1]
 
 
-@pytest.mark.parametrize("between", CORNERS)
+@pytest.mark.parametrize("between", NEIGHBOURS)
 @pytest.mark.parametrize("name", ["four-way", "hilly"])
-def test_a_house_on_the_kerb_hides_who_comes_until_late(name, between):
-    hidden, junction = world_of(name, view="hidden", between=between), Junction(SPECS[name])
+def test_a_house_on_the_kerb_hides_the_two_from_each_other_until_late(name, between):
+    world = make_world(name, view="hidden", between=between)
+    junction = Junction(SPECS[name])
     first, second = (junction.route(arm, "straight") for arm in between)
     meeting = junction.conflicts(first, second)
 
-    def eyes(metres):
-        """Those of the two, so far before they meet."""
-        places = ((first, meeting.s_a), (second, meeting.s_b))
-        return [np.array([*route.path.at(s - metres)[:2], 1.5]) for route, s in places]
+    def eyes_before_meeting(metres):
+        """Return the eyes of the two at a distance before they meet."""
+        x_a, y_a, *_ = first.path.at(meeting.s_a - metres)
+        x_b, y_b, *_ = second.path.at(meeting.s_b - metres)
+        return np.array([[x_a, y_a, 1.5], [x_b, y_b, 1.5]])
 
-    assert [clear_of_props(hidden, *eyes(metres)) for metres in (20.0, 30.0, 6.0)] == [
-        False,
-        False,
-        True,
-    ]
-    seen = [eye for metres in (0.0, 10.0, 20.0, 30.0) for eye in eyes(metres)]
-    assert all(clear_of_props(hidden, hidden.lidar_pole.translation, eye) for eye in seen)
-    covered = hidden.top.codes != hidden.ground.codes
-    assert not np.isin(hidden.ground.codes[covered], ROAD_CODES).any()
+    assert not is_visible(world, *eyes_before_meeting(20.0))
+    assert not is_visible(world, *eyes_before_meeting(30.0))
+    assert is_visible(world, *eyes_before_meeting(6.0))
+
+    for metres in (0.0, 10.0, 20.0, 30.0):
+        for eye in eyes_before_meeting(metres):
+            assert is_visible(world, world.lidar_pole.translation, eye)
+
+    covered = world.top.codes != world.ground.codes
+    assert not np.isin(world.ground.codes[covered], ROAD_CODES).any()
 
 
 def test_a_junction_with_a_hump_lies_level():
-    assert world_of("hilly").world_from_ground.rotation[2, 2] == pytest.approx(1, abs=1e-15)
-    assert 0.9986 < world_of("four-way").world_from_ground.rotation[2, 2] < 1
+    hilly = make_world("hilly").world_from_ground
+    flat = make_world("four-way").world_from_ground
+    assert hilly.rotation[2, 2] == pytest.approx(1, abs=1e-15)
+    assert 0.9986 < flat.rotation[2, 2] < 1
 
 
 @pytest.mark.parametrize(
@@ -147,9 +174,9 @@ def test_a_junction_with_a_hump_lies_level():
     ],
 )
 def test_arms_without_a_corner_are_refused(name, between, arms):
-    assert_refused(
+    assert_raises(
         (
-            lambda: world_of(name, view="hidden", between=between),
+            lambda: make_world(name, view="hidden", between=between),
             ConfigError,
             f"between: the arms .* no corner in common; choose two neighbours of {arms}",
         )
