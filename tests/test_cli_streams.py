@@ -183,10 +183,10 @@ def run(*words: object, output: str) -> subprocess.CompletedProcess[bytes]:
 @pytest.mark.parametrize(
     ("verb", "output"),
     [
-        *(("stats", output) for output in STATUS_BY_OUTPUT),
+        *(("predict", output) for output in STATUS_BY_OUTPUT),
         ("render", "full"),
         ("parquet", "closed pipe"),
-        ("predict", "none"),
+        ("stats", "none"),
     ],
 )
 def test_written_files_do_not_depend_on_the_standard_output(
