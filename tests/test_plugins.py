@@ -223,20 +223,11 @@ def test_the_commands_without_plugins(tmp_path: Path) -> None:
     assert missing_verbs >= {"demo", "explore", "predict", "safety", "study", "synth", "train"}
 
 
-CORE_TEST_FOLDERS = (
-    "collisions",
-    "geometry",
-    "motion",
-    "release",
-    "statistics",
-    "support/parallel",
-    "tables",
-    "v2x",
-)
+CORE_TEST_FOLDERS = ("collisions", "geometry", "statistics", "support/parallel", "tables")
 
 
 @pytest.mark.slow
 def test_the_tests_of_the_core_without_plugins(releases: Path, tmp_path: Path) -> None:
     folder = copy_without(tmp_path, *PLUGINS)
     tests = [f"unit/{name}" for name in CORE_TEST_FOLDERS]
-    assert count_passed_tests(folder, releases, PLUGINS, *tests) > 1000
+    assert count_passed_tests(folder, releases, PLUGINS, *tests) > 400
