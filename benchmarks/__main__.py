@@ -20,6 +20,7 @@ NAMES = (
     "render",
     "synth",
     "export",
+    "clips",
     "loader",
     "engine",
     "stores",
@@ -35,7 +36,8 @@ NAMES = (
 )
 def main(names: tuple[str, ...], as_json: bool) -> None:  # noqa: FBT001 - click's flag
     """Measure the devkit; NAME is one of parsing, indexing, scale, validation, geometry, labels,
-    evaluation, coverage, safety, render, synth, export, loader, engine, stores, explore, beside.
+    evaluation, coverage, safety, render, synth, export, clips, loader, engine, stores, explore,
+    beside.
     """
     all_figures = []
     for name in names or NAMES:

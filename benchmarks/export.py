@@ -14,6 +14,7 @@ from pathlib import Path
 from benchmarks.measure import Figure, best_of, one_core, temporary_folder
 from benchmarks.releases import copied_release
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.export.av2 import Av2
 from deepaccident_devkit.export.bulk import Format, export_release
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
@@ -21,8 +22,8 @@ from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions, WindowRules
+from deepaccident_devkit.export.release import ReleasePart
 from deepaccident_devkit.export.released_infos import ReleasedInfos
-from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.training.image_cache import CachedImages
@@ -32,8 +33,8 @@ CACHE = CachedImages(
 )
 QUESTIONS = Questions(window=WindowRules(observe=0.0, stride=0.5))
 FORMATS: tuple[Format, ...] = (
-    *(OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), WebDataset()),
-    *(QUESTIONS, CACHE),
+    *(OpenCood(), NuScenes(), Mmdet3d(), ReleasedInfos(), Parquet(), Av2()),
+    *(QUESTIONS, CACHE, ReleasePart()),
 )
 """One format of each kind; a format that lies in another's folder comes after it."""
 RELEASE = SynthConfig(scenarios=1, frames=8, image_size=(800, 450), seed=7, designed=True)

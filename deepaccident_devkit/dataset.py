@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
@@ -12,10 +14,12 @@ import numpy as np
 
 from deepaccident_devkit.errors import (
     ChoiceError,
+    ImageSizeWarning,
     MissingFileError,
     NotAvailableError,
     ReleaseError,
     TokenError,
+    escaped,
 )
 from deepaccident_devkit.geometry import SE3, Box, Boxes, LidarPointCloud, PinholeCamera
 from deepaccident_devkit.geometry.boxes import trusted_boxes
@@ -23,6 +27,7 @@ from deepaccident_devkit.geometry.conventions import stored_transforms
 from deepaccident_devkit.geometry.se3 import trusted_se3
 from deepaccident_devkit.release import BevImage, read_bev, read_image, read_lidar
 from deepaccident_devkit.release.fingerprints import digest_of
+from deepaccident_devkit.release.images import calib_fault, image_size
 from deepaccident_devkit.release.layout import ScenarioFolder, frame_numbers
 from deepaccident_devkit.release.store import ReleasePath, StorePath
 from deepaccident_devkit.support import nuscenes_names
@@ -74,6 +79,9 @@ VISIBLE: Final = (None, *get_args(Visible))
 
 class Dataset(OpenTables):
     """One release: its tables (`OpenTables`), poses, boxes and sensor files."""
+
+    # Whether a camera was found whose images do not have the size that its K is for.
+    _has_size_warning = False
 
     if not TYPE_CHECKING:  # type checkers would accept any name
 
@@ -187,18 +195,9 @@ class Dataset(OpenTables):
     ) -> list[Box]:
         """Return the annotated boxes of a sample as a list of objects with tokens.
 
-        The arguments are as in `boxes`. Item i equals `boxes(sample)[i]`, but also has an
-        `instance_token`.
+        The arguments are as in `boxes`. Item i equals `boxes(sample)[i]`.
         """
-        row = self._find_sample_row(sample)
-        boxes = self.boxes(sample, frame, visible, velocity)
-        instance_rows = self._tables.views["annotation"]["instance_row"]
-        instances = instance_rows[self._find_annotation_slice(row)][boxes.row].tolist()
-        token_of_instance = self._tables.resolver.token_makers["instance"]
-        box_objects = list(boxes)
-        for box, instance in zip(box_objects, instances, strict=True):
-            box.instance_token = token_of_instance(instance) if instance >= 0 else None
-        return box_objects
+        return list(self.boxes(sample, frame, visible, velocity))
 
     def actor_ids(self, sample: RowArgument) -> IntArray:
         """Return the CARLA ids (N,) of the actors of a sample's boxes, in the order of its label.
@@ -353,7 +352,8 @@ class Dataset(OpenTables):
     def camera(self, sample_data: RowArgument, channel: str | None = None) -> PinholeCamera:
         """Return a camera with K and the image size from its calib file.
 
-        The camera projects points and finds visible boxes.
+        The camera projects points and finds visible boxes. ImageSizeWarning is issued, once for a
+        release, if the first image of the recording has another size.
 
         Args:
             sample_data: Token or record of a camera's sensor file; with `channel`, of a sample.
@@ -366,10 +366,7 @@ class Dataset(OpenTables):
         row, name = self._find_sensor_file(sample_data, channel)
         if name not in CAMERAS:
             raise ChoiceError(f"camera: expected one of {', '.join(CAMERAS)}, found {name}")
-        view = self._tables.views["sample_data"]
-        width = view["width"].item(row)
-        height = view["height"].item(row)
-        return PinholeCamera(self._copy_intrinsic(row), width, height)
+        return PinholeCamera(self._copy_intrinsic(row), *self._calib_size(row))
 
     def load_image(
         self,
@@ -452,11 +449,46 @@ class Dataset(OpenTables):
         return self.dataroot / self._tables.resolver.filename(sample_data_row)
 
     def _copy_intrinsic(self, sample_data_row: int) -> FloatArray:
-        """Return a copy of a camera's K (3, 3), which the caller may change."""
+        """Return a copy of a camera's K (3, 3), which the caller may change.
+
+        When a camera is first used, its first image is compared with K.
+        """
         views = self._tables.views
         sensor_row = views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
+        if sensor_row not in self._compared_cameras:
+            self._compared_cameras.add(sensor_row)
+            self._compare_image_size(sample_data_row)
         intrinsic: FloatArray = views["calibrated_sensor"]["camera_intrinsic"][sensor_row]
         return intrinsic.reshape(3, 3).copy()
+
+    @cached_property
+    def _compared_cameras(self) -> set[int]:
+        """Rows of `calibrated_sensor` whose images were compared with calib."""
+        return set()
+
+    def _compare_image_size(self, sample_data_row: int) -> None:
+        """Compare the first image of a recording's camera with the size that its K is for.
+
+        ImageSizeWarning is issued for the first image of the release that has another size.
+        """
+        sample_row, channel = divmod(sample_data_row, len(CHANNELS))
+        agent_row = self._tables.views["sample"]["agent_row"].item(sample_row)
+        first_row = self._tables.resolver.sample_at(agent_row, 1) * len(CHANNELS) + channel
+        path = self._join_sensor_path(first_row)
+        with suppress(ReleaseError):  # the release may have no images
+            fault = calib_fault(image_size(path), self._calib_size(first_row))
+            if fault is not None and not self._has_size_warning:
+                self._has_size_warning = True
+                text = (
+                    f"{path}: {fault}, so projections into it are wrong; run deepaccident "
+                    "validate, which lists all such cameras"
+                )
+                warnings.warn(escaped(text), ImageSizeWarning, stacklevel=4)
+
+    def _calib_size(self, sample_data_row: int) -> tuple[int, int]:
+        """Return the width and height of the images that a camera's K is for."""
+        view = self._tables.views["sample_data"]
+        return view["width"].item(sample_data_row), view["height"].item(sample_data_row)
 
     def _channel_path(self, sample_row: int, channel: str) -> ReleasePath:
         first_row = sample_row * len(CHANNELS)
@@ -486,7 +518,11 @@ class Dataset(OpenTables):
             )
         elif velocity == "derived":
             columns["velocity"] = self._derive_velocity(sample_row)
-        return trusted_boxes("lidar", columns, token)
+        scenario = None if token is None else token.rsplit("/", 2)[0]
+        own_actor_id = self._tables.views["agent"]["actor_id"].item(
+            self._tables.views["sample"]["agent_row"].item(sample_row)
+        )
+        return trusted_boxes("lidar", columns, token, scenario, own_actor_id)
 
     def _derive_velocity(self, sample_row: int) -> FloatArray:
         """Return velocities (N, 3) in the sample's LiDAR frame, m/s, from neighbouring samples."""

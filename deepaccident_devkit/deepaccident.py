@@ -148,6 +148,9 @@ class DeepAccident(Dataset):
     project_to_image = v2x.project_to_image
     map_pointcloud_to_image = v2x.map_pointcloud_to_image
     trajectory = v2x.trajectory
+    agent_motion = v2x.agent_motion
+    window = v2x.window
+    windows = v2x.windows
     collision = v2x.collision
     message_sizes = v2x.message_sizes
     interactions = interactions_of_pairs.interactions

@@ -210,3 +210,7 @@ class MissingExtraError(UnavailableError, ImportError):
 
 class MissingPluginError(UnavailableError, ImportError):
     """A plug-in that the call needs is not installed."""
+
+
+class ImageSizeWarning(UserWarning):
+    """The images of a camera are not of the size that its calib files are made for."""

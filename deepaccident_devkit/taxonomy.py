@@ -77,6 +77,8 @@ SMALL_CATEGORIES: Final = ("cyclist", "motorcycle", "pedestrian")
 See docs/released_code.md, Visibility and attributes.
 """
 
+ACTOR: Final = "actor"
+"""Word before an actor's id in the tokens of instances."""
 OWN_ACTOR_ID: Final = -100
 """Label id of the recording agent itself."""
 UNTRACKED_ID: Final = -1

@@ -73,8 +73,9 @@ EXAMPLE_VALUES = {
     "LABEL": "deepaccident_demo/release/type1_subtype1_accident/ego_vehicle/label/"
     "Town10HD_type001_subtype0001_scenario00001/Town10HD_type001_subtype0001_scenario00001_001.txt",
     "OUT": "out",
+    "640x360": "32x18",
 }
-"""Word in capitals of a command line → an example of its value."""
+"""Word of a command line → an example of its value that fits the demo of the tests."""
 ONLY_PARSED = {
     "check splits": "tests/test_cli_audit.py runs them, and makes the files",
     "check scores": "likewise",

@@ -7,8 +7,13 @@ nuscenes_devkit=('nuscenes-devkit==1.2.0 motmetrics==1.4.0 pandas<3 numpy<2' "$T
 check 'environment nuscenes_devkit' environment nuscenes_devkit "$PYTHON" "${nuscenes_devkit[@]}"
 check 'nuscenes-devkit reads the export' client nuscenes_devkit
 check 'environment tables' environment tables "$PYTHON" \
-  'datasets==5.2.0 webdataset==1.0.2 duckdb==2.0.0 polars==2.1.0 pandas==3.1.1 pyarrow==26.0.1 pillow==13.0.0'
+  'datasets==5.2.0 duckdb==2.0.0 polars==2.1.0 pandas==3.1.1 pyarrow==26.0.1 pillow==13.0.0'
 check 'datasets, DuckDB and Polars read the export' client tables
+
+# av2's own requirements are pytorch, OpenCV, rerun and others
+check 'environment argoverse' environment argoverse "$PYTHON" \
+  'numpy==2.4.6 pandas==3.1.1 pyarrow==26.0.1 universal-pathlib==0.3.10' '--no-deps av2==0.3.6'
+check 'av2 reads the export' client argoverse
 
 check 'environment nuscenes' environment nuscenes "$PYTHON" "${nuscenes_devkit[@]}" \
   '.[nuscenes,torch,test] numpy<2' 'mlcroissant==1.1.1 numpy<2'

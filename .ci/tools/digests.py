@@ -53,7 +53,9 @@ GENERATED = [
 ]
 """Options of `synth` for the release that each checkout makes; all its files are compared."""
 EXPORTS = {
+    "av2": ("labelled", ["export", "av2"]),
     "cache": ("sensors", ["cache", "--size", "16x9", "--where", "length=1..1000"]),
+    "clips": ("sensors", ["export", "clips"]),
     "labels": ("labelled", ["labels", "--samples", "all", "--split"]),
     "labels of beverse": (
         "labelled",
@@ -69,8 +71,8 @@ EXPORTS = {
         "labelled",
         ["export", "questions", "--observe", "1", "--ahead", "1", "--stride", "0.5"],
     ),
+    "release": ("sensors", ["export", "release", "--channels", "Camera_Front", "--size", "16x9"]),
     "town-maps": ("sensors", ["export", "town-maps"]),
-    "webdataset": ("sensors", ["export", "webdataset"]),
 }
 """Name → the release that is exported, and the command.
 

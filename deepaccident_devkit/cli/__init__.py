@@ -11,6 +11,7 @@ import os
 import platform
 import re
 import sys
+import warnings
 from functools import partial
 from importlib import import_module
 
@@ -133,6 +134,7 @@ def _run_command() -> None:
     logging.basicConfig(
         level=logging.WARNING, format="%(levelname)s: %(message)s", handlers=[handler]
     )
+    warnings.showwarning = lambda message, *_: click.echo(f"warning: {message}", err=True)
     try:
         run_interruptibly(partial(deepaccident, standalone_mode=False))
     except click.ClickException as error:

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -19,6 +20,7 @@ from deepaccident_devkit.cli.options import (
     channels_parameter,
     engine_options,
     frame_range_parameter,
+    pixel_size,
     refuse_unused,
     release_parameters,
     split_words,
@@ -37,7 +39,14 @@ from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.motion import PRESETS
 from deepaccident_devkit.support.plugins import LazyFormat, LazyVerb, Plugin
 from deepaccident_devkit.support.text import choice, counted, size_text
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, CATEGORIES, LIDAR, VEHICLE_AGENTS
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CAMERAS,
+    CATEGORIES,
+    CHANNELS,
+    LIDAR,
+    VEHICLE_AGENTS,
+)
 from deepaccident_devkit.v2x.collisions import default_scenario
 
 if TYPE_CHECKING:
@@ -51,7 +60,8 @@ link_parameter = advanced(
     type=WordChoice(_LINK_NAMES),
     default="hard",
     show_default=True,
-    help="How to place images: as hard links, symbolic links or copies; the next is the fallback.",
+    help="How to place unchanged files: as hard links, symbolic links or copies; the next is the "
+    "fallback.",
 )
 
 
@@ -100,6 +110,8 @@ def run_export(
     )
     dataset = DeepAccident(**release)
     estimate = export_release(dataset, out, export_format, dry_run=True)
+    if estimate.selection:
+        click.echo(estimate.selection)
     if estimate.written:
         _print_estimate(estimate.tally, estimate.folder, out)
     if dry_run:
@@ -166,8 +178,9 @@ def _pop_own_fields(kind: type[Any], options: dict[str, Any]) -> dict[str, Any]:
     """Remove the fields that only this format has from the options, and return them."""
     from deepaccident_devkit.export.bulk import Format
 
-    fields = kind.__dataclass_fields__.keys() - Format.__dataclass_fields__.keys()
-    return {name: options.pop(name) for name in fields & options.keys()}
+    common_names = {field.name for field in fields(Format)}
+    own_names = {field.name for field in fields(kind)} - common_names
+    return {name: options.pop(name) for name in own_names & options.keys()}
 
 
 def _make_nuscenes_options() -> tuple[_Parameter, ...]:
@@ -265,24 +278,61 @@ def _load_parquet_verb() -> click.Command:
     )
 
 
-def _load_webdataset_verb() -> click.Command:
-    from deepaccident_devkit.export.webdataset import WebDataset
+def _load_release_verb() -> click.Command:
+    from deepaccident_devkit.export.release import ReleasePart
 
-    size = advanced(
-        "--shard-size",
-        type=click.IntRange(min=1),
-        default=WebDataset.shard_size // 10**6,
-        show_default=True,
-        callback=lambda _context, _option, value: value * 10**6,
-        metavar="MB",
-        help="Approximate size of a tar file.",
+    channels = click.option(
+        "--channels",
+        multiple=True,
+        callback=lambda _context, _option, value: tuple(split_words(value)) or CHANNELS,
+        metavar="NAME[,NAME…]",
+        help="Include only these sensors, such as Camera_Front,lidar01.  [default: all]",
     )
     return _make_format_verb(
-        WebDataset,
-        field_option(WebDataset, "frames"),
+        ReleasePart,
+        link_parameter,
+        channels,
+        field_option(ReleasePart, "size", type=str, callback=pixel_size, metavar="WxH"),
+        text="Write a part of the release in DATAROOT, which is a folder, a zip or a folder of "
+        "zips, in the layout of a release.\n\nLabel, calib and meta files are always included, and "
+        "split files name what is there. `deepaccident validate FOLDER` checks that the part is "
+        f"complete. {_CONTINUED}",
+    )
+
+
+def _load_av2_verb() -> click.Command:
+    from deepaccident_devkit.export.av2 import Av2
+
+    return _make_format_verb(
+        Av2,
+        *(field_option(Av2, name, metavar="SECONDS") for name in ("past", "future", "every")),
+        text="Write samples of the release in DATAROOT as scenarios of Argoverse 2: one Parquet "
+        "file per sample, with the tracks that all agents' labels have, merged. The focal track is "
+        f"the agent's own vehicle.\n\n{_CONTINUED}",
+    )
+
+
+def _load_clips_verb() -> click.Command:
+    from deepaccident_devkit.export.clips import Clips
+
+    cameras = click.option(
+        "--channels",
+        "cameras",
+        multiple=True,
+        callback=lambda _context, _option, value: _choose_cameras(value),
+        metavar="NAME[,NAME…]",
+        help=f"Cameras whose images to export, or all.  [default: {CAMERAS[0]}]",
+    )
+    size = field_option(Clips, "size", type=str, callback=pixel_size, metavar="WxH")
+    return _make_format_verb(
+        Clips,
+        cameras,
         size,
-        text="Write samples of the release in DATAROOT as tar files: the images, the LiDAR "
-        f"points, and the rest as JSON.\n\n{_CONTINUED}",
+        field_option(Clips, "quality"),
+        text="Write the images of recordings in DATAROOT as videos, with a row of numbers for each "
+        "frame as Parquet and CSV: time to impact, times to collision, motion and more.\n\nThe "
+        "folder is a LeRobotDataset v3. Agents that lack images are left out of a scenario, and "
+        f"counted. {_CONTINUED}",
     )
 
 
@@ -430,6 +480,11 @@ def _load_town_maps_verb() -> click.Command:
 
 # Format → its line in the list of formats, and the function that builds its subcommand.
 _VERBS = {
+    "av2": LazyVerb("Write tracks of actors as scenarios of Argoverse 2.", _load_av2_verb),
+    "clips": LazyVerb(
+        "Write videos with a row of numbers for each frame, for LeRobot and pandas.",
+        _load_clips_verb,
+    ),
     "mcap": LazyVerb("Write a scenario as an interactive 3D scene (MCAP).", lambda: _mcap),
     "mmdet3d": LazyVerb("Write infos for mmdet3d, or for the released code.", _load_mmdet3d_verb),
     "nuscenes": LazyVerb("Write nuScenes tables and their sensor files.", _load_nuscenes_verb),
@@ -443,12 +498,12 @@ _VERBS = {
     "questions": LazyVerb(
         "Write questions about what happens next, for language models.", _load_questions_verb
     ),
+    "release": LazyVerb(
+        "Write a part of a release in its own layout, with smaller images if you like.",
+        _load_release_verb,
+    ),
     "town-maps": LazyVerb(
         "Write the roads and sidewalks of each town as GeoJSON.", _load_town_maps_verb
-    ),
-    "webdataset": LazyVerb(
-        "Write samples with images, LiDAR and boxes as tar files, for webdataset.",
-        _load_webdataset_verb,
     ),
 }
 

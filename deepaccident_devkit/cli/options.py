@@ -83,6 +83,10 @@ def _enter_style(context: click.Context, parameter: click.Parameter, value: Any)
         context.with_resource(style(chosen["style"], title=not chosen["no_title"]))
 
 
+no_title_option = functools.partial(
+    click.option, "--no-title", is_flag=True, help="Draw no titles, for figures with captions."
+)
+"""Function that makes the option --no-title."""
 figure_style_parameter = together(
     click.option(
         "--style",
@@ -92,13 +96,7 @@ figure_style_parameter = together(
         help="Draw the figures as wide as a paper's column or page, or for a slide. Figures of a "
         "folder or a report are then written as PDF files, too.",
     ),
-    click.option(
-        "--no-title",
-        is_flag=True,
-        expose_value=False,
-        callback=_enter_style,
-        help="Draw the figures without titles, for papers with captions.",
-    ),
+    no_title_option(expose_value=False, callback=_enter_style),
 )
 """--style and --no-title, for subcommands that write figures."""
 where_parameter = click.option(

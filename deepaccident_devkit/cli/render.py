@@ -16,6 +16,7 @@ from deepaccident_devkit.cli.agents import (
 from deepaccident_devkit.cli.options import (
     PATH,
     frame_range_parameter,
+    no_title_option,
     open_release,
     pixel_size,
     refuse_unused,
@@ -138,9 +139,7 @@ _LAYERS = click.option(
     metavar="NAME[,NAME…]",
     help=f"Draw only these layers. Each view has some of {', '.join(LAYERS)}.",
 )
-_NO_TITLE = click.option(
-    "--no-title", is_flag=True, help="Draw no title, for figures with a caption."
-)
+_NO_TITLE = no_title_option()
 # Options for views that show several agents.
 _AGENT_OPTIONS = (_AGENTS, _BY_CLASS, _LAYERS)
 

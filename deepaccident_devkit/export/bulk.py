@@ -16,7 +16,7 @@ import re
 import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -114,12 +114,14 @@ class Exported:
         kept: Number of units that existed already.
         tally: Counts of everything in the folder; for a dry run, estimates for the missing units,
             with all the disk space that they take as `bytes`.
+        selection: For a dry run, a line about all files to export, if the format counts them.
     """
 
     folder: Path
     written: int
     kept: int
     tally: Tally
+    selection: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,6 +149,7 @@ class Manifest:
         settings: All settings that decide what is written.
         release: Sources of the export; None until it is complete.
         written: Counts of everything that was written.
+        contents: What the format says about its files, once it is complete; few formats do.
     """
 
     what: Literal["DeepAccident export"] = "DeepAccident export"
@@ -155,6 +158,7 @@ class Manifest:
     settings: dict[str, Any]
     release: MadeFrom | None = None
     written: Tally = field(default_factory=Tally)
+    contents: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, folder: Path, form: Format | type[Format], settings: dict[str, Any]) -> Manifest:
@@ -222,7 +226,10 @@ class Manifest:
 
     def write(self, folder: Path) -> None:
         """Write the manifest into the folder of the export."""
-        text = f"{json.dumps(asdict(self), indent=1)}\n"
+        values = asdict(self)
+        if not self.contents:
+            del values["contents"]
+        text = f"{json.dumps(values, indent=1)}\n"
         write_bytes(folder / f"{self.format}{_MANIFEST_SUFFIX}", text.encode())
 
     def check(self, folder: Path, settings: Mapping[str, Any]) -> None:
@@ -281,8 +288,9 @@ def export_release(
     command = digest_of({"format": form.name, "settings": settings, "of": scenarios})
     export = Export(dataset, form, root, command)
     units = form.units(dataset, scenarios)
+    selection = form.survey(dataset, scenarios, root)
     if dry_run:
-        return _estimate_export(export, manifest, units)
+        return replace(_estimate_export(export, manifest, units), selection=selection)
     form.check(dataset, root)
     folders = scenario_folders(dataset, scenarios)
     absent = [token for token in scenarios if token not in folders]
@@ -404,7 +412,7 @@ class Export:
             output = Output(Path(folder, "out"), Path(folder, "parts"), self.form.link)
             self.form.write(self.dataset, Unit(name="one", scenarios=(scenario,)), output)
             measured_folder = output.parts
-            if self.form.link == "copy":
+            if "copy" in (self.form.link, *output.tally.linked):
                 output.tally.bytes = 0
                 measured_folder = Path(folder)
             for path in measured_folder.rglob("*"):
@@ -509,7 +517,11 @@ class Export:
         fingerprint = digest_of(_remove_sensor_states(states))
         made_from = MadeFrom(fingerprint=fingerprint, scenarios=dict(sorted(states.items())))
         return Manifest(
-            format=self.form.name, settings=settings, release=made_from, written=output.tally
+            format=self.form.name,
+            settings=settings,
+            release=made_from,
+            written=output.tally,
+            contents=output.contents,
         )
 
     @contextmanager

@@ -65,13 +65,14 @@ AAAI 2024, https://arxiv.org/abs/2304.01168. The data belong to the authors of t
 terms apply. The licence
 Apache-2.0 covers only the code of the devkit.
 
-Everything is right-handed: x forward, y left, z up, yaw counter-clockwise; metres, seconds, \
-radians. Quaternions are
-w, x, y, z. Cameras have optical axes: x right, y down, z forward. Frames are numbered from 1 and \
-0.1 s apart. The
+{axes} Frames are numbered from 1 and 0.1 s apart. The
 impact of an accident is the last frame of its scenario.
 
 {body}"""
+_RIGHT_HANDED = """\
+Everything is right-handed: x forward, y left, z up, yaw counter-clockwise; metres, seconds, \
+radians. Quaternions are
+w, x, y, z. Cameras have optical axes: x right, y down, z forward."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -111,6 +112,7 @@ class Output:
         folder: Folder that paths are relative to.
         parts: Folder of the unit's own files for `finish`.
         tally: The counts so far; the format itself counts samples.
+        contents: What the format says in the manifest about its files; only `finish` adds to it.
     """
 
     def __init__(
@@ -133,6 +135,7 @@ class Output:
         self.folder = folder
         self.parts = parts
         self.tally = Tally() if tally is None else tally
+        self.contents: dict[str, Any] = {}
         self._link = link
         self._note = note
 
@@ -307,6 +310,14 @@ class Format(ABC):
             units.append(Unit(name=flat_name(token), scenarios=(token,)))
         return units
 
+    def survey(self, dataset: Dataset, scenarios: Sequence[str], folder: Path) -> str:  # noqa: ARG002 - for other formats
+        """Check that the scenarios can be exported to a folder, before anything is written.
+
+        Returns:
+            A line about the files that will be exported, or an empty text.
+        """
+        return ""
+
     def check(self, dataset: Dataset, folder: Path) -> None:  # noqa: B027 - few formats add to one
         """Check that a folder contains the export to which this format adds files.
 
@@ -379,9 +390,17 @@ def divide_into_shards(
 
 
 def format_readme(
-    form: Format, dataset: Dataset, title: str, head: Mapping[str, Any], body: str
+    form: Format,
+    dataset: Dataset,
+    title: str,
+    head: Mapping[str, Any],
+    body: str,
+    axes: str = _RIGHT_HANDED,
 ) -> bytes:
-    """Return a README.md with a YAML head, the source and selection of the export, and a body."""
+    """Return a README.md with a YAML head, the source and selection of the export, and a body.
+
+    `axes` are the sentences about the axes of all values.
+    """
     import yaml
 
     conditions = []
@@ -397,5 +416,6 @@ def format_readme(
         devkit=__version__,
         version=dataset.version,
         selection=f"It contains {scenarios}, as recorded by {agents}.",
+        axes=axes,
         body=body,
     ).encode()

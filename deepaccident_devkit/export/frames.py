@@ -21,10 +21,13 @@ FrameFiles: TypeAlias = "dict[int, SensorFile]"
 """Sensor files by frame number."""
 
 
-def keyframes(frame_count: int) -> range:
-    """Return the frame numbers, from 1 to `frame_count`, of a recording's keyframes."""
-    first_keyframe = (frame_count - 1) % KEY_STEP + 1
-    return range(first_keyframe, frame_count + 1, KEY_STEP)
+def keyframes(frame_count: int, step: int = KEY_STEP) -> range:
+    """Return the frame numbers, from 1 to `frame_count`, of a recording's keyframes.
+
+    They are `step` frames apart.
+    """
+    first_keyframe = (frame_count - 1) % step + 1
+    return range(first_keyframe, frame_count + 1, step)
 
 
 def next_keyframe(number: int, frame_count: int) -> int:

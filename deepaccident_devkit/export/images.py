@@ -106,9 +106,9 @@ class ImageConfig:
     def __post_init__(self) -> None:
         """Check every field, and convert sequences to tuples."""
         if self.resize is not None:
-            self._set("resize", _check_pixels("resize", self.resize, "height and width", (1, 1)))
+            self._set("resize", check_pixels("resize", self.resize, "height and width", (1, 1)))
         if self.crop is not None:
-            crop = _check_pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1))
+            crop = check_pixels("crop", self.crop, "top, left, height and width", (0, 0, 1, 1))
             self._set("crop", crop)
             if self.resize is not None:
                 _check_crop(self.crop, self.resize)
@@ -129,7 +129,7 @@ class ImageConfig:
         self._set("cameras", cameras)
         if self.virtual_camera is not None:
             focal, *size = self.virtual_camera
-            height, width = _check_pixels("virtual_camera", size, "height and width", (1, 1))
+            height, width = check_pixels("virtual_camera", size, "height and width", (1, 1))
             self._set("virtual_camera", VirtualCamera(focal, height, width))
             has_other_size = (self.resize, self.crop) != (None, None)
             if not 0 < focal < math.inf or has_other_size:
@@ -322,12 +322,19 @@ def _group_rows(
     return groups
 
 
-def _check_pixels(
+def check_pixels(
     name: str, values: Iterable[SupportsIndex], meaning: str, minima: Sequence[int]
 ) -> tuple[int, ...]:
     """Return values as whole numbers of pixels.
 
-    Raises ConfigError if one is not a whole number, or is below its minimum.
+    Args:
+        name: Name of the argument, for the error.
+        values: Numbers of pixels.
+        meaning: Words for the numbers, such as `width and height`.
+        minima: Smallest possible value of each number.
+
+    Raises:
+        ConfigError: If one is not a whole number, or is below its minimum.
     """
     try:
         numbers = tuple(map(operator.index, values))

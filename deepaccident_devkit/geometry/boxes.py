@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import operator
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NoReturn, overload
+from itertools import repeat
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,11 +37,12 @@ from deepaccident_devkit.support.nuscenes_names import (
     without_names,
 )
 from deepaccident_devkit.support.text import PictureRepr, counted
-from deepaccident_devkit.taxonomy import CAMERAS, CATEGORIES
+from deepaccident_devkit.taxonomy import ACTOR, CAMERAS, CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 if TYPE_CHECKING:
     from pyquaternion import Quaternion
 
+_Value = TypeVar("_Value")
 CORNER_SIGNS = np.array(
     [
         [1, 1, 1],
@@ -83,6 +85,10 @@ class Boxes(FrozenArrays, PictureRepr):
         row: (N,) int64 row of the box in its label file, counted from 0.
         sample: Token of the sample whose label contains all boxes; None if the boxes come from
             several samples or from none.
+        scenario: Token of the scenario that all boxes come from; None if they come from several
+            scenarios or from none.
+        own_actor_id: CARLA id of the agent whose own row has the actor id −100; −1 if it is
+            unknown, or if there are such rows of several agents.
     """
 
     # Where the boxes are.
@@ -99,6 +105,8 @@ class Boxes(FrozenArrays, PictureRepr):
     # Which label they come from.
     row: IntArray
     sample: str | None = None
+    scenario: str | None = None
+    own_actor_id: int = UNTRACKED_ID
 
     def __post_init__(self) -> None:
         """Check shapes and numbers.
@@ -107,8 +115,10 @@ class Boxes(FrozenArrays, PictureRepr):
             GeometryError: If a shape is wrong or a number is invalid.
         """
         checked_frame("Boxes.frame", self.frame)
-        if not (self.sample is None or isinstance(self.sample, str)):
-            raise GeometryError(f"Boxes.sample: expected a token or None, found {self.sample!r}")
+        for name in ("sample", "scenario"):
+            token = getattr(self, name)
+            if not (token is None or isinstance(token, str)):
+                raise GeometryError(f"Boxes.{name}: expected a token or None, found {token!r}")
         count = len(checked("Boxes.center", self.center, (None, 3)))
         columns: dict[str, AnyArray] = {}
         for name, (shape, dtype) in BOX_COLUMNS.items():
@@ -202,15 +212,18 @@ class Boxes(FrozenArrays, PictureRepr):
         if not -len(self) <= number < len(self):
             raise IndexError(f"no box {number} among {counted(len(self), 'box')}")
         row = number % len(self)
-        token = None
-        if self.sample is not None:
-            token = f"{self.sample}/{self.row.item(row)}"
-        return Box(self._select(slice(row, row + 1)), token)
+        box = self._select(slice(row, row + 1))
+        token = None if box.token is None else box.token[0]
+        instance_token = None if box.instance_token is None else box.instance_token[0]
+        return Box(box, token, instance_token)
 
     def __iter__(self) -> Iterator[Box]:
         """Yield each box, which takes a few microseconds; for many boxes, use the arrays."""
-        for row in range(len(self)):
-            yield self[row]
+        tokens = self.token or repeat(None)
+        instance_tokens = self.instance_token or repeat(None)
+        rows = zip(range(len(self)), tokens, instance_tokens, strict=False)
+        for row, token, instance_token in rows:
+            yield Box(self._select(slice(row, row + 1)), token, instance_token)
 
     def __array__(self, dtype: object = None, copy: object = None) -> NoReturn:
         """Raise GeometryError, because boxes consist of several arrays.
@@ -234,6 +247,24 @@ class Boxes(FrozenArrays, PictureRepr):
         if self.sample is None:
             return None
         return [f"{self.sample}/{row}" for row in self.row.tolist()]
+
+    @property
+    def instance_token(self) -> list[str | None] | None:
+        """Tokens of the N actors, None for untracked ones; None if the scenario is not known."""
+        if self.scenario is None:
+            return None
+        prefix = f"{self.scenario}/{ACTOR}/"
+        own_token = None
+        if self.own_actor_id != UNTRACKED_ID:
+            own_token = f"{prefix}{self.own_actor_id}"
+        special_tokens = {OWN_ACTOR_ID: own_token, UNTRACKED_ID: None}
+        tokens = []
+        for actor_id in self.actor_id.tolist():
+            if actor_id in special_tokens:
+                tokens.append(special_tokens[actor_id])
+            else:
+                tokens.append(f"{prefix}{actor_id}")
+        return tokens
 
     @property
     def yaw(self) -> FloatArray:
@@ -285,6 +316,8 @@ class Boxes(FrozenArrays, PictureRepr):
                 "row": self.row,
             },
             self.sample,
+            self.scenario,
+            self.own_actor_id,
         )
 
     def corners(self) -> FloatArray:
@@ -370,7 +403,7 @@ class Boxes(FrozenArrays, PictureRepr):
         columns = {}
         for name in BOX_COLUMNS:
             columns[name] = getattr(self, name)[rows]
-        return trusted_boxes(self.frame, columns, self.sample)
+        return trusted_boxes(self.frame, columns, self.sample, self.scenario, self.own_actor_id)
 
     def _points_within(self, points: FloatArray) -> tuple[IntArray, IntArray]:
         """Return indices of boxes and of points (P, 3), one pair for each point in a box."""
@@ -404,18 +437,28 @@ class Boxes(FrozenArrays, PictureRepr):
             )
 
 
-def trusted_boxes(frame: str, columns: dict[str, AnyArray], sample: str | None = None) -> Boxes:
+def trusted_boxes(
+    frame: str,
+    columns: dict[str, AnyArray],
+    sample: str | None = None,
+    scenario: str | None = None,
+    own_actor_id: int = UNTRACKED_ID,
+) -> Boxes:
     """Return boxes from columns that are known to be correct, without checking them.
 
     Args:
         frame: Coordinate frame.
         columns: All columns of `Boxes`; arrays must be new or read-only, and are made read-only.
         sample: Token of the sample whose label contains all boxes, or None.
+        scenario: Token of the scenario that all boxes come from, or None.
+        own_actor_id: CARLA id of the agent whose own row has the id −100, or −1.
     """
     boxes = object.__new__(Boxes)
     set_field = object.__setattr__
     set_field(boxes, "frame", frame)
     set_field(boxes, "sample", sample)
+    set_field(boxes, "scenario", scenario)
+    set_field(boxes, "own_actor_id", own_actor_id)
     for name, array in columns.items():
         array.setflags(write=False)
         set_field(boxes, name, array)
@@ -437,9 +480,22 @@ def concatenate(parts: list[Boxes], frame: str) -> Boxes:
     columns = {}
     for name in BOX_COLUMNS:
         columns[name] = np.concatenate([getattr(part, name) for part in parts])
-    samples = {part.sample for part in parts}
-    sample = samples.pop() if len(samples) == 1 else None
-    return trusted_boxes(frame, columns, sample)
+    own_parts = [part for part in parts if (part.actor_id == OWN_ACTOR_ID).any()]
+    return trusted_boxes(
+        frame,
+        columns,
+        _common_value((part.sample for part in parts), None),
+        _common_value((part.scenario for part in parts), None),
+        _common_value((part.own_actor_id for part in own_parts), UNTRACKED_ID),
+    )
+
+
+def _common_value(values: Iterable[_Value], fallback: _Value) -> _Value:
+    """Return the value that all `values` equal, or the fallback if they differ or there is none."""
+    distinct = set(values)
+    if len(distinct) == 1:
+        return distinct.pop()
+    return fallback
 
 
 def _over_union(common: FloatArray, sizes: FloatArray, other_sizes: FloatArray) -> FloatArray:

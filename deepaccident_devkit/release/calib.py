@@ -154,9 +154,14 @@ def write_raw_calib(path: Path, raw: Mapping[str, AnyArray]) -> None:
     The arrays are not checked, so `read_calib` may refuse the file. Old numpy versions can read the
     file too.
     """
+    write_bytes(path, encode_raw_calib(raw))
+
+
+def encode_raw_calib(raw: Mapping[str, AnyArray]) -> bytes:
+    """Return the content of a file that `write_raw_calib` writes."""
     # Adding 0.0 removes negative zeros.
     arrays = {key: np.ascontiguousarray(array) + 0.0 for key, array in raw.items()}
-    write_bytes(path, pickled(arrays))
+    return pickled(arrays)
 
 
 def read_unchecked_calib(path: ReleasePath) -> RawCalib:

@@ -1,9 +1,10 @@
 """Camera images `Camera_*/*.jpg`."""
 
+import math
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from deepaccident_devkit.errors import MAX_REASON_LENGTH, SensorFileError, shortened
+from deepaccident_devkit.errors import MAX_REASON_LENGTH, ConfigError, SensorFileError, shortened
 from deepaccident_devkit.release.store import REMEDY, ReleasePath, read_content, real_path
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.files import write_bytes
@@ -32,6 +33,8 @@ _DECODING_ERRORS = (
 # Decoders of other formats may start programs.
 _FORMATS = ("JPEG", "PNG")
 _BYTES_PER_PIXEL = 3
+# Largest difference between the size of an image and twice the principal point.
+_SIZE_TOLERANCE_PX = 1
 # Height and width; for the header of an image, width and height.
 ImageSize: TypeAlias = tuple[int, int]
 # Any marker in a JPEG's data, the marker that starts a scan, and the marker of the end.
@@ -157,6 +160,57 @@ def read_jpeg(path: ReleasePath) -> tuple[bytes, ImageSize]:
     content = read_image_bytes(path)
     with _open_picture(path, content, _FORMATS[:1]) as image:
         return content, image.size
+
+
+def calib_fault(size: ImageSize, calib_size: Iterable[float]) -> str | None:
+    """Return how the width and height of an image contradict calib; None if they do not."""
+    width, height = calib_size
+    if np.allclose(size, (width, height), rtol=0, atol=_SIZE_TOLERANCE_PX):
+        return None
+    return f"is {size[0]}x{size[1]}, but calib is for {width:.0f}x{height:.0f}"
+
+
+def fitting_size(size: ImageSize | None, image_size: ImageSize) -> ImageSize:
+    """Return the width and height of resized images: `size`, or their own size for None.
+
+    Raises:
+        ConfigError: If `size` has another aspect ratio than the images, or exceeds their size.
+    """
+    if size is None:
+        return image_size
+    fault = aspect_fault(size, image_size)
+    if fault is not None:
+        raise ConfigError(f"size: {fault}")
+    return size
+
+
+def aspect_fault(size: ImageSize, image_size: ImageSize) -> str | None:
+    """Return why images cannot be resized to `size`, with a size that fits; None if they can.
+
+    A size fits if it is not larger than the images and keeps their aspect ratio up to rounding:
+    one side is the whole number that is nearest to what the other side requires.
+
+    Args:
+        size: Width and height that were asked for, pixels.
+        image_size: Width and height of the images, pixels.
+    """
+    width, height = size
+    full_width, full_height = image_size
+    is_smaller = 0 < width <= full_width and 0 < height <= full_height
+    distortion = abs(height * full_width - width * full_height)
+    is_undistorted = 2 * distortion <= max(image_size)
+    if is_smaller and is_undistorted:
+        return None
+    full_steps = math.gcd(full_width, full_height)
+    step_width = full_width // full_steps
+    step_height = full_height // full_steps
+    max_steps = min(width // step_width, height // step_height, full_steps)
+    steps = max_steps // 2 * 2 or full_steps  # videos need even sizes
+    return (
+        f"images of {full_width}x{full_height} cannot become {width}x{height} without being "
+        f"enlarged or distorted; choose a multiple of {step_width}x{step_height}, such as "
+        f"{steps * step_width}x{steps * step_height}"
+    )
 
 
 def write_image(path: Path, image: ByteArray) -> None:

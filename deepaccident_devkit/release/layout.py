@@ -487,11 +487,16 @@ def read_split_file(path: ReleasePath, *, raw: bool = False, unique: bool = Fals
 
 def write_split_file(path: Path, scenario_tokens: Sequence[str]) -> None:
     """Write scenario tokens to a split file, one per line."""
+    write_bytes(path, encode_split_file(scenario_tokens))
+
+
+def encode_split_file(scenario_tokens: Sequence[str]) -> bytes:
+    """Return the content of a split file with scenario tokens, one per line."""
     lines = []
     for token in scenario_tokens:
         scenario_type, name = token.split("/")
         lines.append(f"{scenario_type} {name}\n")
-    write_bytes(path, "".join(lines).encode())
+    return "".join(lines).encode()
 
 
 class MissingFiles:

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, MissingExtraError
+from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.accident import PAIR_LAYERS, draw_countdown
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
@@ -44,6 +43,7 @@ from deepaccident_devkit.render.visibility import (
 )
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.mp4 import check_pyav, write_mp4
 from deepaccident_devkit.support.parallel import Engine, Places, in_order, run_unordered
 from deepaccident_devkit.support.text import PathType, choice, path_of
 from deepaccident_devkit.tables.tokens import frame_token, sample_token
@@ -59,8 +59,6 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import FrameRecord
 
-# H.264 quality, from 0 (lossless) to 51 (worst).
-_CRF = "20"
 _WEBP_QUALITY = 70
 # Number of colours of a GIF; one more is reserved for pixels that do not change.
 _GIF_COLORS = 255
@@ -97,17 +95,7 @@ def check_target(path: Path, *, size: tuple[int, int], fps: float) -> None:
     if min(size) < 16:
         raise ChoiceError(f"size: expected width and height of at least 16 pixels, found {size}")
     if suffix == ".mp4":
-        _check_pyav(path)
-
-
-def _check_pyav(path: Path) -> None:
-    try:
-        import av  # noqa: F401 - whether it is installed
-    except ImportError:
-        raise MissingExtraError(
-            f"{path}: MP4 needs PyAV; run pip install '.[video]' in a checkout, "
-            "or choose .gif or .webp"
-        ) from None
+        check_pyav(f"{path}: MP4", ", or choose .gif or .webp")
 
 
 def write_video(path: Path, pictures: Iterable[ByteArray], *, fps: float) -> None:
@@ -119,30 +107,6 @@ def write_video(path: Path, pictures: Iterable[ByteArray], *, fps: float) -> Non
     with replacing(path) as temporary:
         write = SUFFIXES[path.suffix.lower()]
         write(temporary, pictures, fps)
-
-
-def _write_mp4(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
-    """Write H.264 in yuv420p, which browsers play, with the index at the start of the file.
-
-    Browsers can then start to play before they have loaded the whole file.
-    """
-    import av
-
-    options = {"movflags": "+faststart"}
-    with av.open(os.fspath(path), "w", format="mp4", options=options) as container:
-        stream = None
-        for picture in pictures:
-            if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
-                stream.height, stream.width = picture.shape[:2]
-                stream.pix_fmt = "yuv420p"
-                # in a virtual machine, x264's AVX-512 code produced different bytes for the same
-                # pictures in 2 of 100 files
-                stream.options = {"crf": _CRF, "x264-params": "asm=sse4.2"}
-                stream.codec_context.thread_count = 1  # the bytes depend on the number of threads
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        if stream is not None:
-            container.mux(stream.encode(None))
 
 
 def _write_gif(path: Path, pictures: Iterable[ByteArray], fps: float) -> None:
@@ -182,7 +146,7 @@ def _save_animation(path: Path, images: Sequence[Image], fps: float, **options: 
 
 # Function that writes each kind of file, by suffix.
 SUFFIXES: Final[Mapping[str, Callable[[Path, Iterable[ByteArray], float], None]]] = {
-    ".mp4": _write_mp4,
+    ".mp4": write_mp4,
     ".gif": _write_gif,
     ".webp": _write_webp,
 }

@@ -134,19 +134,31 @@ def distinct_names(paths: Sequence[PathType]) -> list[str]:
     return last_parts
 
 
-def fixed_text(value: float, digits: int) -> str:
-    """Return a number as text with `digits` decimals, a minus sign, and no sign on zero."""
+def fixed_text(value: float, digits: int, sign: str = "") -> str:
+    """Return a number as text with `digits` decimals, a minus sign, and no sign on zero.
+
+    With `sign="+"`, positive numbers have a plus sign.
+    """
     rounded = round(float(value), digits) + 0.0  # adding 0.0 removes a negative zero
-    return with_minus(f"{rounded:.{digits}f}")
+    text = with_minus(f"{rounded:.{digits}f}")
+    return sign + text if rounded > 0 else text
 
 
-def number_text(value: float | None, digits: int = 1) -> str:
-    """Return a number with `digits` decimals; a dash for None and NaN, `never` for infinity."""
+def number_text(value: float | None, digits: int = 1, sign: str = "") -> str:
+    """Return a number like `fixed_text`; a dash for None and NaN, `never` for infinity."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
         return "never"
-    return fixed_text(value, digits)
+    return fixed_text(value, digits, sign)
+
+
+def interval_text(low: float | None, high: float | None, digits: int = 3, sign: str = "") -> str:
+    """Return an interval, such as `[0.25, 0.50]`; a dash if an end is None or NaN."""
+    ends = [number_text(end, digits, sign) for end in (low, high)]
+    if "–" in ends:
+        return "–"
+    return f"[{ends[0]}, {ends[1]}]"
 
 
 def share_text(count: int, total: int) -> str:

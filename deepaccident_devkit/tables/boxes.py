@@ -265,6 +265,11 @@ class VelocityFit(ShortRepr):
             return name
         return None
 
+    def to_text(self) -> str:
+        """Return the share of boxes that fit each frame as text, for one or more boxes."""
+        shares = [f"{name} {100 * count / self.boxes:.0f} %" for name, count in self.fits.items()]
+        return f"share of the {self.boxes:,} moving boxes that fit: {', '.join(shares)}"
+
 
 def total_fit(fits: list[VelocityFit]) -> VelocityFit:
     """Return the sum of several scenarios' counts."""

@@ -17,8 +17,7 @@ from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.tables.arrow_files import damaged_value
 from deepaccident_devkit.tables.columns import Choice, Column, Key, Struct, Subset, Vector
 from deepaccident_devkit.tables.records import table_spec
-from deepaccident_devkit.tables.tokens import ACTOR
-from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
+from deepaccident_devkit.taxonomy import ACTOR, AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.tables import OpenTables

@@ -14,9 +14,8 @@ import numpy as np
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.support.text import counted, meant_text
 from deepaccident_devkit.tables.arrow_files import damaged_value
-from deepaccident_devkit.taxonomy import AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
+from deepaccident_devkit.taxonomy import ACTOR, AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
-ACTOR = "actor"
 FORMS = {
     "scenario": "<scenario_type>/<name>",
     "agent": "<scenario>/<agent>",

@@ -1,5 +1,6 @@
 """Agents and their radio links: cooperation, merged views, poses, tracks and accidents."""
 
+from deepaccident_devkit.v2x.agent_motion import MIN_CURVATURE_SPEED, AgentMotion, agent_motion
 from deepaccident_devkit.v2x.agents import (
     AGENT_CONFIGS,
     AGENT_SETS,
@@ -30,13 +31,17 @@ from deepaccident_devkit.v2x.poses import (
     relative_pose_to_ego,
     transform,
 )
+from deepaccident_devkit.v2x.track_window import TrackWindow, stack_windows
 from deepaccident_devkit.v2x.tracks import Trajectory, trajectory
+from deepaccident_devkit.v2x.windows import WindowConfig, window, windows
 
 __all__ = [
     "AGENT_CONFIGS",
     "AGENT_SETS",
     "AVAILABLE",
+    "MIN_CURVATURE_SPEED",
     "AgentConfig",
+    "AgentMotion",
     "Agents",
     "Contact",
     "CooperativeView",
@@ -44,10 +49,13 @@ __all__ = [
     "Link",
     "MessageSize",
     "PoseNoise",
+    "TrackWindow",
     "Trajectory",
+    "WindowConfig",
     "accident_visibility",
     "accident_visible",
     "accident_visible_mask",
+    "agent_motion",
     "aggregate_point_cloud",
     "collision",
     "cooperating_agents",
@@ -60,7 +68,10 @@ __all__ = [
     "pair_in_view",
     "project_to_image",
     "relative_pose_to_ego",
+    "stack_windows",
     "trajectory",
     "transform",
     "visible_instances",
+    "window",
+    "windows",
 ]

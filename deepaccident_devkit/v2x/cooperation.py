@@ -298,7 +298,7 @@ def _merge_by_actor(boxes: Boxes, actor_ids: IntArray, agents: AnyArray) -> Coop
         [seen_by_camera, boxes.camera_visible[untracked_rows]]
     )
     return CooperativeView(
-        boxes=trusted_boxes(boxes.frame, columns),
+        boxes=trusted_boxes(boxes.frame, columns, scenario=boxes.scenario),
         source=agents[rows],
         seen_by=np.concatenate([seen_by, bits[untracked_rows]]),
     )

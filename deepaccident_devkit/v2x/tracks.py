@@ -9,6 +9,7 @@ from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.tables.tables import token_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,6 +162,7 @@ def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
             "camera_visible": np.zeros(count, dtype=bool),
             "row": np.arange(count),
         },
+        scenario=token_of(scenario),
     )
     index = frame_rows[rows].astype(np.int64) - first_frame + 1
     agents = tracks["agents"][rows]

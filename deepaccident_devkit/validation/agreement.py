@@ -142,7 +142,7 @@ def _difference_text(
     actors = actors_text(views.actor[differs])
     frames = frames_text(views.frame[differs])
     return (
-        f"{actors} in {frames} ({share:.0%} of what both see), worst "
+        f"{actors} in {frames} ({100 * share:.0f} % of what both see), worst "
         f"actor {views.actor[row]} at frame {views.frame[row]}: {unit.format(values[row])}"
     )
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from deepaccident_devkit.errors import ReleaseError, TokenError
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, find_release
 from deepaccident_devkit.release.layout import frame_sizes
+from deepaccident_devkit.release.part import PartManifest, read_part_manifest, recording_name
 from deepaccident_devkit.release.store import Dataroot, open_dataroot, places_of, refused_archives
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.parallel import Places, run_batch
@@ -104,6 +105,8 @@ class Completeness(Report):
         lacking: Incomplete scenario → kind of file → number of missing files, over all agents.
         unreadable_archives: A sentence per unreadable archive, with the fault and the remedy. Files
             that it may contain count as missing.
+        is_part: Whether the release is a part that `deepaccident export release` wrote. Only the
+            files that its manifest names are expected.
     """
 
     dataroot: str
@@ -114,6 +117,7 @@ class Completeness(Report):
     splits: Mapping[str, SplitFiles]
     lacking: Mapping[str, Mapping[str, int]]
     unreadable_archives: Sequence[str]
+    is_part: bool = False
 
     def to_text(self) -> str:
         """Return text for a terminal: unreadable archives, splits, then incomplete scenarios."""
@@ -125,8 +129,9 @@ class Completeness(Report):
         """Return the text without the release's name, for use in another report."""
         total = self.total
         present = total.expected - total.missing
+        release = "this part of a release" if self.is_part else "the release"
         head = (
-            f"{counted(self.scenarios, 'scenario')} in the release, {self.whole:,} complete\n"
+            f"{counted(self.scenarios, 'scenario')} in {release}, {self.whole:,} complete\n"
             f"files present: {present:,} of {total.expected:,} ({size_text(total.bytes)})"
             f", missing: {total.missing:,}"
         )
@@ -159,8 +164,9 @@ def release_completeness(
 
     For each frame of a scenario, every agent is expected to have a file of every kind. The frames
     are known from the calib and label files. In the test split, label, BEV camera and meta files
-    are not expected. Broken scenarios count, too. A folder that cannot be listed counts as empty;
-    `validate_release` reports it.
+    are not expected; in a part of a release, only the files that its manifest names are. Broken
+    scenarios count, too. A folder that cannot be listed counts as empty; `validate_release` reports
+    it.
 
     Args:
         root: Dataroot of the release, as for `DeepAccident`: a folder, archives, or a URL.
@@ -181,7 +187,11 @@ def release_completeness(
     files = run_batch(files_of, folders, label="Listing files", places=places, **engine)
     tokens = [folder.token for folder in folders]
     return completeness(
-        layout, zip(tokens, files, strict=True), str(root), selected=scenarios is not None
+        layout,
+        zip(tokens, files, strict=True),
+        str(root),
+        selected=scenarios is not None,
+        part=read_part_manifest(layout.root),
     )
 
 
@@ -263,6 +273,7 @@ def completeness(
     dataroot: str,
     *,
     selected: bool,
+    part: PartManifest | None,
 ) -> Completeness:
     """Sum up the file counts of scenarios.
 
@@ -271,6 +282,8 @@ def completeness(
         counts_by_token: Token of each scenario, with its file counts.
         dataroot: Folder of the release.
         selected: Whether these are only a selection of the release's scenarios.
+        part: Manifest of a part of a release, which says what files are expected; None for a whole
+            release.
     """
     split_of = assign_splits(layout).split_of
     is_mini = layout.version == "v1-mini"
@@ -284,6 +297,7 @@ def completeness(
         if not is_mini:
             split = split_of.get(token, _UNKNOWN_SPLIT)
         counts = [_expect_in_split(split, count) for count in scenario_counts]
+        counts = _expect_in_part(part, token, counts)
         counts_by_split.setdefault(split, {})[token] = counts
         all_counts += counts
         missing_kinds = Counter[str]()
@@ -295,7 +309,7 @@ def completeness(
     expected: Mapping[str, int] = EXPECTED_SCENARIOS
     if is_mini:
         expected = {layout.version: EXPECTED_MINI_SCENARIOS}
-    if selected:
+    if selected or part is not None:
         expected = {}
     splits = {}
     for split in (*SPLITS, layout.version, _UNKNOWN_SPLIT):
@@ -312,6 +326,7 @@ def completeness(
         splits=splits,
         lacking=dict(sorted(lacking.items())),
         unreadable_archives=refused_archives(layout.root),
+        is_part=part is not None,
     )
 
 
@@ -335,6 +350,28 @@ def _expect_in_split(split: str, count: FileCount) -> FileCount:
     if is_optional and count.missing == count.expected:
         return replace(count, expected=0, missing=0)
     return count
+
+
+def _expect_in_part(
+    part: PartManifest | None, token: str, counts: list[FileCount]
+) -> list[FileCount]:
+    """Adapt a scenario's counts to what a part of a release should have, if it names the scenario.
+
+    Args:
+        part: Manifest of the part; None for a whole release.
+        token: Token of the scenario.
+        counts: Counts of the scenario's files.
+    """
+    if part is None or token not in part.contents:
+        return counts
+    content = part.contents[token]
+    adapted_counts = []
+    for count in counts:
+        present = count.expected - count.missing
+        expected = content.get(recording_name(count.agent, count.channel), 0)
+        missing = max(expected - present, 0)
+        adapted_counts.append(replace(count, expected=expected, missing=missing))
+    return adapted_counts
 
 
 def _split_files(

@@ -4,16 +4,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import BoolArray, IntArray
 from deepaccident_devkit.tables.boxes import MIN_BOXES, VelocityFit, match_velocities
 from deepaccident_devkit.tables.build import ROTATION_TOLERANCE, TRANSLATION_TOLERANCE
 from deepaccident_devkit.taxonomy import (
     CAMERAS,
-    FRAME_PERIOD,
     RELEASED_VELOCITY_FRAME,
     UNTRACKED_ID,
     VELOCITY_FRAMES,
 )
+from deepaccident_devkit.v2x.agent_motion import differentiate
 from deepaccident_devkit.validation.agreement import SAME_POSITION_M
 from deepaccident_devkit.validation.subject import (
     CAR_CODES,
@@ -200,7 +200,7 @@ def _check_speed(subject: Subject, agent: int) -> Findings:
     num_frames = subject.num_frames
     start = labelled_agents.index(name) * num_frames
     labelled = subject.files.labels.agent_velocity[start : start + num_frames]
-    measured = _differentiate(subject.positions[agent, :, :2])
+    measured = differentiate(subject.positions[agent, :, :2])
     error = np.linalg.norm(labelled - measured, axis=1)
     speed = np.linalg.norm(measured, axis=1)
     tolerance = _SPEED_TOLERANCE_MPS + _SPEED_TOLERANCE_SHARE * speed
@@ -213,16 +213,6 @@ def _check_speed(subject: Subject, agent: int) -> Findings:
         message += "from the displacement"
         message += f", {_frames_in_mask(differs)}"
         yield subject.label_finding("speed-off", agent, message)
-
-
-def _differentiate(position: FloatArray) -> FloatArray:
-    """Differentiate positions (F, 2) sampled at 10 Hz; return velocities (F, 2) in m/s.
-
-    Differences are one-sided at the ends, and 0 for a single frame.
-    """
-    if len(position) < 2:
-        return np.zeros_like(position)
-    return np.gradient(position, FRAME_PERIOD, axis=0)
 
 
 _POSE_CHECKS: tuple[Callable[[Subject, int], Findings], ...] = (
@@ -242,8 +232,7 @@ def check_velocities(subject: Subject, fit: VelocityFit) -> Findings:
         yield from _check_actor_velocities(subject, fit.best)
     if fit.best == RELEASED_VELOCITY_FRAME:
         return
-    shares = [f"{name} {count / fit.boxes:.0%}" for name, count in fit.fits.items()]
-    message = f"share of the {fit.boxes:,} moving boxes that fit: {', '.join(shares)}"
+    message = fit.to_text()
     code = "velocity-unexplained"
     if fit.best:
         message = f"they are in {VELOCITY_FRAMES[fit.best]}; {message}"

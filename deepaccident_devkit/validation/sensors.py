@@ -6,6 +6,7 @@ Pillow only reports a JPEG that is truncated.
 import hashlib
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any
@@ -15,7 +16,12 @@ import numpy as np
 from deepaccident_devkit.errors import ReleaseError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.release import read_bev, read_lidar
-from deepaccident_devkit.release.images import decode_image, read_image_bytes
+from deepaccident_devkit.release.images import (
+    calib_fault,
+    decode_image,
+    image_size,
+    read_image_bytes,
+)
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
@@ -196,6 +202,17 @@ def check_sensors(subject: Subject, inventory: Inventory) -> Findings:
     yield from _repeated_files(subject, recordings)
 
 
+def check_first_images(subject: Subject, inventory: Inventory) -> Findings:
+    """Compare the size of each camera's first image with K, without decoding it."""
+    for (agent, channel), frames in inventory.items():
+        frame = frames[0]
+        if channel in CAMERAS and frame <= subject.num_frames:
+            row = subject.agents.index(agent)
+            path = subject.files.scenario.channel_path(agent, channel, frame)
+            with suppress(ReleaseError):  # the deep check reports what cannot be read
+                yield from _check_image_sizes(subject, row, channel, {frame: image_size(path)})
+
+
 def _check_images(
     subject: Subject,
     agent: int,
@@ -266,17 +283,21 @@ def _collides(subject: Subject, agent: int) -> bool:
 def _check_image_sizes(
     subject: Subject, agent: int, channel: str, sizes: Mapping[int, tuple[int, int]]
 ) -> Findings:
-    """Compare the size of each image with K: it should be twice the principal point."""
+    """Compare the sizes of images with K, whose principal point should be in the middle.
+
+    Images with the same fault share a finding about the first of them.
+    """
     camera = CAMERAS.index(channel)
+    frames_by_fault: dict[str, list[int]] = {}
     for frame, size in sizes.items():
         row = agent * subject.num_frames + frame - 1
         principal_point = subject.files.calibs.intrinsic[row, camera, :2, 2]
-        expected = 2 * principal_point
-        difference = np.abs(expected - size)
-        if difference.max() > 1:
-            path = subject.files.scenario.channel_path(subject.agents[agent], channel, frame)
-            message = f"is {size[0]}x{size[1]}, but K says {expected[0]:.0f}x{expected[1]:.0f}"
-            yield subject.finding("image-size", str(path), message)
+        fault = calib_fault(size, 2 * principal_point)
+        if fault is not None:
+            frames_by_fault.setdefault(fault, []).append(frame)
+    for fault, frames in frames_by_fault.items():
+        path = subject.files.scenario.channel_path(subject.agents[agent], channel, frames[0])
+        yield subject.finding("image-size", str(path), f"{fault} ({frames_text(frames)})")
 
 
 def out_of_sequence(thumbnails: Mapping[int, FloatArray]) -> list[int]:

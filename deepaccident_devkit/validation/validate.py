@@ -19,6 +19,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, IndexStoreError, ReleaseError
 from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder
 from deepaccident_devkit.release.layout import find_ignored_paths, names_without_calib
+from deepaccident_devkit.release.part import PartManifest, read_part_manifest
 from deepaccident_devkit.release.store import (
     Dataroot,
     StorePath,
@@ -55,7 +56,7 @@ from deepaccident_devkit.validation.completeness import (
 from deepaccident_devkit.validation.inventory import absences, check_split_files, take_inventory
 from deepaccident_devkit.validation.labels import check_labels
 from deepaccident_devkit.validation.poses import check_poses, check_untracked, check_velocities
-from deepaccident_devkit.validation.sensors import check_sensors
+from deepaccident_devkit.validation.sensors import check_first_images, check_sensors
 from deepaccident_devkit.validation.subject import Findings, make_finding, subject_of
 
 if TYPE_CHECKING:
@@ -244,11 +245,7 @@ class ValidationReport(CheckReport):
         scenarios = ", ".join(
             f"{name or 'unknown'} in {counted(count, 'scenario')}" for name, count in counts
         )
-        shares = ", ".join(f"{name} {count / fit.boxes:.0%}" for name, count in fit.fits.items())
-        return (
-            f"label velocities: {best_frame}\n"
-            f"  {scenarios}; share of the {fit.boxes:,} moving boxes that fit: {shares}"
-        )
+        return f"label velocities: {best_frame}\n  {scenarios}; {fit.to_text()}"
 
 
 def worst_first(findings: Sequence[Finding]) -> list[Finding]:
@@ -370,14 +367,15 @@ def _make_report(
     deep: bool,
 ) -> ValidationReport:
     """Build the report from the scenarios' checks, and find faults of the release itself."""
+    part = read_part_manifest(layout.root)
     readable, split_findings = check_split_files(layout)
     tokens = {None, *(check.token for check in checks)}
     all_findings = [finding for finding in split_findings if finding.scenario in tokens]
     if scenarios is None:
-        all_findings += _find_strays(layout)
+        all_findings += _find_strays(layout, part)
     all_findings += _find_outdated(layout, checks)
     counts = ((check.token, check.files) for check in checks)
-    files = completeness(readable, counts, str(root), selected=scenarios is not None)
+    files = completeness(readable, counts, str(root), selected=scenarios is not None, part=part)
     for sentence in files.unreadable_archives:
         error = ReleaseError(sentence)
         all_findings.append(finding_of(error, "archive-unreadable", None))
@@ -387,6 +385,10 @@ def _make_report(
         for count in check.files:
             if deep or count.channel in _SMALL_KINDS:
                 compared[f"{count.channel} files"] += count.expected - count.missing
+    if part is not None:
+        # The manifest says which agents are there.
+        all_findings = [finding for finding in all_findings if finding.code != "agent-missing"]
+        all_findings += _find_missing_in_part(part, files)
     return ValidationReport(
         compared=dict(compared),
         dataroot=str(root),
@@ -447,6 +449,8 @@ def check_scenario(scenario: ScenarioFolder, *, deep: bool = False) -> ScenarioC
             scenario_findings += check_story(subject)
             if deep:
                 scenario_findings += check_sensors(subject, inventory)
+            elif "intrinsic-form" not in {finding.code for finding in scenario_findings}:
+                scenario_findings += check_first_images(subject, inventory)
     return ScenarioCheck(
         token=scenario.token,
         findings=tuple(scenario_findings),
@@ -472,8 +476,27 @@ def _find_outdated(layout: ReleaseLayout, checks: Sequence[ScenarioCheck]) -> Fi
                 yield make_finding("index-outdated", check.token, check.token, message)
 
 
-def _find_strays(layout: ReleaseLayout) -> Findings:
-    """Yield findings about files and folders that look like parts of a release but are unused."""
+def _find_missing_in_part(part: PartManifest, files: Completeness) -> Findings:
+    """Yield findings about files and scenarios that the manifest of a part names, but it lacks."""
+    code = "part-incomplete"
+    if part.release is None:
+        yield make_finding(code, None, files.dataroot, "the export of this part was interrupted")
+    for token, kinds in files.lacking.items():
+        counts = [counted(count, f"{kind} file") for kind, count in kinds.items()]
+        yield make_finding(code, token, token, f"lacks {', '.join(counts)}")
+
+
+def _find_strays(layout: ReleaseLayout, part: PartManifest | None) -> Findings:
+    """Yield findings about scenarios that a part lacks, and about unused files and folders.
+
+    They look like parts of a release. `part` is the manifest of a part of a release, or None.
+    """
+    if part is not None:
+        present = {scenario.token for scenario in layout.scenarios}
+        for token in part.contents:
+            if token not in present:
+                message = f"lacks the scenario {token}"
+                yield make_finding("part-incomplete", None, str(layout.root), message)
     for folder, name in names_without_calib(layout):
         location = str(folder / "*" / "calib" / name)
         message = "has labels, meta or sensor files but no calib files, and is excluded"

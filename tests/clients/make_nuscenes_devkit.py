@@ -1,7 +1,7 @@
 """Make the input of `nuscenes_devkit.py`: `python -m tests.clients.make_nuscenes_devkit FOLDER`.
 
-FOLDER gets a small release, its export, and `expected.json`: our boxes in every sensor's frame at
-keyframes, and in the world at all frames.
+FOLDER gets a small release, its export, `expected.json`: our boxes in every sensor's frame at
+keyframes, and in the world at all frames, and `windows.json`: our windows of tracks at keyframes.
 """
 
 import json
@@ -29,10 +29,13 @@ def main(folder: Path) -> None:
     dataset = DeepAccident("v1", make_release(folder / "release", config), verbose=False)
     export_release(dataset, folder / "export", NuScenes(agents=AGENTS))
     boxes = {}
+    windows = {}
     for record in dataset.sample:
         if record["agent"] in AGENTS:
             boxes[record["token"]] = list_boxes(dataset, record["token"])
+            windows[record["token"]] = list_states(dataset, record["token"])
     (folder / "expected.json").write_text(json.dumps(boxes))
+    (folder / "windows.json").write_text(json.dumps(windows))
 
 
 def list_boxes(dataset: DeepAccident, sample: str) -> dict[str, Any]:
@@ -55,6 +58,28 @@ def list_boxes(dataset: DeepAccident, sample: str) -> dict[str, Any]:
         ]
         boxes_by_frame[name] = np.column_stack(columns).tolist()
     return boxes_by_frame
+
+
+def list_states(dataset: DeepAccident, sample: str) -> dict[str, Any]:
+    """List the valid states of each actor but the agent's own vehicle as [step of 0.5 s, x, y, x in
+    the actor's frame, y in that frame], by actor id.
+    """
+    times = {"past": 2.0, "future": 3.0, "step": 0.5}
+    in_world, in_actor = (
+        dataset.window(sample, **times, agents="single", frame=frame)
+        for frame in ("world", "actor")
+    )
+    states_by_actor = {}
+    for row, actor in enumerate(in_world.actor_id.tolist()):
+        if actor != in_world.own_actor_id:
+            steps = np.flatnonzero(in_world.valid[row])
+            columns = [
+                steps - in_world.present,
+                in_world.center[row, steps, :2],
+                in_actor.center[row, steps, :2],
+            ]
+            states_by_actor[actor] = np.column_stack(columns).tolist()
+    return states_by_actor
 
 
 if __name__ == "__main__":

@@ -52,12 +52,12 @@ def run_checks(folder: Path) -> str:
     sweep_error_m = check_sweeps(nusc, expected)
     check_points(nusc)
     check_rendering(nusc, folder)
-    check_futures(nusc)
+    num_states = check_windows(nusc, json.loads((folder / "windows.json").read_text()))
     detected_classes = check_detection(nusc, folder)
     tracked_classes = check_tracking(nusc, folder)
     return (
         f"nuscenes-devkit: {num_boxes} boxes in sensor frames within 1e-3 m, at sweeps "
-        f"within {sweep_error_m:.2f} m, rendered; "
+        f"within {sweep_error_m:.2f} m, rendered; {num_states} states of windows; "
         f"AP 1.0 of {detected_classes}, MOTA 1.0 of {tracked_classes}; "
         f"{memory_per_sample / 1000:.0f} kB of memory a sample: good"
     )
@@ -171,26 +171,45 @@ def check_rendering(nusc: NuScenes, folder: Path) -> None:
     assert picture.stat().st_size > 1000
 
 
-def check_futures(nusc: NuScenes) -> None:
-    """Check that the prediction helper returns an actor's path in the next two seconds."""
+def check_windows(nusc: NuScenes, windows: dict) -> int:
+    """Check that the prediction helper returns the states of our windows before and after each
+    keyframe, in the world and in the actor's frame; return their number.
+    """
     helper = PredictHelper(nusc)
-    num_whole_paths = 0
+    num_states = 0
     for sample in nusc.sample:
+        states_by_actor = windows[sample["deepaccident_token"]]
         for token in sample["anns"]:
             record = nusc.get("sample_annotation", token)
-            path = []
-            while record["next"] and len(path) < 4:
-                record = nusc.get("sample_annotation", record["next"])
-                path.append(record["translation"][:2])
-            predicted = helper.get_future_for_agent(
-                record["instance_token"], sample["token"], 2, in_agent_frame=False
-            )
+            if record["actor_id"] == -1:
+                continue
+            ours = np.array(states_by_actor.pop(str(record["actor_id"])))
+            agent = (record["instance_token"], sample["token"])
+            for get_states, seconds, is_side in (
+                (helper.get_past_for_agent, 2, ours[:, 0] < 0),
+                (helper.get_future_for_agent, 3, ours[:, 0] > 0),
+            ):
+                rows = get_states(*agent, seconds, in_agent_frame=False, just_xy=False)
+                in_actor = get_states(*agent, seconds, in_agent_frame=True)
+                # Theirs begin next to the present, and have y forward and x to the right.
+                x, y = np.reshape(in_actor, (-1, 2)).T
+                theirs = []
+                for row, forward, left in zip(rows, y, -x, strict=True):
+                    elapsed = nusc.get("sample", row["sample_token"])["timestamp"]
+                    step = round((elapsed - sample["timestamp"]) / 5e5)
+                    theirs.append([step, *row["translation"][:2], forward, left])
+                theirs = np.reshape(sorted(theirs), (-1, 5))
 
-            assert np.allclose(predicted.reshape(-1, 2), np.reshape(path, (-1, 2)))
+                assert np.array_equal(theirs[:, 0], ours[is_side, 0])
+                assert np.abs(theirs - ours[is_side]).max(initial=0) < 1e-3
 
-            num_whole_paths += len(path) == 4
+                num_states += len(theirs)
 
-    assert num_whole_paths > 100
+        assert not states_by_actor
+
+    assert num_states > 1000
+
+    return num_states
 
 
 def write_results(

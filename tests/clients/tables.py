@@ -1,10 +1,8 @@
-"""Open the exports of make_tables.py with datasets, Polars, DuckDB, pandas and webdataset, without
-the devkit.
+"""Open the exports of make_tables.py with datasets, Polars, DuckDB and pandas, without the devkit.
 
 It also runs the code of docs/exports.md that is marked with one of these names.
 """
 
-import hashlib
 import io
 import json
 import math
@@ -12,7 +10,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from itertools import product
 from pathlib import Path
@@ -23,17 +21,13 @@ os.environ.update(HF_HOME=_CACHE.name, HF_HUB_OFFLINE="1", HF_DATASETS_DISABLE_P
 
 import datasets  # noqa: E402 - which reads the variables once
 import duckdb  # noqa: E402
-import numpy as np  # noqa: E402
 import pandas as pd  # noqa: E402
 import polars as pl  # noqa: E402
-import webdataset as wds  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "exports.md"
-CLIENTS = ("datasets", "duckdb", "polars", "webdataset")
+CLIENTS = ("datasets", "duckdb", "polars")
 Rows = tuple[int, Callable[[int], dict[str, Any]]]
 """Number of rows, and a function that returns the row at a position."""
-Images = tuple[Any, Any]
-"""Encoded images of the front and back left cameras; None for a missing one."""
 
 
 def list_files(table: str, split: str) -> list[str]:
@@ -126,79 +120,12 @@ def check_queries(expected: dict[str, Any]) -> int:
     return len(blocks) + 1
 
 
-def check_sample(sample: dict[str, Any], expected: dict[str, Any], images: Images) -> None:
-    points = np.array(sample["lidar.npy"], dtype=np.float32)
-    assert points.shape == (expected["count"], 4)
-    assert digest(points.tobytes()) == expected["points"]
-
-    digests = [None if image is None else digest(image) for image in images]
-    assert digests == [expected["front"], expected["back"]]
-
-    facts = sample["json"]
-    world_from_lidar = np.array(facts["world_from_ego"]) @ facts["ego_from_lidar"]
-    assert np.allclose(world_from_lidar, expected["world_from_lidar"], atol=1e-9)
-
-    boxes = facts["boxes"]
-    centers = np.array(boxes["center"]).reshape(-1, 3)
-    centers_in_world = centers @ world_from_lidar[:3, :3].T + world_from_lidar[:3, 3]
-    assert np.allclose(centers_in_world, np.reshape(expected["centers"], (-1, 3)))
-    assert equals(boxes["velocity"], expected["velocities"])
-    assert len({len(column) for column in boxes.values()}) == 1
-    assert facts["cameras"]["camera_back_left"]["intrinsic"] == expected["intrinsic"]
-    assert facts["time_to_impact"] == expected["time_to_impact"]
-
-
-def digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
-def read_with_webdataset(split: str) -> Iterator[tuple[dict[str, Any], Images]]:
-    paths = sorted(map(str, Path("out/shards").glob(f"{split}-*.tar")))
-    encoded_samples = iter(wds.WebDataset(paths, shardshuffle=False))
-    for sample in wds.WebDataset(paths, shardshuffle=False).decode("rgb8"):
-        encoded = next(encoded_samples)
-        assert sample["camera_back_left.jpg"].shape == (36, 64, 3)
-        yield sample, (encoded.get("camera_front.jpg"), encoded["camera_back_left.jpg"])
-
-
-def read_with_datasets(split: str) -> Iterator[tuple[dict[str, Any], Images]]:
-    samples = datasets.load_dataset("out/shards", split=split)
-    assert samples[0]["camera_back_left.jpg"].size == (64, 36)
-
-    image_names = ("camera_front.jpg", "camera_back_left.jpg")
-    for name in image_names:
-        samples = samples.cast_column(name, datasets.Image(decode=False))
-    for sample in samples:
-        yield sample, tuple(sample[name] and sample[name]["bytes"] for name in image_names)
-
-
-def check_shards(shards: dict[str, Any]) -> int:
-    num_compared = 0
-    readers = (read_with_webdataset, read_with_datasets)
-    for (split, expected), reader in product(shards.items(), readers):
-        keys = []
-        for sample, images in reader(split):
-            keys.append(sample["__key__"])
-            check_sample(
-                sample,
-                expected[keys[-1]],
-                images,
-            )
-        assert sorted(keys) == sorted(expected)
-        parts = [key.split("/") for key in keys]
-        moments = [(kind, name, frame) for kind, name, _, frame in parts]
-        assert moments == sorted(moments)
-        num_compared += len(keys)
-    return num_compared
-
-
 def main(folder: Path) -> None:
     os.chdir(folder)
     expected = json.loads(Path("expected.json").read_text())
     print(
-        f"tables: {check_tables(expected['tables'])} rows, "
-        f"{check_queries(expected['queries'])} blocks of code and "
-        f"{check_shards(expected['shards'])} samples in shards good"
+        f"tables: {check_tables(expected['tables'])} rows and "
+        f"{check_queries(expected['queries'])} blocks of code good"
     )
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.export.bulk import export_release
+from deepaccident_devkit.export.release import ReleasePart
 from deepaccident_devkit.export.released_infos import ReleasedInfos
 
 
@@ -25,9 +26,13 @@ def golden(request: pytest.FixtureRequest) -> Path:
     return folder
 
 
-def test_every_info_is_equal(golden: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("of_part", [False, True])
+def test_every_info_is_equal(golden: Path, tmp_path: Path, of_part: bool) -> None:
     shutil.copytree(golden / "release", tmp_path / "release")
     dataset = DeepAccident("v1", tmp_path / "release", index_dir=tmp_path / "index", verbose=False)
+    if of_part:
+        export_release(dataset, tmp_path / "part", ReleasePart(split="train"), workers=1)
+        dataset = DeepAccident("v1", tmp_path / "part", verbose=False)
     export_release(dataset, tmp_path / "out", ReleasedInfos())
 
     content = pickle.loads((tmp_path / "out/carla_infos_train.pkl").read_bytes())

@@ -9,6 +9,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from support.expected_errors import assert_raises
+from torch.utils.data import DataLoader
 from torch_extra.items import load_item
 
 from deepaccident_devkit import DeepAccident
@@ -24,8 +25,15 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig
 from deepaccident_devkit.motion.sample_labels import motion_labels
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
-from deepaccident_devkit.training.torch import AllEgosDataset, ImageConfig, V2XConfig, V2XDataset
-from deepaccident_devkit.v2x import AGENT_CONFIGS, cooperating_agents
+from deepaccident_devkit.training.torch import (
+    AllEgosDataset,
+    ImageConfig,
+    V2XConfig,
+    V2XDataset,
+    collate,
+    collate_all_egos,
+)
+from deepaccident_devkit.v2x import AGENT_CONFIGS, WindowConfig, cooperating_agents
 
 LABELS = MotionLabelConfig(receptive_field=2, future_frames=3, step=1)
 
@@ -384,3 +392,38 @@ def test_impossible_image_configurations_are_refused(
     fields: dict[str, object], message: str
 ) -> None:
     assert_raises((lambda: ImageConfig(**fields), ConfigError, message))
+
+
+def test_an_item_has_the_window_of_its_sample(da: DeepAccident) -> None:
+    sample = da.get_sample(da.scenario[0], "other_vehicle", 3)["token"]
+    config = WindowConfig(past=0.2, future=0.4, actors="any", agents="single", visible="camera")
+    augmentation = Augmentation(rotation=0.3, scale=1.1, flip=True)
+
+    item = load_item(da, sample, points=False, window=config, augmentation=augmentation)
+
+    window = da.window(sample, 0.2, 0.4, agents="single", visible="camera", actors="any")
+    expected = window.augmented(augmentation.matrix).arrays
+    assert item["window"].keys() == expected.keys()
+    for name, array in expected.items():
+        assert_allclose(item["window"][name], array, rtol=1e-6, atol=1e-5)
+    assert item["window"]["center"].dtype == torch.float32
+    assert item["window"]["category"].dtype == torch.int64
+    assert item["window"]["seen_by"].dtype == torch.uint8
+
+
+def test_windows_are_a_list_in_a_batch(da: DeepAccident) -> None:
+    tokens = [f"{da.scenario[0]['token']}/{agent}/003" for agent in AGENTS[:3]]
+    config = V2XConfig(points=False, boxes=None, window=WindowConfig(past=0.1, future=0.1))
+    dataset = V2XDataset(da, tokens, config)
+    [batch] = DataLoader(dataset, batch_size=3, collate_fn=collate)
+    assert [window["yaw"].shape[1] for window in batch["window"]] == [3, 3, 3]
+    assert ", window" in repr(dataset)
+
+    [moment] = DataLoader(AllEgosDataset(da, tokens, config), collate_fn=collate_all_egos)
+    for one, other in zip(moment["window"], batch["window"], strict=True):
+        assert_array_equal(one["center"], other["center"])
+
+
+def test_a_window_of_another_type_is_refused() -> None:
+    with pytest.raises(ConfigError, match="window: expected None or a WindowConfig"):
+        V2XConfig(window=2.0)  # type: ignore[arg-type]

@@ -97,7 +97,8 @@ VERBS = (
             "opencood": " --without-clouds",
             "nuscenes": "",
             "parquet": "",
-            "webdataset": "",
+            "av2": "",
+            "release": "",
         }.items()
     ),
     Verb(

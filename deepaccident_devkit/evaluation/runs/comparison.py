@@ -37,7 +37,14 @@ from deepaccident_devkit.evaluation.task import Headline, headlines, plain
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, ShortRepr, json_numbers
 from deepaccident_devkit.support.human_names import metric_name, rules_name, with_unit
 from deepaccident_devkit.support.reports import Report, Row, record_rows
-from deepaccident_devkit.support.text import PathType, columns_text, counted, path_of
+from deepaccident_devkit.support.text import (
+    PathType,
+    columns_text,
+    counted,
+    interval_text,
+    number_text,
+    path_of,
+)
 
 # How a number is tested: by itself, together with the other headlines, or not at all.
 Family = Literal["main", "headlines", "other"]
@@ -154,7 +161,7 @@ class Comparison(Report):
         if self.left_out:
             left_out = counted(self.left_out, "sample")
             head.append(f"excluded: {left_out} that only one of the two evaluations has")
-        interval_title = f"{self.resampling.confidence:.0%} interval"
+        interval_title = f"{100 * self.resampling.confidence:.0f} % interval"
         rows: list[Sequence[str]] = [("number", "a", "b", "b − a", interval_title, "p", "decision")]
         explanations: list[str] = []
         for number in self.numbers:
@@ -186,7 +193,7 @@ class Comparison(Report):
                 f"at least as much; number of swaps: {self.swaps:,}"
             ),
             (
-                f"{main_headline} is tested at {level:.0%}; the other headlines are tested "
+                f"{main_headline} is tested at {100 * level:.0f} %; the other headlines are tested "
                 "together, with p adjusted by Holm's rule"
             ),
             (
@@ -198,9 +205,9 @@ class Comparison(Report):
         if other_p:
             low_count = sum(p <= level for p in other_p)
             notes.append(
-                f"exploratory: p is at most {level:.0%} for {low_count} of {len(other_p)} other "
-                f"numbers; about {level * len(other_p):.1f} are expected by chance if both runs "
-                "are equally good"
+                f"exploratory: p is at most {100 * level:.0f} % for {low_count} of {len(other_p)} "
+                f"other numbers; about {level * len(other_p):.1f} are expected by chance if both "
+                "runs are equally good"
             )
         return notes
 
@@ -225,27 +232,13 @@ def text_row(number: ComparedNumber) -> tuple[str, ...]:
         decision = _TOO_FEW
     return (
         with_unit(metric_name(str(number.headline)), number.unit),
-        decimal_text(number.a),
-        decimal_text(number.b),
-        decimal_text(number.difference, "+"),
-        interval_text(number.low, number.high, "+"),
-        decimal_text(number.adjusted_p),
+        number_text(number.a, 3),
+        number_text(number.b, 3),
+        number_text(number.difference, 3, "+"),
+        interval_text(number.low, number.high, sign="+"),
+        number_text(number.adjusted_p, 3),
         decision,
     )
-
-
-def decimal_text(value: float | None, sign: str = "") -> str:
-    """Format a number with three decimals; None is a dash, and `sign="+"` always shows a sign."""
-    if value is None:
-        return "–"
-    return f"{value:{sign}.3f}"
-
-
-def interval_text(low: float | None, high: float | None, sign: str = "") -> str:
-    """Format an interval like `decimal_text`; a dash if an end is unknown."""
-    if low is None or high is None:
-        return "–"
-    return f"[{low:{sign}.3f}, {high:{sign}.3f}]"
 
 
 def compare_bundles(

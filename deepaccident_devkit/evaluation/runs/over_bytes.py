@@ -13,7 +13,7 @@ from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.breakdowns import cluster_of
 from deepaccident_devkit.evaluation.intervals import Resampling, intervals_of
 from deepaccident_devkit.evaluation.runs.bundles import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.comparison import comparable, interval_text
+from deepaccident_devkit.evaluation.runs.comparison import comparable
 from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.evaluation.task import Unit, headlines, value_text
 from deepaccident_devkit.support.human_names import metric_name, rules_name
@@ -23,6 +23,7 @@ from deepaccident_devkit.support.text import (
     columns_text,
     counted,
     distinct_names,
+    interval_text,
     path_of,
 )
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
@@ -107,7 +108,7 @@ class OverBytes(Report):
 
     def to_text(self) -> str:
         """Format one line for each headline of each evaluation."""
-        interval_title = f"{self.resampling.confidence:.0%} interval"
+        interval_title = f"{100 * self.resampling.confidence:.0f} % interval"
         rows = [("number", "evaluation", "bytes per sample", "value", interval_title)]
         for point in self.points:
             interval = interval_text(point.low, point.high)

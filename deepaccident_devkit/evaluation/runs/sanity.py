@@ -332,8 +332,8 @@ def suspect_mistakes(sums: Mapping[str, FloatArray], task: str) -> Iterator[str]
         if suspected:
             share, given_share, name = max(suspected, key=itemgetter(0))
             yield (
-                f"{name}: {remedies[name]} ({share:.0%} of the truth matches when corrected, "
-                f"{given_share:.0%} as given)"
+                f"{name}: {remedies[name]} ({100 * share:.0f} % of the truth matches when "
+                f"corrected, {100 * given_share:.0f} % as given)"
             )
             if group in ("place", "time"):
                 return

@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from deepaccident_devkit.errors import shortened
 from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.runs.comparison import decimal_text, interval_text
 from deepaccident_devkit.evaluation.runs.further import Json, further_results
 from deepaccident_devkit.evaluation.runs.over_bytes import sent_bytes
 from deepaccident_devkit.evaluation.runs.setups import agent_of, evaluator_class, scenario_of
@@ -25,7 +24,7 @@ from deepaccident_devkit.support.human_names import (
     with_unit,
 )
 from deepaccident_devkit.support.reports import Table
-from deepaccident_devkit.support.text import columns_text, counted
+from deepaccident_devkit.support.text import columns_text, counted, interval_text, number_text
 
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
 # Text that replaces a missing number.
@@ -188,7 +187,7 @@ def _headlines_text(summary: Json) -> str:
     alternatives: Mapping[str, Any] = summary["metrics"].get("beside") or {}
     titles = ["number", "value"]
     if intervals:
-        titles.append(f"{overall['resampling']['confidence']:.0%} interval")
+        titles.append(f"{100 * overall['resampling']['confidence']:.0f} % interval")
     titles += [f"if {name}" for name in alternatives]
     rows = [titles]
     without_interval = []
@@ -202,7 +201,7 @@ def _headlines_text(summary: Json) -> str:
             if interval == _MISSING and headline["text"] != _MISSING:
                 without_interval.append(name)
         for metrics in alternatives.values():
-            row.append(decimal_text(_find_value(metrics, path)))
+            row.append(number_text(_find_value(metrics, path), 3))
         rows.append(row)
     notes = [] if intervals else group_notes
     if without_interval:
@@ -252,7 +251,7 @@ def _breakdown_text(summary: Json, name: str) -> str:
         row = [human_name(group["value"]), str(group["samples"]), str(group["scenarios"])]
         for headline in headlines:
             number = group["headlines"].get(headline["path"])
-            row.append(decimal_text(number))
+            row.append(number_text(number, 3))
         rows.append(row)
     return columns_text(rows)
 

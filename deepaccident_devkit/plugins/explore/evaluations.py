@@ -178,7 +178,7 @@ def _collect_facts(bundle: Bundle) -> dict[str, str]:
     counts = summary["counts"]
     results = summary["results"]
     release = summary["release"]
-    switches = [f"{name} = {scalar(value)}" for name, value in setup.switches.items()]
+    switches = [f"{name}={value!r}" for name, value in setup.switches.items()]
     protocol = human_name(setup.protocol, "protocols")
     if switches:
         protocol = f"{protocol}, but {', '.join(switches)}"

@@ -314,7 +314,7 @@ class AvoidabilityReport(Report):
                     texts = map(_seconds_text, seconds[ranks] + reaction)
                     cells.append(" / ".join(texts))
                 rows.append(cells)
-        share_text = " and ".join(f"{share:.0%}" for share in _TEXT_SHARES)
+        share_text = " and ".join(f"{100 * share:.0f} %" for share in _TEXT_SHARES)
         return (
             f"{group}: {counted(len(members), 'accident')}; seconds of warning that {share_text} "
             f"of them need\n{columns_text(rows)}\n"

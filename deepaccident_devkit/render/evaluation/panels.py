@@ -28,7 +28,7 @@ from deepaccident_devkit.render.styles import (
     text_size,
 )
 from deepaccident_devkit.support.human_names import human_name, metric_name, with_unit
-from deepaccident_devkit.support.text import counted, distinct_names, fixed_text, with_minus
+from deepaccident_devkit.support.text import counted, distinct_names, number_text, with_minus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -355,8 +355,4 @@ def _draw_difference(ax: Axes, row: int, number: ComparedNumber, difference: flo
 
 def _number_text(value: float | None, number: ComparedNumber, sign: str = "") -> str:
     """Format a value with a compared number's decimals; `sign="+"` also writes positive signs."""
-    if value is None:
-        return "–"
-    decimals = 2 if number.unit == "%" else 3
-    text = fixed_text(value, decimals)
-    return sign + text if round(value, decimals) > 0 else text
+    return number_text(value, 2 if number.unit == "%" else 3, sign)

@@ -1,6 +1,5 @@
 """`save_report`: one HTML file with the whole evaluation, and its figures as PNG files."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from deepaccident_devkit.support.files import place_in, writable_folder, write_b
 from deepaccident_devkit.support.human_names import column_name, human_name, metric_name, rules_name
 from deepaccident_devkit.support.pages import document, result_text, scalar
 from deepaccident_devkit.support.reading import read_bytes
-from deepaccident_devkit.support.text import PathType, counted, with_minus
+from deepaccident_devkit.support.text import PathType, counted, interval_text
 
 # Word in the report for each value of a headline's `higher_is_better`.
 _BETTER_WORDS = {True: "higher", False: "lower", None: ""}
@@ -91,7 +90,7 @@ def report_context(run: EvaluationRun) -> dict[str, Any]:
 def _headline_rows(result: Any, group: Group[Any] | None) -> list[list[str]]:
     rows = []
     for headline in _headlines(result):
-        interval = _interval_text(headline, group)
+        interval = _headline_interval(headline, group)
         direction = _BETTER_WORDS[headline.higher_is_better]
         rows.append([metric_name(headline.name), headline.text(), interval, direction])
     return rows
@@ -112,7 +111,7 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
     results = run.results
     counts = summary["counts"]
     protocol = setup.protocol
-    changes = [f"{name} = {scalar(value)}" for name, value in setup.switches.items()]
+    changes = [f"{name}={value!r}" for name, value in setup.switches.items()]
     if changes:
         protocol += f", but {', '.join(changes)}"
     header = {"task": setup.task, "protocol": protocol}
@@ -202,7 +201,7 @@ def _group_table(
         for headline in _headlines(group.result):
             name = metric_name(headline.name)
             names[name] = None
-            cells[name] = (headline.text(), _interval_text(headline, group))
+            cells[name] = (headline.text(), _headline_interval(headline, group))
         cells_of_groups.append(cells)
     rows = []
     for group, cells in zip(groups, cells_of_groups, strict=True):
@@ -251,16 +250,11 @@ def _absent_classes(result: object) -> list[str]:
     return [name for name, count in zip(result.classes, truths, strict=True) if not count]
 
 
-def _interval_text(headline: Headline, group: Group[Any] | None) -> str:
-    if group is None or headline.value is None:
+def _headline_interval(headline: Headline, group: Group[Any] | None) -> str:
+    if group is None or headline.value is None or headline.path not in group.intervals:
         return ""
-    low, high = group.intervals.get(headline.path, (math.nan, math.nan))
-    if math.isnan(low) or math.isnan(high):
-        return ""
-    digits = 3
-    if headline.unit == "%":
-        digits = 2
-    return with_minus(f"{low:.{digits}f} to {high:.{digits}f}")
+    low, high = group.intervals[headline.path]
+    return interval_text(low, high, 2 if headline.unit == "%" else 3)
 
 
 def save_report(

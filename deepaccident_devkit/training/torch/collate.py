@@ -31,7 +31,7 @@ _MATRICES = (
 )
 # Keys of tensors with the agents as their first axis.
 _AGENT_KEYS = ("agent_valid", "files_missing", "images", *_MATRICES)
-_BOX_KEYS = ("boxes", "velocity_known", "categories", "actor_ids")
+_BOX_KEYS = ("boxes", "velocity_known", "categories", "actor_ids", "window")
 # Keys that stay lists with one entry for each item: texts, and tensors of different lengths.
 _LIST_KEYS = ("token", "agents", "points", *_BOX_KEYS)
 # Keys that only items of an `AllEgosDataset` have.
@@ -59,10 +59,10 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return B items as one dict with an axis of agents.
 
     It is for models with a fixed number of agents, or with a mask for them. `token`, `agents`,
-    `points` and the boxes (`boxes`, `velocity_known`, `categories`, `actor_ids`) of the items
-    (`V2XDataset`) become lists of B. All other tensors are stacked, (B, …). If items have different
-    numbers of agents, tensors (B, A, …) are padded with blank agents, which have `agent_valid`
-    False, images of 0 and identity matrices.
+    `points`, the boxes (`boxes`, `velocity_known`, `categories`, `actor_ids`) and `window` of the
+    items (`V2XDataset`) become lists of B. All other tensors are stacked, (B, …). If items have
+    different numbers of agents, tensors (B, A, …) are padded with blank agents, which have
+    `agent_valid` False, images of 0 and identity matrices.
 
     Raises:
         ConfigError: If there are no items, or they do not fit together because of different
@@ -137,7 +137,7 @@ def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     - `egos`: list of G tokens. `ego_rows` (G, 2) int64: the item and the agent of each ego.
     - `partners` (G, A) bool: the agents of the ego's item that cooperate with the ego.
-    - the targets: stacked, (G, …), or lists of G for boxes.
+    - the targets: stacked, (G, …), or lists of G for boxes and windows.
 
     Raises:
         ConfigError: As in `collate`.

@@ -30,7 +30,7 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.support.text import PathType, settle_choices
 from deepaccident_devkit.taxonomy import OnError
-from deepaccident_devkit.v2x import Agents, Link
+from deepaccident_devkit.v2x import Agents, Link, WindowConfig
 from deepaccident_devkit.v2x.messages import checked_link
 
 BoxSource = Literal["sample", "cooperative"]
@@ -45,6 +45,7 @@ _DEFAULT_STEP = 5
 _TYPED_FIELDS = (
     ("images", ImageConfig, "an ImageConfig, such as ImageConfig(resize=(224, 400))"),
     ("labels", (MotionLabelConfig, str), "a MotionLabelConfig, or the name of a preset"),
+    ("window", WindowConfig, "a WindowConfig, such as WindowConfig(past=2.0, future=3.0)"),
     ("bev_segmentation", BevGrid, "the BevGrid that it is resampled to, such as BevGrid()"),
 )
 
@@ -69,6 +70,8 @@ class V2XConfig:
             if another one annotated it), None for no boxes.
         visible: Visibility of the boxes: `released`, `camera`, or None for all, with own rows
             (`DeepAccident.boxes`, `v2x.cooperative_boxes`).
+        window: Steps and actors of the window of tracks, which has its own `agents` and `visible`;
+            None for no window.
         labels: Motion labels, or the name of a preset (`motion.PRESETS`); None for no labels. Their
             own `agents` are the agents that see the labelled actors; this configuration's
             `augmentation` augments them.
@@ -101,6 +104,7 @@ class V2XConfig:
     # Targets.
     boxes: BoxSource | None = "sample"
     visible: Visible | None = "released"
+    window: WindowConfig | None = None
     labels: MotionLabelConfig | str | None = None
     to_present: WarpMode | None = "nearest"
     bev_segmentation: BevGrid | None = None

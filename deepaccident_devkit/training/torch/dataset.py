@@ -31,7 +31,8 @@ from deepaccident_devkit.training.torch.config import (
     augmented_boxes,
     augmented_six_vectors,
 )
-from deepaccident_devkit.v2x import cooperative_boxes
+from deepaccident_devkit.v2x import WindowConfig, cooperative_boxes
+from deepaccident_devkit.v2x.windows import configured_window
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -91,6 +92,10 @@ class V2XDataset(TorchDataset):
     - `categories` (M,) int64, indices into `taxonomy.CATEGORIES`; −1 must be ignored: it is a class
       of another source that the devkit does not have. `actor_ids` (M,) int64, as in the label (−100
       is the agent's own row) or, for cooperative boxes, CARLA's ids; −1 is an untracked actor.
+
+    With `window`: `window`, a dict of the N actors' tracks in T steps (`v2x.TrackWindow`), in the
+    ego frame of the sample's agent at the present. Floats are float32, and NaN where not `valid`;
+    whole numbers are int64, masks uint8 and bool.
 
     With `labels`, where each map is in the present ego frame or in the ego frame of its own moment,
     depending on `to_present`:
@@ -154,7 +159,7 @@ class V2XDataset(TorchDataset):
         """Return the number of samples, the cooperating agents, and the contents of an item."""
         config = self.config
         contents = ""
-        for name in ("points", "images", "boxes", "labels", "bev_segmentation"):
+        for name in ("points", "images", "boxes", "window", "labels", "bev_segmentation"):
             if getattr(config, name):
                 contents += f", {name}"
         plural = "s" * (len(self) != 1)
@@ -265,6 +270,8 @@ class V2XDataset(TorchDataset):
             item: dict[str, Any] = {}
             if self.config.boxes is not None:
                 item.update(self._box_item(sample, augmentation))
+            if self.config.window is not None:
+                item["window"] = self._window_item(sample, self.config.window, augmentation)
             item.update(label_item)
             if grid is not None:
                 target = bev_segmentation(self._dataset, sample, grid, augmentation=augmentation)
@@ -289,6 +296,17 @@ class V2XDataset(TorchDataset):
             "categories": tensor(categories, np.int64),
             "actor_ids": tensor(boxes.actor_id),
         }
+
+    def _window_item(
+        self, sample: str, config: WindowConfig, augmentation: Augmentation
+    ) -> dict[str, Tensor]:
+        """Return the tensors of a sample's window of tracks."""
+        window = configured_window(self._dataset, sample, config)
+        tensors = {}
+        for name, array in window.augmented(augmentation.matrix).arrays.items():
+            item_types = {"f": np.float32, "i": np.int64}
+            tensors[name] = tensor(array, item_types.get(array.dtype.kind, array.dtype))
+        return tensors
 
     def _label_items(
         self, samples: Sequence[str], augmentation: Augmentation
@@ -340,8 +358,8 @@ class V2XDataset(TorchDataset):
             sensor_data.participants(self._dataset, sample, self.config.agents)
 
     def _check_labelled(self) -> None:
-        """Check that all samples have labels, if labels are requested; raises NotAvailableError."""
-        if self.config.labels is None:
+        """Check that all samples have labels, if targets need them; raises NotAvailableError."""
+        if self.config.labels is None and self.config.window is None:
             return
         is_labelled = self._dataset.columns("sample")["labelled"][:][self._rows]
         unlabelled_rows = self._rows[~is_labelled]
@@ -349,7 +367,7 @@ class V2XDataset(TorchDataset):
             token = self._dataset.sample[int(unlabelled_rows[0])]["token"]
             raise NotAvailableError(
                 f"{len(unlabelled_rows)} of the {len(self)} samples have no label, such as {token} "
-                "(the test split has none); exclude them, or choose labels=None"
+                "(the test split has none); exclude them, or choose labels=None and window=None"
             )
 
     def _check_latency(self) -> None:

@@ -38,6 +38,7 @@ from deepaccident_devkit.errors import (
     SomeFailedError,
     WorkerError,
 )
+from deepaccident_devkit.export.av2 import Av2
 from deepaccident_devkit.export.bulk import (
     Export,
     Exported,
@@ -47,13 +48,14 @@ from deepaccident_devkit.export.bulk import (
     Output,
     export_release,
 )
+from deepaccident_devkit.export.clips import Clips
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions
+from deepaccident_devkit.export.release import ReleasePart
 from deepaccident_devkit.export.released_infos import ReleasedInfos
-from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.fingerprints import fingerprint, scenario_hashes
 from deepaccident_devkit.support.files import temporary_of, temporary_path
@@ -853,9 +855,11 @@ IMAGES = ImageConfig(resize=(9, 16), cameras=("Camera_Back",))
             TinyFormat(split="val", where=("length>=3", "designed_accident=false")),
             "is in that split and matches",
         ),
+        (ReleasePart(agents=ABSENT_AGENTS), "none of the chosen agents recorded"),
         (NuScenes(agents=ABSENT_AGENTS), "none of the chosen agents recorded"),
         (Parquet(agents=ABSENT_AGENTS), "none of the chosen agents recorded"),
-        (WebDataset(agents=ABSENT_AGENTS), "none of the chosen agents recorded"),
+        (Av2(agents=ABSENT_AGENTS), "none of the chosen agents is a vehicle with labels"),
+        (Clips(agents=ABSENT_AGENTS), "no chosen agent has all images of the chosen cameras"),
     ],
 )
 @pytest.mark.parametrize("dry_run", [False, True])

@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.mmdet3d import Mmdet3d
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
-from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.release.images import write_image
 from deepaccident_devkit.testing import SmallRelease, write_small_release
 
@@ -57,19 +55,6 @@ def read_opencood(out: Path, token: str) -> Intrinsics:
     return {"Front": (front["intrinsic"], None), "Back": (back["intrinsic"], None)}
 
 
-def read_webdataset(out: Path, token: str) -> Intrinsics:
-    (shard,) = out.glob("*.tar")
-    with tarfile.open(shard) as archive:
-        content = archive.extractfile(f"{token}.json")
-        assert content is not None
-        cameras = json.load(content)["cameras"]
-    intrinsics = {}
-    for name in ("Front", "Back"):
-        camera = cameras[f"camera_{name.lower()}"]
-        intrinsics[name] = (camera["intrinsic"], (camera["width"], camera["height"]))
-    return intrinsics
-
-
 def read_nuscenes(out: Path, token: str) -> Intrinsics:
     tables = read_tables(out / "v1.0-deepaccident")
     intrinsics = {}
@@ -94,7 +79,6 @@ def read_mmdet3d(out: Path, token: str) -> Intrinsics:
     ("forms", "read"),
     [
         ((OpenCood(),), read_opencood),
-        ((WebDataset(),), read_webdataset),
         ((NuScenes(),), read_nuscenes),
         ((NuScenes(), Mmdet3d()), read_mmdet3d),
     ],
@@ -124,13 +108,12 @@ def read_first_truth(out: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8").splitlines()[0])
 
 
-def list_tar_names(out: Path) -> list[str]:
-    with tarfile.open(next(out.glob("*.tar"))) as archive:
-        return archive.getnames()
-
-
 def read_town_maps(out: Path) -> Any:
     return json.loads(next(out.glob("*.geojson")).read_text(encoding="utf-8"))["features"]
+
+
+def read_clip_rows(out: Path) -> list[str]:
+    return (out / "frames.csv").read_text(encoding="utf-8").splitlines()[1:]
 
 
 def read_parquet_tokens(out: Path) -> list[str]:
@@ -139,15 +122,23 @@ def read_parquet_tokens(out: Path) -> list[str]:
     return read_table(next(out.glob("sample/*.parquet")))["token"].to_pylist()
 
 
+def read_track_ids(out: Path) -> list[str]:
+    from pyarrow.parquet import read_table
+
+    return read_table(next(out.rglob("scenario_*.parquet")))["track_id"].to_pylist()
+
+
 OPENERS: dict[str, Callable[[Path], Any]] = {
+    "av2": read_track_ids,
+    "clips": read_clip_rows,
     "mcap": lambda out: read_mcap(next(out.glob("*.mcap"))),
     "mmdet3d": lambda out: pickle.loads(next(out.glob("*_val.pkl")).read_bytes())["data_list"],
     "nuscenes": lambda out: read_tables(out / "v1.0-deepaccident")["sample"],
     "opencood": lambda out: sorted(out.rglob("*.yaml")),
     "parquet": read_parquet_tokens,
     "questions": read_first_truth,
+    "release": lambda out: DeepAccident("v1", out, verbose=False).sample[:],
     "town-maps": read_town_maps,
-    "webdataset": list_tar_names,
 }
 """Function that opens the output of `deepaccident export FORMAT` and returns a part of it, by
 format.

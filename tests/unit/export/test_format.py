@@ -12,13 +12,14 @@ from support.tiny_format import TinyFormat
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError
 from deepaccident_devkit.export.bulk import Format, flat_name
+from deepaccident_devkit.export.clips import Clips
 from deepaccident_devkit.export.images import ImageConfig
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.opencood import OpenCood
 from deepaccident_devkit.export.parquet import Parquet
 from deepaccident_devkit.export.questions import Questions, WindowRules
+from deepaccident_devkit.export.release import ReleasePart
 from deepaccident_devkit.export.released_infos import ReleasedInfos
-from deepaccident_devkit.export.webdataset import WebDataset
 from deepaccident_devkit.training.image_cache import CachedImages
 
 TYPE = "type1_subtype1_accident"
@@ -62,7 +63,8 @@ ONE_SIZE = ImageConfig(resize=(18, 30))
         (OpenCood, {"classes": ("bus",)}, "classes: expected one of car"),
         (ReleasedInfos, {"agents": ("ego_vehicle",)}, "agents: the released classes need all five"),
         (ReleasedInfos, {"root_prefix": "./data\n/DeepAccident"}, "root_prefix: expected a path"),
-        (WebDataset, {"frames": "2hz"}, "frames: expected one of every, keyframes"),
+        (Clips, {"cameras": ("Camera_Up",)}, "^cameras: expected one of Camera_Front"),
+        (ReleasePart, {"channels": ("label",)}, "channels: expected one of Camera_Front"),
         (CachedImages, {"images": ONE_SIZE, "codec": "png"}, "codec: expected one of raw, jpeg"),
         (Questions, {"observers": "nobody"}, "^observers: expected one of single"),
         (
@@ -84,7 +86,8 @@ def test_a_wrong_choice_is_refused_before_a_release_is_opened(
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
-        (WebDataset, {"shard_size": 0}, "shard_size: expected a number of bytes from 1, found 0"),
+        (Clips, {"quality": 52}, "quality: expected a number from 0 to 51, found 52"),
+        (ReleasePart, {"size": (640,)}, "size: expected width and height in pixels, found"),
         (Parquet, {"shard_scenarios": 0}, "shard_scenarios: .*from 1.*0"),
         (
             CachedImages,

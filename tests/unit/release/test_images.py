@@ -9,8 +9,9 @@ from PIL import Image
 from support.expected_errors import assert_raises
 from support.strategies import mutations
 
-from deepaccident_devkit.errors import MissingFileError, SensorFileError
+from deepaccident_devkit.errors import ConfigError, MissingFileError, SensorFileError
 from deepaccident_devkit.release import read_image, write_image
+from deepaccident_devkit.release.images import aspect_fault, fitting_size
 
 REMEDY = "; restore the file from its archive"
 
@@ -146,3 +147,57 @@ def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(path: Path
     _, peak_bytes = tracemalloc.get_traced_memory()
     assert peak_bytes < 10 << 20
     tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("size", "example"),
+    [
+        ((640, 480), "640x360"),
+        ((640, 361), "640x360"),
+        ((641, 360), "640x360"),
+        ((3200, 1800), "1600x900"),
+        ((1600, 901), "1600x900"),
+        ((100, 100), "96x54"),
+        ((0, 0), "1600x900"),
+    ],
+)
+def test_a_size_that_distorts_or_enlarges_images_is_refused_with_one_that_fits(
+    size: tuple[int, int], example: str
+) -> None:
+    width, height = size
+    words = (f"{width}x{height}", "images of 1600x900", "a multiple of 16x9", f"such as {example}")
+    assert_raises((lambda: fitting_size(size, (1600, 900)), ConfigError, words))
+
+
+@pytest.mark.parametrize("size", [(640, 360), (1600, 900), (854, 480), (400, 225), (1, 1)])
+def test_smaller_sizes_of_the_same_aspect_ratio_fit(size: tuple[int, int]) -> None:
+    assert fitting_size(size, (1600, 900)) == size
+
+
+def test_without_a_size_images_keep_their_own() -> None:
+    assert fitting_size(None, (1600, 900)) == (1600, 900)
+
+
+SIDES = st.integers(1, 4096)
+
+
+@given(SIDES, SIDES, SIDES)
+def test_a_side_can_be_chosen_and_the_other_one_rounded(width: int, height: int, side: int) -> None:
+    new_width = min(width, side)
+    new_height = max(1, round(new_width * height / width))
+
+    fault = aspect_fault((new_width, new_height), (width, height))
+
+    is_too_flat = new_width * height < width / 2
+    assert (fault is None) is not is_too_flat
+
+
+@given(st.tuples(st.integers(0, 5000), st.integers(0, 5000)), st.tuples(SIDES, SIDES))
+def test_a_size_that_a_refusal_names_fits(
+    size: tuple[int, int], image_size: tuple[int, int]
+) -> None:
+    fault = aspect_fault(size, image_size)
+    if fault is not None:
+        width, height = map(int, fault.rpartition(" ")[2].split("x"))
+        assert aspect_fault((width, height), image_size) is None
+        assert width * image_size[1] == height * image_size[0]

@@ -5,12 +5,13 @@ from support.default_values import package_values
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.v2x import cooperative_view, relative_pose_to_ego
+from deepaccident_devkit.v2x import agent_motion, cooperative_view, relative_pose_to_ego
 from deepaccident_devkit.v2x.clouds import moved_points
 from deepaccident_devkit.v2x.collisions import labelled_pair
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
 EXPECTED_DEFAULTS = {
+    "agent_motion.MIN_CURVATURE_SPEED": "0.5",
     "agents.SHEER_CURTAINS": "('Town05_type001_subtype0002_scenario00035', "
     "'Town05_type001_subtype0002_scenario00004')",
     "agents.VISIBILITIES": "('visible', 'partial', 'invisible')",
@@ -48,6 +49,14 @@ EXPECTED_DEFAULTS = {
     "poses.future_egomotion": "valid=None",
     "poses.project_to_image": "frame=None, colors=True",
     "poses.map_pointcloud_to_image": "sample=None, colors=True",
+    "track_window.TrackWindow.write_av2": "focal=None",
+    "track_window.argoverse_table": "focal=None",
+    "windows.ACTOR_FRAME": "'actor'",
+    "windows.WindowConfig": "past=2.0, future=3.0, step=0.1, agents=None, visible=None, "
+    "actors='present'",
+    "windows.configured_window": "frame='ego'",
+    "windows.window": "past=2.0, future=3.0, step=0.1, agents=None, visible=None, frame='ego', "
+    "actors='present'",
     "tracks.Trajectory": "present=None",
     "tracks.trajectory": "sample=None, frame='world'",
 }
@@ -59,6 +68,7 @@ def test_every_default_and_constant_written_out(da_b: DeepAccident) -> None:
     no_boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [])
     assert len(moved_points(np.zeros((0, 3)), no_boxes, no_boxes)) == 0
     assert len(relative_pose_to_ego([SE3.identity()])) == 1
+    assert len(agent_motion(da_b, da_b.agent[0]).time) > 0
     assert labelled_pair(None, np.zeros(1)) is None
     assert len(cooperative_view(da_b, da_b.sample[0]).source) > 0
     assert len(scenario_tracks(da_b, da_b.scenario[0]).index) > 0

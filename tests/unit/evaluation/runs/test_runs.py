@@ -33,8 +33,6 @@ EXPECTED_VALUES = {
     "bundles.save_run": "include_results=False, overwrite=False, extras=()",
     "bundles.checked_target": "overwrite=False, requested=None",
     "comparison.ComparedNumber": "higher_is_better=None",
-    "comparison.decimal_text": "sign=''",
-    "comparison.interval_text": "sign=''",
     "comparison.compare_bundles": "resampling=None, common=False",
     "evaluation_run.SUMMARY_FORMAT": "'DeepAccident metrics summary'",
     "evaluation_run.SUMMARY_VERSION": "1",

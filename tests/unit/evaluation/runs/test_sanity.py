@@ -628,8 +628,8 @@ def test_a_mistake_is_suspected_from_a_share_of_hits_on(
     assert len(warnings) == suspected
 
     end = (
-        f"({undone / total:.0%} of the truth matches when corrected, "
-        f"{predicted / total:.0%} as given)"
+        f"({undone / total * 100:.0f} % of the truth matches when corrected, "
+        f"{predicted / total * 100:.0f} % as given)"
     )
     for warning in warnings:
         assert warning.startswith(f"{name}: ")
@@ -643,7 +643,7 @@ def test_the_worst_measurement_counts_and_the_best_mistake_of_a_group() -> None:
     tallies = {"x mirrored": x_mirrored, "y mirrored": y_mirrored, "one step late": late}
     (warning,) = suspect_mistakes(tallies, "motion")  # and no mistake of time beside it
     assert warning.startswith("y mirrored: ")
-    assert "(30% of the truth" in warning
+    assert "(30 % of the truth" in warning
 
     one_missed = np.array([[100.0, 0.0], [100.0, 1.0], [0.0, 0.0], [100.0, 1.0]])
     assert list(suspect_mistakes({"x mirrored": one_missed}, "motion")) == []

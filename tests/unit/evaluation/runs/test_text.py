@@ -210,7 +210,7 @@ def test_the_text_of_a_full_summary() -> None:
     lines = lines_of(summary_text(summary, ["agent", "weather"]))
     expected_lines = {
         "evaluated PARTIAL: 6 of 8 samples",
-        "number value 90% interval if paper",
+        "number value 90 % interval if paper",
         "a 1 [0.250, 0.750] 0.125",
         "near 3 1 0.250 – – – –",
         "if paper: other",
