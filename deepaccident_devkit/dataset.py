@@ -476,7 +476,8 @@ class Dataset(OpenTables):
         first_row = self._tables.resolver.sample_at(agent_row, 1) * len(CHANNELS) + channel
         path = self._join_sensor_path(first_row)
         with suppress(ReleaseError):  # the release may have no images
-            fault = calib_fault(image_size(path), self._calib_size(first_row))
+            size = image_size(path)
+            fault = calib_fault(size, self._calib_size(first_row))
             if fault is not None and not self._has_size_warning:
                 self._has_size_warning = True
                 text = (
@@ -595,6 +596,7 @@ class Dataset(OpenTables):
         if frame == "ego":
             return trusted_se3(pose)
         channel = LIDAR if frame == "lidar" else frame
-        sample_data_row = sample_row * len(CHANNELS) + CHANNELS.index(channel)
+        channel_index = CHANNELS.index(channel)
+        sample_data_row = sample_row * len(CHANNELS) + channel_index
         ego_from_sensor = stored_transforms(views["sample_data"]["matrix"][sample_data_row])
         return trusted_se3(pose @ ego_from_sensor)

@@ -175,6 +175,7 @@ class DeepAccident(Dataset):
     render_visibility = render.render_visibility
     render_visibility_matrix = render.render_visibility_matrix
     render_accident = render.render_accident
+    render_teaser = render.render_teaser
     render_link = render.render_link
     render_evaluation = render.render_evaluation
     render_scenario_video = render.render_scenario_video

@@ -69,6 +69,7 @@ REFERENCE = {
     "Motion labels": ("motion",),
     "Evaluation": (
         "evaluation",
+        "evaluation.drawing",
         "evaluation.motion",
         "evaluation.accident",
         "evaluation.detection",

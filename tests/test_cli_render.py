@@ -216,6 +216,16 @@ def test_a_video_without_titles_differs_from_one_with_titles(
     assert (tmp_path / "titled.gif").read_bytes() != (tmp_path / "bare.gif").read_bytes()
 
 
+def test_a_turntable_is_a_view_and_the_twin_is_shown_beside(
+    da_motion: DeepAccident, tmp_path: Path
+) -> None:
+    out = tmp_path / "video.gif"
+    options = ("--turntable", "--beside", "twin", "--frame-range", "3", "--size", "320x180")
+    run("video", da_motion.dataroot, "--out", out, *options, "--workers", 1)
+    with Image.open(out) as image:
+        assert image.size == (320, 180)
+
+
 def test_video_takes_the_first_accident(da: DeepAccident, tmp_path: Path) -> None:
     out = tmp_path / "video.webp"
     options = ("--what", "accident", "--frame-range", "6", "--size", "160x90")

@@ -93,6 +93,11 @@ def test_its_task(python: Path, da_motion: DeepAccident, tmp_path: Path) -> None
     with pytest.raises(ResultsError, match=message):
         _ = bundle.setup
 
+    picture = tmp_path / "counting.png"
+    options = ("--results", results, "--task", "counting", "--out", picture)
+    run(python, "render", "evaluation", da_motion.dataroot, tokens[0], *options)
+    assert picture.stat().st_size > 10_000
+
     sources = ("--results", results, "--dataroot", da_motion.dataroot)
     assert "identical: " in run(python, "check", "bundle", out, *sources)
     output = run(python, "evaluate", "counting", status=2, DEEPACCIDENT_PLUGINS="off")

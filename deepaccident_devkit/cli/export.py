@@ -439,6 +439,11 @@ def _choose_cameras(texts: tuple[str, ...]) -> tuple[str, ...]:
 @click.option(
     "--results", type=PATH, metavar="FILE", help="Also write the predictions of this results file."
 )
+@click.option(
+    "--task",
+    metavar="TASK",
+    help="Task that draws the predictions, also of a plug-in.  [default: the kind of the results]",
+)
 def _mcap(
     scenario: str | None,
     out: Path,
@@ -457,7 +462,9 @@ def _mcap(
     from deepaccident_devkit.export.mcap import McapConfig, export_mcap
 
     names = agent_names(agents)
-    choices = {name: options.pop(name) for name in ("frames", "points", "motion_labels")}
+    choices = {name: options.pop(name) for name in ("frames", "points", "motion_labels", "task")}
+    if results is None:
+        refuse_unused("without --results", "task")
     choices["agents"] = None if names == AGENTS else names
     choices["channels"] = split_words(channels) if channels else None
     config = McapConfig.of(**choices)  # fails before the release is indexed

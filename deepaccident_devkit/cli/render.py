@@ -1,7 +1,7 @@
 """`deepaccident render`: images and videos of a release; each view is a subcommand."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -27,7 +27,7 @@ from deepaccident_devkit.cli.options import (
 from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
 from deepaccident_devkit.cli.verbs import Verb, WordChoice, advanced, together, verb
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
 from deepaccident_devkit.render.bev import render_bev
@@ -47,9 +47,18 @@ from deepaccident_devkit.render.figures import (
 from deepaccident_devkit.render.link import render_link
 from deepaccident_devkit.render.motion import MotionStyle, render_motion_labels
 from deepaccident_devkit.render.outcomes import render_evaluation
+from deepaccident_devkit.render.outcomes.results_grid import (
+    PICKED_SAMPLES,
+    Pick,
+    named_results,
+    pick_samples,
+    render_results,
+    shared_samples,
+)
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.styles import current_style, style
+from deepaccident_devkit.render.teaser import TEASER_SECONDS, render_teaser
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 from deepaccident_devkit.support.text import size_text
@@ -83,9 +92,47 @@ def _with_link(draw: Callable[..., Any]) -> Callable[..., Any]:
     return draw_with_link
 
 
-def _draw_evaluation(dataset: Dataset, token: str, *, results: Path, **choices: Any) -> Any:
-    prediction: Any = read_results(results).prediction(token)
-    return render_evaluation(dataset, token, prediction, **choices)
+def _draw_evaluation(
+    dataset: Dataset, tokens: str | Sequence[str], *, results: Mapping[str, Results], **choices: Any
+) -> Any:
+    """Draw one sample of one results file, or a list of samples of all of them."""
+    if not isinstance(tokens, str):
+        return render_results(dataset, tokens, results, **choices)
+    (predictions,) = results.values()
+    prediction: Any = predictions.prediction(tokens)
+    task = choices.pop("task", None) or predictions.task
+    return render_evaluation(dataset, tokens, prediction, task=task, **choices)
+
+
+def _parse_named_paths(
+    _context: click.Context, _parameter: click.Parameter, values: tuple[str, ...]
+) -> tuple[tuple[str, Path], ...]:
+    """Parse PATH or NAME=PATH; an existing path may contain an equals sign."""
+    named_paths = []
+    for value in values:
+        name, separator, path = value.partition("=")
+        if not separator or Path(value).exists():
+            name, path = "", value
+        named_paths.append((name, Path(path)))
+    return tuple(named_paths)
+
+
+def _open_with_results(
+    choices: dict[str, Any], tokens: Sequence[str], release: Mapping[str, Any]
+) -> tuple[Dataset, Sequence[str]]:
+    """Open the results among the options of a view, then the release; choose the samples."""
+    pick = choices.pop("pick", None)
+    if pick is not None and tokens:
+        raise click.UsageError("--pick chooses the samples; leave out their names, or --pick")
+    opened = [(name, read_results(path)) for name, path in choices.get("results", ())]
+    if opened:
+        choices["results"] = named_results(opened, choices.get("task"))
+        tokens = tokens or shared_samples(choices["results"])[:1]
+    dataset = open_release(**release)
+    if pick is not None:
+        rules = {name: choices.get(name) for name in ("task", "protocol")}
+        tokens = pick_samples(dataset, choices["results"], pick, release["workers"], **rules)
+    return dataset, tokens
 
 
 def _draw_sensor_file(
@@ -119,6 +166,16 @@ def _parse_seconds(
         raise click.BadParameter(
             f"expected seconds, such as 2,1,0, found {value!r}", context, parameter
         ) from None
+
+
+def _seconds_option(default: Sequence[float]) -> Any:
+    return click.option(
+        "--seconds",
+        callback=_parse_seconds,
+        help="Moments to show, in seconds before the impact.  "
+        f"[default: {','.join(f'{second:g}' for second in default)}]",
+        metavar="S[,S…]",
+    )
 
 
 _AGENTS = cooperating_parameter("Agents to show", "chosen by the view")
@@ -172,12 +229,15 @@ class _Picture:
     def figure(
         self,
         dataset: Dataset,
-        row: str,
+        row: str | Sequence[str],
         size: tuple[int, int] | None,
         dpi: float,
         choices: dict[str, Any],
     ) -> Any:
-        """Draw a row into a figure, of `size` in pixels or of the view's default size."""
+        """Draw a row, or several side by side, into a figure.
+
+        The figure has `size` in pixels, or the view's default size.
+        """
         if size is None:
             return self.draw(dataset, row, **choices)
         canvas: Any = figure_of_pixels(*size, dpi=dpi)
@@ -280,29 +340,48 @@ _PICTURES = {
         "best; --agents all shows all agents.",
         options=(
             _AGENTS,
-            click.option(
-                "--seconds",
-                callback=_parse_seconds,
-                help="Moments to show, in seconds before the impact.  "
-                f"[default: {','.join(f'{second:g}' for second in COUNTDOWN)}]",
-                metavar="S[,S…]",
-            ),
+            _seconds_option(COUNTDOWN),
             _LAYERS,
         ),
+    ),
+    "teaser": _Picture(
+        draw=render_teaser,
+        default="the first accident",
+        table="scenario",
+        help="Render an accident as one wide figure: moments of the best camera, the "
+        "infrastructure's view, all paths on a map, and since when each agent has seen the pair.",
+        options=(_AGENTS, _seconds_option(TEASER_SECONDS), _LAYERS),
     ),
     "evaluation": _Picture(
         draw=_draw_evaluation,
         table="sample",
         options=(
-            click.option("--results", type=PATH, required=True, help="Results file of a model."),
+            click.option(
+                "--results",
+                multiple=True,
+                required=True,
+                callback=_parse_named_paths,
+                metavar="[NAME=]PATH",
+                help="Results file of a model. Several give one picture with the label and the "
+                "models in rows, and samples in columns.  [default name: the method in its notes]",
+            ),
+            click.option(
+                "--pick",
+                type=WordChoice(get_args(Pick)),
+                help="Samples to show side by side: those with the worst or best score of the "
+                f"first model, or where the first two differ most; {PICKED_SAMPLES} at most, from "
+                "different scenarios.",
+            ),
             click.option(
                 "--task",
-                type=WordChoice(["motion", "accident"]),
-                help="Judge the predicted motion, or the accident in it.",
+                metavar="TASK",
+                help="Task that judges the predictions, also of a plug-in, such as accident or "
+                "warning for predicted motion.  [default: the kind of the results]",
             ),
             click.option(
                 "--protocol",
-                help="Name of the protocol.  [default: released; for explicit accidents: boxes]",
+                help="Name of the protocol.  [default: released; for explicit accidents: boxes; "
+                "for other tasks: their first]",
             ),
             _LAYERS,
         ),
@@ -409,10 +488,9 @@ def _make_verb(name: str, picture: _Picture) -> click.Command:
             refuse_unused("without --pose-noise", "seed")
         options["layers"] = split_words(options.pop("layers", ())) or None
         choices = {option: value for option, value in options.items() if value is not None}
-        if not tokens and "results" in choices:
-            tokens = read_results(choices["results"]).tokens[:1]
-        dataset = open_release(**release)
-        rows = rows_to_draw(dataset, picture.table, tokens, frames, picture.channels)
+        side_by_side = "pick" in choices or len(choices.get("results", ())) > 1
+        dataset, shown_tokens = _open_with_results(choices, tokens, release)
+        rows = rows_to_draw(dataset, picture.table, shown_tokens, frames, picture.channels)
         figure_style: Any = None
         for word in styles:
             if word in picture.styles:
@@ -423,13 +501,15 @@ def _make_verb(name: str, picture: _Picture) -> click.Command:
         if choices.get("color_by") == "class":  # only the other values are passed to the view
             box_colors = choices.pop("color_by")
         with style(figure_style, title=not no_title, color_by=box_colors):
-            for row, path in zip(rows, picture_paths(out, name, rows), strict=True):
+            shown_rows: list[Any] = [rows] if side_by_side else rows
+            paths = picture_paths(out, name, rows[:1] if side_by_side else rows)
+            for row, path in zip(shown_rows, paths, strict=True):
                 figure = picture.figure(dataset, row, size, dpi or current_style().dpi, choices)
                 save_picture(figure, path, dpi=dpi)
                 missing = missing_words(figure)
                 if missing:
                     _logger.warning("%s: %s", path, "; ".join(missing))
-                click.echo(f"wrote {path} ({row})")
+                click.echo(f"wrote {path} ({', '.join(rows) if side_by_side else row})")
 
     return render_view
 
@@ -453,7 +533,19 @@ for _name, _picture in _PICTURES.items():
     "views",
     multiple=True,
     metavar="VIEW[,VIEW…]",
-    help=f"Views to show side by side: {', '.join(VIEWS)}.  [default: frame]",
+    help=f"Views to show side by side: {', '.join(VIEWS)}.  [default: frame; with --beside: bev]",
+)
+@click.option(
+    "--turntable",
+    is_flag=True,
+    help="Show the points of all agents in three dimensions, from a camera that goes around them; "
+    "the same as the view turntable.",
+)
+@click.option(
+    "--beside",
+    type=WordChoice(("twin",)),
+    help="twin: show an accident and its normal twin side by side, with one clock, verdicts and "
+    "the pair's time to collision.",
 )
 @_AGENTS
 @_LAYERS
@@ -477,6 +569,7 @@ def video(
     agents: tuple[str, ...],
     layers: tuple[str, ...],
     no_title: bool,
+    turntable: bool,
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as a video.
@@ -486,13 +579,15 @@ def video(
     """
     release = {option: options.pop(option) for option in _RELEASE_OPTIONS}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
+    if turntable:
+        views = (*views, "turntable")
     dataset = open_release(**release)
     click.get_current_context().with_resource(style(title=not no_title))
     path = render_scenario_video(
         dataset,
         scenario or default_scenario(dataset),
         out,
-        views=split_words(views) or "frame",
+        views=split_words(views) or ("bev" if options["beside"] else "frame"),
         agents=names_or_configuration(agents),
         layers=cast(list[Layer] | None, split_words(layers) or None),
         workers=release["workers"],
@@ -515,11 +610,22 @@ def video(
 @click.option(
     "--results",
     type=click.Path(),
-    help="Results file of motion or accidents, to show with its verdicts.",
+    help="Results file to show, with its verdicts.",
+)
+@click.option(
+    "--task",
+    metavar="TASK",
+    help="Task that draws the results, also of a plug-in, such as warning for accidents.  "
+    "[default: the kind of the results]",
 )
 @cooperating_parameter("Agents to show", "available")
 def replay(
-    scenario: str | None, out: str, results: str | None, agents: tuple[str, ...], **release: Any
+    scenario: str | None,
+    out: str,
+    results: str | None,
+    task: str | None,
+    agents: tuple[str, ...],
+    **release: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as one HTML file that plays in any browser.
 
@@ -533,6 +639,7 @@ def replay(
         scenario,
         out,
         prediction=prediction,
+        task=task,
         agents=names_or_configuration(agents),
         progress=True,
     )

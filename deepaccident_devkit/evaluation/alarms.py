@@ -1,9 +1,11 @@
 """Alarms in predictions: explicit accidents, or accidents in motion maps, and their actors."""
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnAlarm, DrawnPlaces, joined_drawing
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceAccident,
@@ -30,6 +32,8 @@ Pair = tuple[int | None, int | None]
 # An alarm and the actors that it names.
 NamedAlarm = tuple[Accident, Pair]
 _RELEASED_LABELS = MotionLabelConfig()
+# Pictures show an alarm from this score on, if the protocol has no threshold.
+_FIRES_FROM = 0.5
 
 
 def named_alarms(
@@ -62,6 +66,38 @@ def named_alarms(
         alarms = [(accident, _name_actors(accident, truth)) for accident in prediction]
     counted_alarms = [alarm for alarm in alarms if alarm[0].score >= MIN_SCORE]
     return sorted(counted_alarms, key=lambda alarm: alarm_sort_key(alarm[0]))
+
+
+def drawing_of_alarms(
+    true: Accident | None, alarms: Sequence[Accident], threshold: float | None = None
+) -> Drawing:
+    """Describe alarms and the true accident for a picture.
+
+    Args:
+        true: The accident that follows; None for none.
+        alarms: Alarms in descending order of score.
+        threshold: Lowest score that raises an alarm; None for 0.5.
+    """
+    words = "no collision ahead"
+    places = joined_drawing(alarms).places
+    if true is not None:
+        words = f"collision in {true.time:.1f} s"
+        actual = DrawnPlaces(
+            xy=true.positions,
+            time=true.time,
+            role="collision",
+            note=f"in {true.time:.1f} s",
+            label="actual collision",
+        )
+        places = (actual, *places)
+    if not alarms:
+        alarm = DrawnAlarm(score=0.0, fires=False)
+        return Drawing(places=places, alarm=alarm, words=f"{words}; no alarm")
+    highest = alarms[0]
+    lowest_score = _FIRES_FROM if threshold is None else threshold
+    alarm = DrawnAlarm(score=highest.score, fires=highest.score >= lowest_score)
+    words = f"{words}; alarm for a collision {highest.words}"
+    return Drawing(places=places, alarm=alarm, words=words)
 
 
 def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.drawing import Drawing, joined_drawing
 from deepaccident_devkit.evaluation.sample_counts import Counts, SampleCounts
 from deepaccident_devkit.evaluation.task import TaskResult, headlines, plain, protocol_of
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
@@ -33,9 +34,9 @@ class Evaluator(SampleCounts, Generic[_Result]):
     - `result_of`, which computes the result from the counts of samples; the result's `rows`
       describe its numbers.
 
-    All other methods have a default. Pictures of a result are drawn in `render.evaluation`, from
-    the result and from `counts`. Evaluators that are not tasks, but add numbers to a task's
-    numbers, only need `settings`, `update` and `result_of`.
+    All other methods have a default. `drawing` describes the picture of a sample. Pictures of a
+    result are drawn in `render.evaluation`, from the result and from `counts`. Evaluators that are
+    not tasks, but add numbers to a task's numbers, only need `settings`, `update` and `result_of`.
 
     Attributes:
         task: Name of the task.
@@ -108,6 +109,26 @@ class Evaluator(SampleCounts, Generic[_Result]):
     def read(self, results: Any, dataset: Dataset, token: str) -> Any:  # noqa: ARG002 - boxes need the data set
         """Read the prediction for a sample from results, in the form that `update` expects."""
         return results.prediction(token)
+
+    def drawing(
+        self,
+        dataset: Dataset,  # noqa: ARG002 - tasks use them
+        token: str,  # noqa: ARG002
+        prediction: Any,
+        /,
+        *truth: Any,  # noqa: ARG002
+    ) -> Drawing:
+        """Describe the picture of a sample; by default, the prediction without the truth.
+
+        Args:
+            dataset: Release with the sample.
+            token: Token of the sample.
+            prediction: Prediction, as `update` takes it.
+            truth: What `truth` returns.
+        """
+        if isinstance(prediction, list | tuple):
+            return joined_drawing(prediction)
+        return joined_drawing([prediction])
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -257,7 +257,8 @@ def numbers_of_draws(
     for result in evaluator.resampled(parts, times):
         numbers = numbers_of(result)
         rows.append([numbers.get(path, math.nan) for path in paths])
-    return np.array(rows).reshape(len(rows), len(paths))  # two axes even without names
+    numbers_by_draw = np.array(rows)
+    return numbers_by_draw.reshape(len(rows), len(paths))  # two axes even without names
 
 
 def standard_errors(values: FloatArray, left_out: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -323,8 +323,9 @@ def map_accident(
     """
     shapes = _read_shapes(instance, grid.orientation)
     cell_size = np.array([grid.x[2], grid.y[2]])
+    tracks = _make_tracks(shapes, len(instance), grid, rules)
     return InstanceAccident(
-        tracks=_make_tracks(shapes, len(instance), grid, rules),
+        tracks=tracks,
         contact=_find_contact(shapes, cell_size, reading.danger_distance),
     )
 

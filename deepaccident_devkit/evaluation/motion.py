@@ -7,7 +7,10 @@ from itertools import chain
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
+import numpy as np
+
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnPath, Role
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
     CLASSES,
@@ -45,6 +48,7 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, ShortRepr
 from deepaccident_devkit.support.text import counted, settle_choices
+from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 __all__ = [
     "MOTION_PROTOCOLS",
@@ -180,6 +184,29 @@ class MotionResult(TaskResult):
     notes: tuple[str, ...] = ()
 
 
+def predicted_instances(output: MotionOutput) -> Any:
+    """Return the instance maps (T, H, W) of the last prediction, in the orientation of the grid."""
+    if output.heads is not None:
+        return predict_instances(output.heads[-1], "motion").instance
+    maps = np.asarray(output.instances)
+    return maps[-1]
+
+
+def _drawn_paths(
+    paths: Mapping[int, FloatArray], step: float, role: Role, label: str
+) -> list[DrawnPath]:
+    """Describe the paths (T, 2) of instances for a picture; `step` is in seconds.
+
+    Instances with one position have no path.
+    """
+    drawn_paths = []
+    for path in paths.values():
+        times = np.arange(len(path), dtype=np.float64) * step
+        if len(path) > 1:
+            drawn_paths.append(DrawnPath(xy=path, times=times, role=role, label=label))
+    return drawn_paths
+
+
 class MotionEvaluator(Evaluator[MotionResult]):
     """Evaluator of motion: IoU and VPQ of the last prediction, path errors of all predictions.
 
@@ -239,6 +266,20 @@ class MotionEvaluator(Evaluator[MotionResult]):
         """
         counts = motion_counts(prediction, label, self.protocol, trajectories=self.trajectories)
         self.add(token, counts)
+
+    def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
+        """Describe the paths of predicted instances (the last prediction) and of true ones."""
+        (label,) = truth
+        present = labels_at_present(label)
+        step = label.config.step * FRAME_PERIOD
+        true_instances = np.where(present.label_valid[:, None, None], present.instance, 0)
+        predicted = instance_paths(predicted_instances(prediction), prediction.grid)
+        true = instance_paths(true_instances, present.config.grid)
+        paths = [
+            *_drawn_paths(predicted, step, "predicted", "predicted"),
+            *_drawn_paths(true, step, "truth", "true path"),
+        ]
+        return Drawing(paths=tuple(paths))
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
         """Compute the metrics from the counts of samples, in any order."""

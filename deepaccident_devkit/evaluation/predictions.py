@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError, GeometryError
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnPlaces
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
 from deepaccident_devkit.motion import (
@@ -196,6 +197,22 @@ class Accident(FrozenArrays):
         object.__setattr__(self, "score", score)
         object.__setattr__(self, "ids", ids)
         FrozenArrays.__post_init__(self)
+
+    @property
+    def words(self) -> str:
+        """Time and score in words, such as `in 1.5 s, score 0.9`."""
+        return f"in {self.time:.1f} s, score {self.score:.2g}"
+
+    def drawing(self) -> Drawing:
+        """Describe the predicted positions for a picture."""
+        places = DrawnPlaces(
+            xy=self.positions,
+            time=self.time,
+            role="predicted",
+            note=self.words,
+            label="predicted collision",
+        )
+        return Drawing(places=(places,))
 
 
 Prediction = MotionOutput | Iterable[Accident]

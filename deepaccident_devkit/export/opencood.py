@@ -394,8 +394,9 @@ class _AgentFrames:
         lens = load_camera(self._dataset, token, self._files[name].get(index + 1))
         lidar_to_camera = self._extrinsic[name][index]
         raw_world_from_camera = raw_world_from_lidar @ inverses(lidar_to_camera)
+        world_from_camera = flip_pose(raw_world_from_camera)
         return {
-            "cords": carla_poses(flip_pose(raw_world_from_camera)).tolist(),
+            "cords": carla_poses(world_from_camera).tolist(),
             "extrinsic": lidar_to_camera.tolist(),
             "intrinsic": lens.intrinsic.tolist(),
         }

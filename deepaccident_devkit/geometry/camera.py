@@ -70,7 +70,8 @@ class PinholeCamera(FrozenArrays):
             )
         object.__setattr__(self, "intrinsic", readonly(intrinsic))
         for name in ("width", "height"):
-            object.__setattr__(self, name, _pixels(f"PinholeCamera.{name}", getattr(self, name)))
+            pixels = _pixels(f"PinholeCamera.{name}", getattr(self, name))
+            object.__setattr__(self, name, pixels)
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal: float) -> PinholeCamera:

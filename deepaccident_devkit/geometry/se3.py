@@ -278,7 +278,8 @@ def rigid_fault(matrix: FloatArray) -> str | None:
         return f"its last row is {matrix[3].tolist()}, expected 0 0 0 1"
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
-        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        product = rotation @ rotation.T
+        error = float(np.abs(product - np.eye(3)).max())
     if not error <= RIGID_TOLERANCE:  # also true for NaN, after an overflow
         return f"its rotation is not orthonormal (off by {error:.2g})"
     if np.linalg.det(rotation) < 0:

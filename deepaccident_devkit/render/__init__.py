@@ -27,6 +27,7 @@ from deepaccident_devkit.render.outcomes import (
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.styles import style
+from deepaccident_devkit.render.teaser import render_teaser
 from deepaccident_devkit.render.town_map import render_town_map
 from deepaccident_devkit.render.video import render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
@@ -57,6 +58,7 @@ __all__ = [
     "render_sample",
     "render_sample_data",
     "render_scenario_video",
+    "render_teaser",
     "render_town_map",
     "render_visibility",
     "render_visibility_matrix",

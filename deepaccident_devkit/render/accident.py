@@ -11,6 +11,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
+from deepaccident_devkit.render.bev import draw_road
 from deepaccident_devkit.render.boxes import (
     actor_tags,
     bounds_in_image,
@@ -40,7 +41,6 @@ from deepaccident_devkit.render.figures import (
     show_square,
     with_light_grid,
 )
-from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     CASING_COLOR,
@@ -52,7 +52,7 @@ from deepaccident_devkit.render.styles import (
 )
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.tables.tokens import sample_token
-from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CAMERAS, FRAME_PERIOD, short_name
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import CONTACT_GAP, contact_words
@@ -149,16 +149,16 @@ def render_accident(
         ChoiceError: No such agent, configuration or layer, or none of the moments was recorded.
     """
     shown_layers = layers_of(layers, _DEFAULT_LAYERS, PAIR_LAYERS)
-    contact = _contact(dataset, scenario, "show moments of this scenario with render_frame")
+    contact = contact_of(dataset, scenario, "show moments of this scenario with render_frame")
     record = dataset.get("scenario", scenario)
     frames = record["num_frames"]
-    cut_words = _cut_words(contact, frames)
+    warning_words = cut_words(contact, frames)
     is_column = current_style().layout == "column"
     default_seconds: Sequence[float] = COUNTDOWN
     if is_column:
         default_seconds = _COLUMN_COUNTDOWN
-    moments = _moments(seconds or default_seconds, frames)
-    names = _agent_names(dataset, record, agents)
+    moments = recorded_moments(seconds or default_seconds, frames)
+    names = agents_in_countdown(dataset, record, agents)
     size = (_PANEL_WIDTH_IN * len(moments) + 0.8, 1.95 * len(names) + _PANEL_WIDTH_IN + 1.1)
     fig = figure_or_new(fig, size, column=1.5)
     pair = CollidingPair.of(dataset, contact)
@@ -170,11 +170,11 @@ def render_accident(
                 selection_words = f"{count} of {len(names)} agents shown"
             names = _best_agents(pair, names, [frame for _, frame in moments], count)
     axes, is_wide = _panels(fig, len(names), len(moments))
-    last_word = "the last frame" if cut_words or contact.touching else "the impact"
+    last_word = "the last frame" if warning_words or contact.touching else "the impact"
     for column, (time_left, frame) in enumerate(moments):
         for agent, ax in zip(names, axes[:, column], strict=False):
             words = draw_pair_in_camera(pair, agent, frame, shown_layers, ax)
-            _write_name(words, ax)
+            write_camera_name(words, ax)
         draw_pair_from_above(pair, frame, shown_layers, axes[-1, column])
         head = last_word if time_left == 0 else f"{time_left:g} s before"
         _write_head(head, "black", axes[0, column], above=not is_wide)
@@ -184,13 +184,14 @@ def render_accident(
     _write_head(head, "black", axes[-1, 0], above=is_wide)
     contact_text = accident_words(dataset, contact)
     if is_column:
-        contact_text = _roles_and_sides(dataset, contact, with_ids=False)
-    words = "\n".join(filter(None, [contact_text, cut_words]))
+        contact_text = roles_and_sides(dataset, contact, with_ids=False)
+    words = "\n".join(filter(None, [contact_text, warning_words]))
     set_scene_title(fig, dataset, record["token"], selection_words, below=words)
     return lay_out_figure(fig)
 
 
-def _agent_names(dataset: Dataset, record: Any, agents: Agents) -> list[str]:
+def agents_in_countdown(dataset: Dataset, record: Any, agents: Agents) -> list[str]:
+    """Return the chosen agents of a scenario in drawing order; None means all present agents."""
     if agents == []:
         return []
     recorder = agents_of(dataset, record)[0]
@@ -217,7 +218,7 @@ def draw_countdown(
     shown_layers = layers_of(layers, _DEFAULT_LAYERS, PAIR_LAYERS)
     record = dataset.get("frame", frame)
     index = record["index"]
-    contact = _contact(dataset, record["scenario_token"], "the view 'frame'")
+    contact = contact_of(dataset, record["scenario_token"], "the view 'frame'")
     pair = CollidingPair.of(dataset, contact)
     axes = fig.subplot_mosaic(_MOSAIC, height_ratios=(1, 1, 0.8))
     for agent in AGENTS:
@@ -245,7 +246,7 @@ def accident_words(dataset: Dataset, contact: Contact) -> str:
     speeds = f"{number_words(contact.speeds[hitting])} and {number_words(contact.speeds[hit])} m/s"
     closing_speed = f"closing at {number_words(contact.closing_speed)} m/s"
     angle = f"{np.degrees(contact.impact_angle):.0f}° between their headings"
-    lines = [_roles_and_sides(dataset, contact), f"{speeds}, {closing_speed}, {angle}"]
+    lines = [roles_and_sides(dataset, contact), f"{speeds}, {closing_speed}, {angle}"]
     if contact.touching != 0:
         lines.append(contact_words(contact.touching, contact.gap))
     return "\n".join(lines)
@@ -258,7 +259,7 @@ def _hitting_and_hit(contact: Contact) -> tuple[int, int]:
     return 0, 1
 
 
-def _roles_and_sides(dataset: Dataset, contact: Contact, *, with_ids: bool = True) -> str:
+def roles_and_sides(dataset: Dataset, contact: Contact, *, with_ids: bool = True) -> str:
     """Describe who hits whom, and the sides that touch; agents may be named without their ids."""
     scenario = contact.frame.rsplit("/", 1)[0]
     agents = recorders_of(dataset, scenario)
@@ -322,7 +323,9 @@ class CollidingPair:
         actors = [actor for actor in self.contact.actor_ids if actor != own_actor]
         return boxes.select(np.isin(boxes.actor_id, actors))
 
-    def view(self, agent: str, index: int) -> tuple[str, BestView | None, int | None]:
+    def view(
+        self, agent: str, index: int, channels: Sequence[str] = CAMERAS
+    ) -> tuple[str, BestView | None, int | None]:
         """Select the camera of an agent that shows the pair best in a frame (numbered from 1).
 
         If any images are present, only their cameras count. If no image shows the pair, the camera
@@ -335,9 +338,9 @@ class CollidingPair:
         """
         sample = sample_token(self.scenario, agent, index)
         cameras: Sequence[str] = [
-            channel for channel in CAMERAS if has_sensor_file(self.dataset, f"{sample}/{channel}")
+            channel for channel in channels if has_sensor_file(self.dataset, f"{sample}/{channel}")
         ]
-        cameras = cameras or CAMERAS
+        cameras = cameras or channels
         for frame in range(index, max(0, index - _CAMERA_MEMORY_FRAMES), -1):
             frame_sample = sample_token(self.scenario, agent, frame)
             boxes = self.at(frame, agent)
@@ -351,16 +354,23 @@ class CollidingPair:
 
 
 def draw_pair_in_camera(
-    pair: CollidingPair, agent: str, index: int, layers: Collection[Layer], ax: Axes
+    pair: CollidingPair,
+    agent: str,
+    index: int,
+    layers: Collection[Layer],
+    ax: Axes,
+    *,
+    channels: Sequence[str] = CAMERAS,
 ) -> str:
     """Render the part of an agent's image that shows the pair, with tags.
 
-    Frames are numbered from 1. Boxes are dashed if no camera of the agent sees them. Returns the
-    camera's short name and, if it does not see the pair in this frame, how long ago it did.
+    Frames are numbered from 1. The camera is one of `channels`. Boxes are dashed if no camera of
+    the agent sees them. Returns the camera's short name and, if it does not see the pair in this
+    frame, how long ago it did.
     """
     dataset = pair.dataset
     sample = sample_token(pair.scenario, agent, index)
-    channel, view, seen_frame = pair.view(agent, index)
+    channel, view, seen_frame = pair.view(agent, index, channels)
     name = camera_name(channel)
     camera = dataset.get("sample_data", f"{sample}/{channel}")
     draw_camera(dataset, camera, {*layers}.intersection(CAMERA_LAYERS), ax)
@@ -408,7 +418,7 @@ def draw_pair_from_above(
     x, y = point.tolist()
     show_square(ax, (x, y), view_range)
     if "bev" in layers:
-        _draw_road(pair, index, view_range, ax)
+        draw_road(dataset, sample["frame_token"], [ax], target_from_world=SE3.identity())
     if "trajectories" in layers:
         draw_trails(
             dataset,
@@ -424,7 +434,7 @@ def draw_pair_from_above(
     ax.plot(x, y, "x", color="black", markersize=_CROSS_SIZE_PT, markeredgewidth=1.8, zorder=5)
     half = _CROSS_SIZE_PT / 2
     keep_free(ax, [[point]], margin=(-half, -half, half, half))
-    _draw_scale(view_range, ax, grid="grid" in layers)
+    draw_scale_bar(view_range, ax, grid="grid" in layers)
     ax.set_title(_speeds_title(pair, pair_boxes), fontsize=text_size())
 
 
@@ -449,27 +459,7 @@ def number_words(value: float) -> str:
     return "unknown"
 
 
-def _draw_road(pair: CollidingPair, index: int, view_range: float, ax: Axes) -> None:
-    """Render the ground from the BEV camera closest to the contact whose file is present."""
-    dataset = pair.dataset
-    distances = {}
-    for agent in agents_of(dataset, pair.scenario):
-        sample = sample_token(pair.scenario, agent, index)
-        if has_sensor_file(dataset, f"{sample}/{BEV_CAMERA}"):
-            position = dataset.world_from(sample, "ego").translation[:2]
-            offset = position - pair.contact.point[:2]
-            distances[sample] = float(np.abs(offset).max())
-    if distances:
-        nearest_sample = min(distances, key=distances.__getitem__)
-        draw_underlay(
-            dataset.load_bev(nearest_sample),
-            ax,
-            target_from_ego=dataset.world_from(nearest_sample, "ego"),
-            view_range=view_range + distances[nearest_sample],
-        )
-
-
-def _draw_scale(view_range: float, ax: Axes, *, grid: bool) -> None:
+def draw_scale_bar(view_range: float, ax: Axes, *, grid: bool) -> None:
     """Render a scale bar of 5 or 10 m, and a grid of that spacing, instead of axis labels."""
     from matplotlib.ticker import MultipleLocator
 
@@ -553,7 +543,7 @@ def _write_tags(tags: list[str], positions: FloatArray, ax: Axes) -> None:
     place_chips(ax, chips, colors=[COLLIDER_COLOR] * len(tags))
 
 
-def _cut_words(contact: Contact, frames: int) -> str:
+def cut_words(contact: Contact, frames: int) -> str:
     """Return a warning if the recording does not end at the contact, otherwise an empty text."""
     contact_frame = int(contact.frame.rsplit("/", 1)[1])
     if contact_frame == frames and contact.gap <= CONTACT_GAP:
@@ -564,7 +554,7 @@ def _cut_words(contact: Contact, frames: int) -> str:
     )
 
 
-def _contact(dataset: Dataset, scenario: RowArgument, alternative: str) -> Contact:
+def contact_of(dataset: Dataset, scenario: RowArgument, alternative: str) -> Contact:
     """Return how the two actors of a scenario collide.
 
     Raises:
@@ -580,7 +570,7 @@ def _contact(dataset: Dataset, scenario: RowArgument, alternative: str) -> Conta
     return contact
 
 
-def _moments(seconds: Sequence[float], frames: int) -> list[tuple[float, int]]:
+def recorded_moments(seconds: Sequence[float], frames: int) -> list[tuple[float, int]]:
     """Return (seconds before the impact, frame number) of each requested moment on record."""
     recorded = []
     for time_left in seconds:
@@ -662,7 +652,8 @@ def _best_agents(
             if view is not None:
                 shares_and_areas.append((view.total_share, view.area))
         totals = np.sum(shares_and_areas, axis=0).tolist()
-        priorities[agent] = (agent == AGENTS[0], totals)
+        is_ego = agent == AGENTS[0]
+        priorities[agent] = (is_ego, totals)
     ranked = sorted(agents, key=priorities.__getitem__, reverse=True)
     return in_drawing_order(ranked[:number])
 
@@ -686,7 +677,7 @@ def _write_head(words: str, color: str, ax: Axes, *, above: bool) -> None:
     )
 
 
-def _write_name(words: str, ax: Axes) -> None:
+def write_camera_name(words: str, ax: Axes) -> None:
     """Write a camera's name in the lower left corner of its panel, on top of the image."""
     ax.annotate(
         words,

@@ -41,8 +41,8 @@ from deepaccident_devkit.render.figures import (
 from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
-    BEV_COLORS,
     COLLIDER_COLOR,
+    EMPTY_ROAD_COLORS,
     GRID_COLOR,
     current_style,
     in_own_settings,
@@ -108,8 +108,6 @@ _BOX_MOSAICS: Mapping[str, dict[str, Any]] = {
     "page": {"mosaic": [["camera", "above"]], "width_ratios": (16, 10)},
     "column": {"mosaic": [["camera"], ["above"]], "height_ratios": (9, 16)},
 }
-# Actors at one moment would be ghosts in a picture of all moments.
-_EMPTY_ROAD_COLORS = {**BEV_COLORS, "vehicle": BEV_COLORS["road"], "pedestrian": BEV_COLORS["road"]}
 # Minimum number of metres shown on each side of the path.
 _PATH_MARGIN_M = 10.0
 
@@ -427,7 +425,7 @@ def _draw_road(
         ax,
         target_from_ego=world_from_ego,
         view_range=view_range + distance,
-        colors=_EMPTY_ROAD_COLORS,
+        colors=EMPTY_ROAD_COLORS,
     )
 
 

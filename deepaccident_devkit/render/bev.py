@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, get_args
 
@@ -45,6 +45,7 @@ from deepaccident_devkit.render.figures import (
 from deepaccident_devkit.render.ground import draw_underlay
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
+    BEV_COLORS,
     CASING_COLOR,
     COLLIDER_COLOR,
     GRID_COLOR,
@@ -55,6 +56,7 @@ from deepaccident_devkit.render.styles import (
 from deepaccident_devkit.render.town_map import draw_town_map, map_beneath
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import BEV_CAMERA, AgentName, Frame, short_name
 from deepaccident_devkit.v2x import (
     Agents,
@@ -65,6 +67,7 @@ from deepaccident_devkit.v2x import (
     cooperative_boxes,
     transform,
 )
+from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.messages import messages
 
 if TYPE_CHECKING:
@@ -282,6 +285,51 @@ def _draw_ground(
             view_range=float(view.half.max()) + distance,
         )
     return has_picture or town is not None
+
+
+def draw_road(
+    dataset: Dataset,
+    moment: str,
+    axes: Sequence[Axes],
+    *,
+    target_from_world: SE3,
+    colors: Mapping[str, str] = BEV_COLORS,
+) -> None:
+    """Draw the road beneath what axes show, as the BEV camera nearest to their middle saw it.
+
+    If no agent's picture is present, the road is from the town map, or nothing is drawn if none is
+    stored.
+
+    Args:
+        dataset: The release.
+        moment: Token of a frame.
+        axes: Axes to render on; the first one's middle counts. Their limits stay as they are.
+        target_from_world: Pose of the world in the frame of the axes.
+        colors: Colour by name of a tag.
+    """
+    scenario, number = moment.rsplit("/", 1)
+    middle = np.mean(axes[0].viewLim.get_points(), axis=0)
+    poses = {}
+    distances = {}
+    for agent in agents_of(dataset, scenario):
+        sample = sample_token(scenario, agent, int(number))
+        if has_sensor_file(dataset, f"{sample}/{BEV_CAMERA}"):
+            poses[sample] = target_from_world @ dataset.world_from(sample, "ego")
+            offset = poses[sample].translation[:2] - middle
+            distances[sample] = float(np.abs(offset).max())
+    if not distances:
+        town = map_beneath(dataset, scenario, make=False)
+        if town is not None:
+            for ax in axes:
+                draw_town_map(town, ax, target_from_world=target_from_world)
+        return
+    nearest_sample = min(distances, key=distances.__getitem__)
+    image = dataset.load_bev(nearest_sample)
+    pose = poses[nearest_sample]
+    for ax in axes:
+        edges = ax.viewLim.get_points() - pose.translation[:2]
+        view_range = float(np.abs(edges).max())
+        draw_underlay(image, ax, target_from_ego=pose, view_range=view_range, colors=colors)
 
 
 def _missing_ground_text(

@@ -555,7 +555,8 @@ def actor_tags(dataset: Dataset, contact: Contact) -> dict[int, str]:
 
     An agent is named by its letters, such as `E` or `OB`, and any other actor by its category.
     """
-    agents = recorders_of(dataset, contact.frame.rsplit("/", 1)[0])
+    scenario, _ = contact.frame.rsplit("/", 1)
+    agents = recorders_of(dataset, scenario)
     tags = {}
     for actor, instance_token in zip(contact.actor_ids, contact.instances, strict=True):
         if actor in agents:

@@ -57,7 +57,7 @@ def draw_underlay(
         ax,
         extent=(-reach, reach, -reach, reach),
         target_from_cells=target_from_ego,
-        zorder=0,
+        zorder=-0.5,  # beneath the cells of labels, above a town map
         colors=colors,
     )
 

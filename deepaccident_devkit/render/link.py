@@ -12,7 +12,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import concatenate
-from deepaccident_devkit.render.bev import BevView, draw_bev, link_words
+from deepaccident_devkit.render.bev import BevView, draw_bev, draw_road, link_words
 from deepaccident_devkit.render.boxes import (
     ARROW_STYLE,
     collider_ids,
@@ -38,6 +38,7 @@ from deepaccident_devkit.render.figures import (
 )
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
+    CASING_COLOR,
     MUTED_COLOR,
     OWN_COLOR,
     TRUE_PLACE_COLOR,
@@ -56,8 +57,8 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.tables.records import SampleRecord
 
-_LINK_LAYERS: Layers = ("points", "boxes", "ids", "grid")
-_DEFAULT_LAYERS: Layers = ("points", "boxes", "grid")
+_LINK_LAYERS: Layers = ("bev", "points", "boxes", "ids", "grid")
+_DEFAULT_LAYERS: Layers = ("bev", "points", "boxes", "grid")
 # Metres shown around the agents and the pair.
 _VIEW_MARGIN_M = 8.0
 # Minimum and maximum number of metres shown to each side.
@@ -66,6 +67,10 @@ _VIEW_RANGE_LIMITS_M = (25.0, 60.0)
 # it is shown.
 _INSET_SHARE = 0.36
 _MIN_MAGNIFICATION = 1.5
+# Letters of the magnified parts, and the smallest error that is magnified.
+_INSET_LETTERS = "AB"
+_MIN_MAGNIFIED_ERROR_M = 0.01
+_LETTER_BACKGROUND = {"facecolor": CASING_COLOR, "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
 # Metres shown around the two positions of a magnified box.
 _MAGNIFIED_MARGIN_M = 3.5
 _TRUE_LINE_STYLE = (0, (2, 1))
@@ -120,9 +125,9 @@ def render_link(
 
     The first panel shows all partners' boxes, dashed at their true positions, and in the partner's
     hue as received. Arrows lead from the true to the received positions; the legend states the mean
-    distances, and a corner shows the box with the largest error magnified. The other panels show
-    the agents' clouds, as recorded and as received; in papers and on slides only as received, and
-    in a paper's column not at all.
+    distances, and corners show the two boxes with the largest errors magnified. The other panels
+    show the agents' clouds, as recorded and as received; in papers and on slides only as received,
+    and in a paper's column not at all.
 
     Args:
         dataset: The release.
@@ -132,8 +137,9 @@ def render_link(
             None for all present agents.
         view_range: Metres shown to each side of the ego; None shows all agents and the colliding
             pair.
-        layers: Any of `points`, `boxes`, `grid` (these are the default) and `ids`. Without
-            `points`, no panel shows clouds.
+        layers: Any of `bev` (the road, if a BEV camera's picture or a town map is present),
+            `points`, `boxes`, `grid` (these are the default) and `ids`. Without `points`, no panel
+            shows clouds.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
@@ -161,17 +167,20 @@ def render_link(
     label_axes(box_ax, "ego")
     box_ax.set_title(_error_words(shared))
     _draw_shared(shared, shown_layers, box_ax)
-    if "boxes" in shown_layers:
-        _magnify_largest_error(shared, box_ax)
+    insets = _magnify_largest_errors(shared, box_ax) if "boxes" in shown_layers else []
     words = f"received by {short_name(record['agent'])}"
     write_beside(box_ax, words, (0.0, 0.0), AGENT_COLORS[record["agent"]])
     for ax, (words, cloud_link) in zip(cloud_axes, links.items(), strict=True):
         view = BevView(view_range=view_range, agents=agents, link=cloud_link)
-        draw_bev(dataset, record, view, shown_layers - {"boxes", "ids"}, ax)
+        draw_bev(dataset, record, view, shown_layers & {"points", "grid"}, ax)
         ax.set(title=f"Point clouds {words}", anchor="C")
         if "boxes" in shown_layers:
             truth = cooperative_boxes(dataset, record, agents=agents, frame="ego")
             draw_boxes_from_above(truth, ax, [OWN_COLOR] * len(truth), fill=0.0, linewidths=0.7)
+    if "bev" in shown_layers:
+        target_from_world = dataset.world_from(record, "ego").inverse()
+        axes = [box_ax, *insets, *cloud_axes]
+        draw_road(dataset, record["frame_token"], axes, target_from_world=target_from_world)
     draw_legend(fig, _legend_handles(shared), columns=4)
     set_scene_title(fig, dataset, record["token"], below=link_words(link))
     return lay_out_figure(fig)
@@ -272,36 +281,67 @@ def _draw_shared(shared: Sequence[SharedBoxes], layers: frozenset[Layer], ax: Ax
         with_light_grid(ax, "both")
 
 
-def _magnify_largest_error(shared: Sequence[SharedBoxes], ax: Axes) -> None:
-    """Magnify the visible box with the largest error, in the corner with the fewest boxes.
+def _magnify_largest_errors(shared: Sequence[SharedBoxes], ax: Axes) -> list[Axes]:
+    """Magnify the two visible boxes with the largest errors; return the axes of these parts.
 
-    There is no magnified part if no visible box has an error, or if it would hardly be larger.
+    They are in the corners with the fewest boxes. A box that the first part shows is not magnified
+    again. There is no magnified part for a box without an error, or if it would hardly be larger.
     """
     shifts = np.concatenate([np.stack(boxes.shifts, axis=1) for boxes in shared])
     low, high = np.array([ax.get_xlim(), ax.get_ylim()]).T
     is_visible = ((low < shifts) & (shifts < high)).all(axis=(1, 2))
     shifts = shifts[is_visible]
-    distances = np.linalg.norm(shifts[:, 1] - shifts[:, 0], axis=1)
-    if not distances.any():
-        return
-    center, half = square_around(shifts[distances.argmax()], _MAGNIFIED_MARGIN_M)
     side = _INSET_SHARE * (high[1] - low[1])
-    magnification = side / (2 * half)
-    if magnification < _MIN_MAGNIFICATION:
-        return
-    size = side / (high - low)
-    corners = (1 - size) * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
-    places = (shifts.reshape(-1, 2) - low) / (high - low)
-    is_covered = (np.abs(places - corners[:, None] - size / 2) < size / 2).all(axis=2)
-    corner = corners[is_covered.sum(axis=1).argmin()]
-    inset = ax.inset_axes((*corner, *size))
+    corners = low + (high - low - side) * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+    is_covered = np.abs(shifts.reshape(-1, 2) - corners[:, None] - side / 2) < side / 2
+    num_covered = is_covered.all(axis=2).sum(axis=1)
+    insets: list[Axes] = []
+    for letter in _INSET_LETTERS:
+        distances = np.linalg.norm(shifts[:, 1] - shifts[:, 0], axis=1)
+        if distances.max(initial=0.0) < _MIN_MAGNIFIED_ERROR_M:
+            break
+        center, half = square_around(shifts[distances.argmax()], _MAGNIFIED_MARGIN_M)
+        magnification = side / (2 * half)
+        if magnification < _MIN_MAGNIFICATION:
+            break
+        corner_distances = np.linalg.norm(corners + side / 2 - center, axis=1)
+        best = np.lexsort((corner_distances, num_covered))[0]
+        inset = _magnify(shared, ax, corners[best], center=center, half=half)
+        # letters, because lines from the parts to their places would cross
+        words = f"{letter}: {distances.max():.2f} m, ×{magnification:.0f}"
+        left, top = center + half * np.array([-1, 1])
+        for text_ax, text in ((inset, words), (ax, letter)):
+            text_ax.annotate(
+                text,
+                (left, top),
+                xytext=(3, -3),
+                textcoords="offset points",
+                ha="left",
+                va="top",
+                bbox=_LETTER_BACKGROUND,
+                zorder=6,
+            )
+        insets.append(inset)
+        is_magnified = (np.abs(shifts - center) < half).all(axis=(1, 2))
+        shifts = shifts[~is_magnified]
+        corners = np.delete(corners, best, axis=0)
+        num_covered = np.delete(num_covered, best)
+    return insets
+
+
+def _magnify(
+    shared: Sequence[SharedBoxes], ax: Axes, corner: FloatArray, *, center: FloatArray, half: float
+) -> Axes:
+    """Draw the square around `center` magnified, with its lower left at `corner`, metres."""
+    low, high = ax.viewLim.get_points()
+    side = _INSET_SHARE * (high[1] - low[1])
+    inset = ax.inset_axes((*(corner - low) / (high - low), *side / (high - low)))
     show_square(inset, center, half)
     inset.set(xticks=[], yticks=[])
     _draw_shared(shared, frozenset({"boxes"}), inset)
-    words = f"{distances.max():.2f} m, ×{magnification:.0f}"
-    inset.text(0.04, 0.96, words, ha="left", va="top", transform=inset.transAxes)
-    ax.indicate_inset_zoom(inset, edgecolor=MUTED_COLOR, alpha=1.0)
-    keep_free(ax, [low + np.stack([corner, corner + size]) * (high - low)])
+    ax.indicate_inset((*(center - half), 2 * half, 2 * half), edgecolor=MUTED_COLOR, alpha=1.0)
+    keep_free(ax, [[corner, corner + side], [center - half, center + half]])
+    return inset
 
 
 def _legend_handles(shared: Sequence[SharedBoxes]) -> list[Artist]:
@@ -339,7 +379,8 @@ def _shift_words(shared: SharedBoxes) -> str:
     if not len(starts):
         return f"{name}: no box in common"
     distances = np.linalg.norm(ends - starts, axis=1)
-    return f"{name}: {distances.mean():.2f} m"
+    mean_distance = distances.mean()
+    return f"{name}: {mean_distance:.2f} m"
 
 
 def _error_words(shared: Sequence[SharedBoxes]) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 import numpy as np
@@ -16,6 +17,7 @@ from deepaccident_devkit.motion import (
     PostProcessing,
     motion_labels,
 )
+from deepaccident_devkit.render.bev import draw_road
 from deepaccident_devkit.render.boxes import collider_ids, recorder_ids
 from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.figures import (
@@ -38,7 +40,7 @@ from deepaccident_devkit.render.motion_maps import (
     maps_of_output,
     trail_handles,
 )
-from deepaccident_devkit.render.styles import current_style, in_own_settings
+from deepaccident_devkit.render.styles import EMPTY_ROAD_COLORS, current_style, in_own_settings
 from deepaccident_devkit.support.text import choice
 
 if TYPE_CHECKING:
@@ -58,6 +60,7 @@ _LAYERS_OF_STYLE: dict[MotionStyle, Layers] = {
     "maps": _MAP_LAYERS,
     "trail": TRAIL_LAYERS,
 }
+_RoadDrawer = Callable[[Sequence["Axes"]], None]
 # Maps that a small picture shows.
 _MAIN_MAPS = ("instance", "flow")
 # Number of frames in a small picture, for each `room` of a style.
@@ -90,8 +93,10 @@ def render_motion_labels(
             ego frame of its own time.
         style: `maps`, or `trail` for one panel with all frames, later ones paler, and the actors'
             paths. None means `trail` in a paper or on a slide, otherwise `maps`.
-        layers: Any of `labels` (the cells), `velocities` (the arrows of the flow), `ids` and
-            `grid`; a trail has `trajectories` instead of `velocities`. Default: the first two.
+        layers: Any of `bev` (the road beneath instances at t = 0, if a BEV camera's picture or a
+            town map is present), `labels` (the cells), `velocities` (the arrows of the flow),
+            `ids` and `grid`; a trail has `trajectories` instead of `velocities`. Default: the first
+            three.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
@@ -109,10 +114,17 @@ def render_motion_labels(
         labels = labels.to_present()
     pair = collider_ids(dataset, sample)
     agents = recorder_ids(dataset, sample)
-    fig = draw_motion_labels(
-        labels, marked=pair, agents=agents, style=style, layers=layers, fig=fig
+    record = dataset.get("sample", sample)
+    draw_road_beneath = partial(
+        draw_road,
+        dataset,
+        record["frame_token"],
+        target_from_world=dataset.world_from(record, "ego").inverse(),
+        colors=EMPTY_ROAD_COLORS,
     )
-    set_scene_title(fig, dataset, dataset.get("sample", sample)["token"], "motion labels")
+    maps = maps_of_labels(labels, pair, agents)
+    fig = _draw(maps, style, layers, fig, draw_road_beneath)
+    set_scene_title(fig, dataset, record["token"], "motion labels")
     if style == "trail":
         return lay_out_figure(fig)
     return fig
@@ -272,22 +284,38 @@ def _at_present(maps: MotionMaps) -> MotionMaps:
 
 
 def _draw(
-    maps: MotionMaps, style: MotionStyle, layers: Iterable[Layer] | None, fig: Figure | None
+    maps: MotionMaps,
+    style: MotionStyle,
+    layers: Iterable[Layer] | None,
+    fig: Figure | None,
+    draw_road_beneath: _RoadDrawer | None = None,
 ) -> Figure:
     style = choice("style", style, get_args(MotionStyle))
-    shown_layers = layers_of(layers, _DEFAULT_LAYERS[style], _LAYERS_OF_STYLE[style])
+    road_layers: Layers = () if draw_road_beneath is None else ("bev",)
+    default_layers = (*road_layers, *_DEFAULT_LAYERS[style])
+    possible_layers = (*road_layers, *_LAYERS_OF_STYLE[style])
+    shown_layers = layers_of(layers, default_layers, possible_layers)
+    if "bev" not in shown_layers or not maps.at_present:
+        draw_road_beneath = None
     if style == "maps":
-        return _draw_maps(maps, shown_layers, fig)
+        return _draw_maps(maps, shown_layers, fig, draw_road_beneath)
     trail = _at_present(maps)
     # a narrow map is as wide as its column, above a legend of three rows
     page_height = 0.6 if current_style().is_wide else 1.2
     fig = figure_or_new(fig, (6.4, 6.8), panels="one", page=page_height, column=1.2)
-    draw_trail_of(trail, shown_layers, fig.subplots())
+    ax = draw_trail_of(trail, shown_layers, fig.subplots())
+    if draw_road_beneath is not None:
+        draw_road_beneath([ax])
     draw_legend(fig, [*instance_handles(trail), *trail_handles(trail, shown_layers)])
     return fig
 
 
-def _draw_maps(maps: MotionMaps, layers: frozenset[Layer], fig: Figure | None) -> Figure:
+def _draw_maps(
+    maps: MotionMaps,
+    layers: frozenset[Layer],
+    fig: Figure | None,
+    draw_road_beneath: _RoadDrawer | None,
+) -> Figure:
     names = maps.names
     frames = list(range(len(maps.valid)))
     if current_style().shows_few_panels:
@@ -311,6 +339,10 @@ def _draw_maps(maps: MotionMaps, layers: frozenset[Layer], fig: Figure | None) -
             draw_map_of(maps, name, frame, layers, ax)
         panels[row, 0].set_ylabel(f"{name}\ny left (m)")
         draw_key(maps, name, axes[row, columns])
+    if draw_road_beneath is not None:
+        # offset and flow have white ground, because their pale shades have a meaning
+        recorded = maps.valid[frames]
+        draw_road_beneath(panels[0, recorded].tolist())
     for ax, frame in zip(panels[0], frames, strict=True):
         ax.set_title(f"+{frame * maps.step:.1f} s" if frame else "present")
     for ax in panels.flat:

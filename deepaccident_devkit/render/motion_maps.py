@@ -264,7 +264,7 @@ def draw_map_of(
         write_in_middle(ax, "not recorded")
         return ax
     if "labels" in layers:
-        _draw_picture(maps, name, frame, ax)
+        _draw_picture(maps, name, frame, layers, ax)
     if name == "flow":
         if "velocities" in layers:
             _draw_arrows(maps, frame, ax)
@@ -278,7 +278,9 @@ def draw_trail_of(maps: MotionMaps, layers: frozenset[Layer], ax: Axes) -> Axes:
     ax.set(xlim=maps.grid.x[:2], ylim=maps.grid.y[:2], aspect="equal")
     label_axes(ax, "ego")
     if "labels" in layers:
-        _draw_cells(ax, trail_picture(maps), maps)
+        instance = maps.instance.max(axis=0)
+        picture = _above_road(trail_picture(maps), instance, layers)
+        _draw_cells(ax, picture, maps)
         draw_edge(maps, maps.own, ax, OWN_COLOR)
     if "trajectories" in layers:
         _draw_paths(maps, ax)
@@ -348,9 +350,13 @@ def direction_colors(left: AnyArray, forward: AnyArray, *, longest: float) -> An
     return _STILL_GREY - strength[..., None] * (_STILL_GREY - full_colors)
 
 
-def _draw_picture(maps: MotionMaps, name: DrawnMap, frame: int, ax: Axes) -> None:
+def _draw_picture(
+    maps: MotionMaps, name: DrawnMap, frame: int, layers: frozenset[Layer], ax: Axes
+) -> None:
     if name == "instance":
-        _draw_cells(ax, maps.colors[maps.instance[frame]], maps)
+        instance = maps.instance[frame]
+        picture = _above_road(maps.colors[instance], instance, layers)
+        _draw_cells(ax, picture, maps)
         draw_edge(maps, maps.own, ax, OWN_COLOR, frame=frame)
     elif name == "centerness":
         if maps.centerness is not None:
@@ -435,6 +441,13 @@ def _with_ids_and_grid(maps: MotionMaps, frame: int, layers: frozenset[Layer], a
     if "grid" in layers:
         return with_light_grid(ax, "both")
     return ax
+
+
+def _above_road(picture: AnyArray, instance: AnyArray, layers: frozenset[Layer]) -> AnyArray:
+    """Make free cells of an RGB picture (H, W, 3) transparent if the road is drawn beneath it."""
+    if "bev" not in layers:
+        return picture
+    return np.dstack([picture, instance > 0])
 
 
 def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **style: Any) -> None:

@@ -71,6 +71,12 @@ BEV_COLORS: Mapping[str, str] = {
     "vehicle": "#d3d9e0",
     "pedestrian": "#d3d9e0",
 }
+# The road alone: actors at one moment would be ghosts in a picture of several moments.
+EMPTY_ROAD_COLORS: Mapping[str, str] = {
+    **BEV_COLORS,
+    "vehicle": BEV_COLORS["road"],
+    "pedestrian": BEV_COLORS["road"],
+}
 # The ground of a town's map in a separate picture.
 MAP_COLORS: Mapping[str, str] = {
     "road": "#868f98",
@@ -115,7 +121,7 @@ COLORS: Final = f"""
     --warning: color-mix(in srgb, var(--caution) 40%, #fff); --block: #292929; --edge: #777; }}
 }}
 """
-Drawing = TypeVar("Drawing", bound=Callable[..., Any])
+Renderer = TypeVar("Renderer", bound=Callable[..., Any])
 # Approximate height of the words in a picture, in inches: they shrink less than the picture.
 _WORDS_HEIGHT_IN = 0.5
 # Height of a line of words with the space to the next line, over the size of its letters.
@@ -239,7 +245,7 @@ def own_settings(style: _Style | None = None) -> Iterator[None]:
             _applied_style.reset(token)
 
 
-def in_own_settings(function: Drawing) -> Drawing:
+def in_own_settings(function: Renderer) -> Renderer:
     """Decorate a function so that it renders within `own_settings`."""
     return own_settings()(function)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -15,6 +15,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.accident import PAIR_LAYERS, draw_countdown
+from deepaccident_devkit.render.beside import BesideTwin
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.captions import has_sensor_file
@@ -36,6 +37,7 @@ from deepaccident_devkit.render.samples import (
     render_sample,
 )
 from deepaccident_devkit.render.styles import current_style, own_settings, using_style
+from deepaccident_devkit.render.turntable import draw_turntable
 from deepaccident_devkit.render.visibility import (
     VISIBILITY_LAYERS,
     render_visibility,
@@ -67,6 +69,9 @@ _PALETTE_PIXELS = 2_000_000
 # Function that renders a frame (a record) on an empty figure; its result is not used.
 OwnView = Callable[[Dataset, "FrameRecord", "Figure"], object]
 _DPI = 100.0
+# Shares of a comparison's height: the verdicts above the views, and the strip below them.
+_VERDICT_SHARE = 0.05
+_STRIP_SHARE = 0.25
 # Margin between views, in pixels.
 _MARGIN_PX = 5
 # Size in pixels of a picture at `_DPI` pixels per inch. Larger pictures have a higher resolution,
@@ -243,10 +248,19 @@ VIEWS: Final[Mapping[str, _View]] = {
     "calibration": _View(
         draw=render_calibration, row_kind="frame", layers=CALIBRATION_LAYERS, share=2, inches=12.0
     ),
+    "turntable": _View(
+        draw=draw_turntable,
+        row_kind="frame",
+        options=("agents",),
+        layers=(),
+        channels=(LIDAR,),
+        share=2,
+        inches=8.0,
+    ),
     "labels": _View(
         draw=partial(render_motion_labels, style="trail"),
         options=("layers",),
-        layers=TRAIL_LAYERS,
+        layers=("bev", *TRAIL_LAYERS),
         inches=5.5,
     ),
     **{
@@ -312,13 +326,20 @@ class VideoScene:
         (view, layers), *other_views = self.views
         if other_views or layers != ("image",) or len(view.channels) != 1:
             return None
+        (channel,) = view.channels
         scenario, number = frame.rsplit("/", 1)
-        camera = f"{sample_token(scenario, agent, int(number))}/{view.channels[0]}"
+        camera = f"{sample_token(scenario, agent, int(number))}/{channel}"
         if not has_sensor_file(self.dataset, camera):
             return None
         image = Image.fromarray(self.dataset.load_image(camera))
         size = (self.width, self.height)
         return np.asarray(ImageOps.pad(image, size, Image.Resampling.LANCZOS, color="white"))
+
+    @property
+    def dpi(self) -> float:
+        """Pixels per inch of the words in a picture of this size."""
+        scale = (self.width * self.height / _REFERENCE_PIXELS) ** 0.5
+        return float(_DPI * scale)
 
     def figure(
         self,
@@ -329,14 +350,46 @@ class VideoScene:
         layers: Layers | None,
     ) -> Figure:
         """Render one view of a moment on a figure of a width in pixels."""
-        scale = (self.width * self.height / _REFERENCE_PIXELS) ** 0.5
-        dpi = min(_DPI * scale, width / view.inches)
+        dpi = min(self.dpi, width / view.inches)
         with using_style(self.style), own_settings():
             fig = figure_of_pixels(width, self.height, dpi=dpi)
             layout: Any = fig.get_layout_engine()
             layout.set(w_pad=_MARGIN_PX / dpi)
             view.render(fig, self.dataset, frame, agents, layers)
         return fig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _BesideScene:
+    """How every frame of a video of an accident beside its normal twin is rendered.
+
+    Attributes:
+        scene: Size and style of the whole picture; its views show both sides.
+        twins: The accident and the twin.
+    """
+
+    scene: VideoScene
+    twins: BesideTwin
+
+    def picture(self, number: int) -> ByteArray:
+        """Render a frame number of both sides; (height, width, 3) uint8, RGB."""
+        verdict_height = round(self.scene.height * _VERDICT_SHARE)
+        strip_height = round(self.scene.height * _STRIP_SHARE)
+        view_height = self.scene.height - verdict_height - strip_height
+        left_width = self.scene.width // 2
+        sides = []
+        for side, width in zip(
+            self.twins.sides, (left_width, self.scene.width - left_width), strict=True
+        ):
+            frame = frame_token(side.scenario, min(number, len(side.gap)))
+            scene = replace(self.scene, width=width, height=view_height)
+            sides.append(scene.picture(frame))
+        with using_style(self.scene.style), own_settings():
+            verdicts = figure_of_pixels(self.scene.width, verdict_height, dpi=self.scene.dpi)
+            self.twins.write_verdicts(verdicts, number)
+            strip = figure_of_pixels(self.scene.width, strip_height, dpi=self.scene.dpi)
+            self.twins.draw_times(strip.add_subplot(), number)
+        return np.vstack([_picture_of(verdicts), np.hstack(sides), _picture_of(strip)])
 
 
 def _picture_of(fig: Any) -> ByteArray:
@@ -399,6 +452,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     path: PathType,
     *,
     views: str | OwnView | Iterable[str | OwnView] = "frame",
+    beside: Literal["twin"] | None = None,
     agents: Agents = None,
     layers: Iterable[Layer] | None = None,
     frames: Collection[int] | slice | None = None,
@@ -410,9 +464,10 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
 
     The views are named after the `render_…` functions: `frame` (the agents' front cameras next to
     one view from above), `sample` (six cameras), `bev`, `visibility`, `visibility_matrix`,
-    `calibration`, `labels` (motion labels as a trail), a camera by its channel, and `accident` (the
-    countdown to the impact: five cameras, a view from above and the speeds). `frame`, `accident`,
-    or two or three of the others side by side, fill a 16:9 picture.
+    `calibration`, `labels` (motion labels as a trail), `turntable` (the agents' points in three
+    dimensions, from a camera that goes around them once), a camera by its channel, and `accident`
+    (the countdown to the impact: five cameras, a view from above and the speeds). `frame`,
+    `accident`, or two or three of the others side by side, fill a 16:9 picture.
 
     Args:
         dataset: The release.
@@ -421,6 +476,9 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
             `video`), `.gif` or `.webp`. An earlier file is replaced when the new one is complete.
         views: A view by name, a function (dataset, frame record, figure) that renders one, or
             several side by side. A single camera with only the layer `image` fills the picture.
+        beside: `twin` shows an accident and its normal twin side by side, with one clock that
+            starts with the recordings, verdicts and the pair's time to collision. `scenario` is
+            either of the two, and `views` are shown of both: `bev` and cameras fit well.
         agents: Agents in the views, or None for all present ones. Views of one agent (`sample`,
             `bev`, cameras, …) show the first of them or, with None, the agent with the most files
             of their sensors; from above, they show the boxes and points of all `agents`.
@@ -442,7 +500,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         ChoiceError: No such view, layer, agent, frame or kind of file, or the file cannot have this
             size or rate.
         NotAvailableError: An agent is not in this release, the sample has no label, or the view is
-            `accident` and the scenario has no collision.
+            `accident` and the scenario has no collision, or there is no twin.
         MissingExtraError: The file is an `.mp4`, and the extra `video` is not installed.
         WorkerError: As in `parallel.Engine`.
     """
@@ -454,14 +512,21 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         height -= height % 2
     scene_views = views_of(views, layers)
     record = dataset.get("scenario", scenario)
-    numbers = _frame_numbers(frames, record["num_frames"])
-    tokens = [frame_token(record["token"], number) for number in numbers]
+    last_frame = record["num_frames"]
+    twins = None
+    if beside is not None:
+        choice("beside", beside, ("twin",))
+        twins = BesideTwin.of(dataset, record)
+        last_frame = twins.num_frames
+    numbers = _frame_numbers(frames, last_frame)
+    recorded_numbers = [min(number, record["num_frames"]) for number in numbers]
+    tokens = [frame_token(record["token"], number) for number in recorded_numbers]
     names_at(dataset, tokens[0], agents)  # raises errors before any worker starts
     functions = [view.draw for view, _ in scene_views if view.is_own]
     channels = {channel for view, _ in scene_views for channel in view.channels}
     view_agent = None
     if agents is None and channels:
-        view_agent = default_agent(dataset, record["token"], numbers, channels)
+        view_agent = default_agent(dataset, record["token"], recorded_numbers, channels)
     scene = VideoScene(
         dataset=dataset,
         views=scene_views,
@@ -472,9 +537,14 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     )
     workers = _workers(functions, engine.get("workers"))
     options: Engine = {"progress": True, **engine, "workers": workers}
+    render: Callable[[Any], ByteArray] = scene.picture
+    items: Sequence[Any] = tokens
+    if twins is not None:
+        render = _BesideScene(scene=scene, twins=twins).picture
+        items = numbers
     unordered = run_unordered(
-        scene.picture,
-        tokens,
+        render,
+        items,
         label="Rendering frames",
         places=Places(reads=dataset.places),
         **options,

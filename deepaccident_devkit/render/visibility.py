@@ -10,7 +10,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render.bev import draw_points_from_above
+from deepaccident_devkit.render.bev import draw_points_from_above, draw_road
 from deepaccident_devkit.render.boxes import (
     draw_boxes_from_above,
     draw_ids_from_above,
@@ -68,6 +68,7 @@ if TYPE_CHECKING:
 # more, for the agent.
 _FRAME_TOKEN_SLASHES = 2
 VISIBILITY_LAYERS: Final[Layers] = (
+    "bev",
     "points",
     "boxes",
     "ids",
@@ -75,7 +76,7 @@ VISIBILITY_LAYERS: Final[Layers] = (
     "visibility",
     "grid",
 )
-_DEFAULT_LAYERS: Layers = ("boxes", "visibility", "grid")
+_DEFAULT_LAYERS: Layers = ("bev", "boxes", "visibility", "grid")
 # Metres shown around the agents and the colliding pair.
 _VIEW_MARGIN_M = 10.0
 # Minimum number of metres shown to each side.
@@ -192,7 +193,8 @@ def visibility_of(
         seen[:, column] = np.isin(boxes.actor_id, visible)
         label = dataset.boxes(own_sample, "lidar")
         ids = dataset.actor_ids(own_sample)
-        ids = np.where(label.actor_id == OWN_ACTOR_ID, UNTRACKED_ID, ids)
+        is_own = label.actor_id == OWN_ACTOR_ID
+        ids = np.where(is_own, UNTRACKED_ID, ids)
         _, row, label_row = np.intersect1d(boxes.actor_id, ids, return_indices=True)
         annotated[row, column] = True
         points[row, column] = label.num_lidar_pts[label_row]
@@ -257,8 +259,9 @@ def render_visibility(
         frame: Coordinate frame: `ego`, `lidar` or `world`.
         view_range: Metres to each side of the ego; None shows all agents, the colliding pair, and
             the actors between them.
-        layers: Any of `boxes`, `visibility` (dots, lines, words), `grid` (these are the default),
-            `points` (the observing agents' LiDAR), `ids` and `velocities`.
+        layers: Any of `bev` (the road, if a BEV camera's picture or a town map is present),
+            `boxes`, `visibility` (dots, lines, words), `grid` (these are the default), `points`
+            (the observing agents' LiDAR), `ids` and `velocities`.
         ax: Axes to render on, new ones if None. In a figure of your own, the title is yours.
 
     Returns:
@@ -280,9 +283,12 @@ def render_visibility(
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", anchor="N")
     label_axes(ax, frame)
     ax.locator_params(nbins=6)  # each tick costs time
+    token = dataset.get("sample", visibility.sample)["frame_token"]
+    if "bev" in shown_layers:
+        target_from_world = dataset.world_from(visibility.sample, frame).inverse()
+        draw_road(dataset, token, [ax], target_from_world=target_from_world)
     if "points" in shown_layers:
         _draw_points(dataset, visibility, frame, ax)
-    token = dataset.get("sample", visibility.sample)["frame_token"]
     set_scene_title(ax, dataset, token, "who sees whom")
     hidden = visibility.hidden_from(visibility.ego)
     colors = role_colors(dataset, visibility.sample, visibility.boxes)

@@ -6,7 +6,8 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.geometry import SE3, Boxes, quaternions
+from deepaccident_devkit.geometry import SE3, Boxes, quaternions, time_to_collision
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.geometry.boxes import trusted_boxes
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.tables.tables import token_of
@@ -167,3 +168,30 @@ def scenario_tracks(dataset: Dataset, scenario: RowArgument) -> ScenarioTracks:
     index = frame_rows[rows].astype(np.int64) - first_frame + 1
     agents = tracks["agents"][rows]
     return ScenarioTracks(boxes=boxes, index=index, agents=agents)
+
+
+def pair_approach(
+    tracks: ScenarioTracks, pair: tuple[int, int], num_frames: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return how close two actors are in each of T frames, from above, as by `interactions`.
+
+    Args:
+        tracks: A scenario's tracks.
+        pair: Ids of the two actors.
+        num_frames: The scenario's number of frames T.
+
+    Returns:
+        Gap between the two in metres, and time to collision in seconds; shape (T,) each. NaN where
+            one of the two is not annotated or its velocity is unknown; the time is infinite where
+            they would never touch.
+    """
+    boxes = np.full((2, num_frames, 5), np.nan)
+    velocity = np.full((2, num_frames, 2), np.nan)
+    for member, actor in enumerate(pair):
+        rows = np.flatnonzero(tracks.actor_id == actor)
+        track = tracks.boxes.select(rows)
+        frame = tracks.index[rows] - 1
+        columns = [track.center[:, :2], track.size[:, :2], track.yaw]
+        boxes[member, frame] = np.column_stack(columns)
+        velocity[member, frame] = track.velocity[:, :2]
+    return gaps_of_pairs(*boxes), time_to_collision(*boxes, *velocity)

@@ -1,5 +1,6 @@
 """Replays, used as a reader uses them: they play, scrub, show the impact and request nothing."""
 
+import base64
 import io
 import re
 from pathlib import Path
@@ -619,3 +620,36 @@ def test_nobody_can_make_it_load_or_run_anything(browser: Browser, page: Path) -
 
     wait_for(both_are_blocked)
     assert browser.value("window.ran === undefined") is True
+
+
+@pytest.mark.parametrize("scene", ["both", "map"])
+def test_a_saved_picture_has_twice_the_size_of_the_screen(
+    scene: str, browser: Browser, judged_page: Path, tmp_path: Path
+) -> None:
+    browser.open(judged_page, 1280)
+    choose(browser, "#scene", scene)
+    scrub(browser, 20)
+    behavior = {"behavior": "allow", "downloadPath": str(tmp_path)}
+    browser.driver.execute_cdp_cmd("Browser.setDownloadBehavior", behavior)
+    if scene == "both":
+        click(browser, "save")
+    else:
+        browser.press("s")
+    wait_for(lambda: list(tmp_path.glob("*_021.png")))
+    (path,) = tmp_path.glob("*.png")
+
+    assert read_text(browser, "announcement") == f"Saved {path.name}"
+    assert browser.complaints() == []
+    ground = "document.getElementById('ground')"
+    width, height = browser.value(f"[{ground}.clientWidth, {ground}.clientHeight]")
+    with Image.open(path) as picture:
+        saved_pixels = np.asarray(picture.convert("RGB"))
+    assert saved_pixels.shape[1] > 4 * width  # the scene and the cameras beside it
+    encoded_map = capture_map(browser).partition(",")[2]
+    with Image.open(io.BytesIO(base64.b64decode(encoded_map))) as map_image:
+        drawn_map = map_image.convert("RGB")
+    assert drawn_map.size == (width, height)  # the page itself is as it was
+    if scene == "map":
+        saved_map = Image.fromarray(saved_pixels[84 : 84 + 2 * height, 24 : 24 + 2 * width])
+        shrunk = np.asarray(saved_map.resize(drawn_map.size, Image.Resampling.BOX), dtype=float)
+        assert np.abs(shrunk - np.asarray(drawn_map, dtype=float)).mean() < 6

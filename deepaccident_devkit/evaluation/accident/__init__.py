@@ -16,7 +16,8 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     ComparedAccidents,
     average_precision,
 )
-from deepaccident_devkit.evaluation.alarms import foreseen_accident
+from deepaccident_devkit.evaluation.alarms import drawing_of_alarms, foreseen_accident
+from deepaccident_devkit.evaluation.drawing import Drawing
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.instances import prediction_accuracy
 from deepaccident_devkit.evaluation.map_accidents import AccidentReading
@@ -119,6 +120,12 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         prediction = checked_prediction(prediction)
         counts = self.protocol.counts(prediction, label, context or AccidentContext())
         self.add(token, dict(counts))
+
+    def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
+        """Describe the accidents that the protocol compares."""
+        label, context = truth
+        compared = compared_accidents(prediction, label, context, self.protocol)
+        return drawing_of_alarms(compared.true, compared.predicted)
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
         """Compute the metrics from the counts of samples, in any order."""

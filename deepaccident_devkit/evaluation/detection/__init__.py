@@ -33,6 +33,7 @@ from deepaccident_devkit.evaluation.detection.result import (
     detection_result,
     drawn_results,
 )
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnBoxes
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
@@ -138,6 +139,36 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         detections = columns_of(prediction.boxes, prediction.scores)
         counts = frame_counts(detections, columns_of(truth), self.protocol)
         self.add(token, {"token": token, **counts})
+
+    def drawing(self, dataset: Dataset, token: str, prediction: Any, /, *truth: Any) -> Drawing:
+        """Describe matched, false and missed boxes at the threshold of `detection_matches`.
+
+        The prediction may be in any frame of the sample.
+        """
+        (true_boxes,) = truth
+        frame = self.protocol.frame
+        truth_from_world = dataset.world_from(token, frame).inverse()
+        world_from_prediction = dataset.world_from(token, prediction.boxes.frame)
+        prediction = prediction.transform(truth_from_world @ world_from_prediction, frame)
+        matches = detection_matches(prediction, true_boxes, self.protocol)
+        right = DrawnBoxes(
+            boxes=prediction.boxes.select(matches.detection),
+            scores=prediction.scores[matches.detection],
+            role="right",
+            label="detected",
+        )
+        false = DrawnBoxes(
+            boxes=prediction.boxes.select(matches.false),
+            scores=prediction.scores[matches.false],
+            role="false",
+            label="false",
+        )
+        found = DrawnBoxes(
+            boxes=true_boxes.select(matches.truth), role="truth", label="true box of a detection"
+        )
+        missed = DrawnBoxes(boxes=true_boxes.select(matches.missed), role="missed", label="missed")
+        words = f"{len(right.boxes)} detected, {len(false.boxes)} false, {len(missed.boxes)} missed"
+        return Drawing(boxes=(found, right, false, missed), words=words)
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
         """Compute the metrics from the counts of samples, in any order."""

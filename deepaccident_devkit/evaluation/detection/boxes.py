@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument, Visible
 from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnBoxes
 from deepaccident_devkit.evaluation.task import as_tuples, protocol_of, switched
 from deepaccident_devkit.geometry import SE3, Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
@@ -357,6 +358,13 @@ class DetectedBoxes(FrozenArrays):
     def transform(self, target_from_source: SE3, frame: str) -> DetectedBoxes:
         """Transform the detections to another frame, such as `world` for results files."""
         return replace(self, boxes=self.boxes.transform(target_from_source, frame))
+
+    def drawing(self) -> Drawing:
+        """Describe the detections for a picture."""
+        detected = DrawnBoxes(
+            boxes=self.boxes, scores=self.scores, role="predicted", label="detected"
+        )
+        return Drawing(boxes=(detected,))
 
     def __len__(self) -> int:
         """Return the number of boxes."""

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from deepaccident_devkit.errors import GeometryError
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnPath
 from deepaccident_devkit.evaluation.instances import distances
 from deepaccident_devkit.evaluation.predictions import ascending_times
 from deepaccident_devkit.support.arrays import (
@@ -27,6 +28,8 @@ MISS_DISTANCE: Final = 2.0
 COLLISION_DISTANCE: Final = 1.0
 # Seconds by which a time may differ from its step, as sums of float32 do.
 SAME_TIME: Final = 1e-3
+# Pictures of modes divide by at least this probability.
+_MIN_PROBABILITY = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,6 +73,21 @@ class Forecast(FrozenArrays):
         object.__setattr__(self, "paths", paths)
         object.__setattr__(self, "probabilities", probabilities)
         FrozenArrays.__post_init__(self)
+
+    def drawing(self) -> Drawing:
+        """Describe the modes for a picture; the most probable one is the darkest."""
+        highest = max(float(self.probabilities.max()), _MIN_PROBABILITY)
+        modes = []
+        for path, probability in zip(self.paths, self.probabilities.tolist(), strict=True):
+            mode = DrawnPath(
+                xy=path,
+                times=self.times,
+                role="predicted",
+                probability=probability / highest,
+                label="predicted",
+            )
+            modes.append(mode)
+        return Drawing(paths=tuple(modes))
 
     def at(self, steps: FloatArray, present: FloatArray) -> FloatArray:
         """Interpolate the positions linearly at S times.

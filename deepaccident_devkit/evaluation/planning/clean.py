@@ -139,6 +139,17 @@ def _contacts(plan: Plan, scene: PlanningScene, margin: float) -> Contacts:
     )
 
 
+def plan_contacts(plan: Plan, scene: PlanningScene) -> Contacts | None:
+    """Find the first contact of a plan with each other actor, as the protocol `clean` does.
+
+    Returns:
+        The contacts; None if no later frame is recorded.
+    """
+    if len(scene.recorded) < 2:
+        return None
+    return _contacts(plan, scene, _contact_margin(scene))
+
+
 def _numbers_at_horizon(
     errors: FloatArray, scene: PlanningScene, contacts: Contacts, horizon: int
 ) -> dict[str, float]:

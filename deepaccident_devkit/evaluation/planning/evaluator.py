@@ -8,6 +8,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.evaluation.drawing import Drawing
 from deepaccident_devkit.evaluation.means import MeansEvaluator, MeansResult, Sums, table_rows
 from deepaccident_devkit.evaluation.planning.cells import (
     CELL_PROTOCOLS,
@@ -20,6 +21,7 @@ from deepaccident_devkit.evaluation.planning.cells import (
     touching,
 )
 from deepaccident_devkit.evaluation.planning.clean import CleanPlanning, add_clean
+from deepaccident_devkit.evaluation.planning.drawing import drawing_of_plan
 from deepaccident_devkit.evaluation.planning.scene import (
     Plan,
     PlanningScene,
@@ -169,6 +171,12 @@ class PlanningEvaluator(MeansEvaluator[PlanningResult]):
         else:
             _add_cell_numbers(sums, token, plans_by_row, scene, self.protocol)
         self.add(token, sums.counts())
+
+    def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
+        """Describe the best plan, the recorded path, and the contact that the plan runs into."""
+        (scene,) = truth
+        best_plan = max(prediction, key=lambda plan: plan.score)
+        return drawing_of_plan(best_plan, scene)
 
 
 def _add_cell_numbers(

@@ -12,6 +12,7 @@ from deepaccident_devkit.collisions.replay import braking_plans, motion_of, repl
 from deepaccident_devkit.collisions.twins import twin_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import EvaluationError, GeometryError
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnPath
 from deepaccident_devkit.evaluation.predictions import ascending_times
 from deepaccident_devkit.evaluation.truth import box_truth, labelled_sample
 from deepaccident_devkit.geometry.conventions import inverses, stored_transforms
@@ -80,6 +81,20 @@ class Plan(FrozenArrays):
         object.__setattr__(self, "yaw", yaw)
         object.__setattr__(self, "score", score)
         FrozenArrays.__post_init__(self)
+
+    def drawing(self, width: float = 0.0) -> Drawing:
+        """Describe the plan for a picture, from the present on.
+
+        Args:
+            width: Width of the vehicle, metres; 0 draws a line.
+        """
+        times = self.times
+        path = self.path
+        if times[0] > 0:
+            times = np.append(0.0, times)
+            path = np.vstack([np.zeros(2), path])
+        plan = DrawnPath(xy=path, times=times, role="predicted", width=width, label="plan")
+        return Drawing(paths=(plan,))
 
     def poses(self, times: FloatArray) -> FloatArray:
         """Interpolate the plan's poses at times (N,), shape (N, 3: x, y, yaw), metres and radians.

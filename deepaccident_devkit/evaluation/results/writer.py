@@ -142,7 +142,8 @@ class ResultsWriter:
                 folder = stack.enter_context(replacing_folder(self.path))
                 self._body = ShardWriter(folder, self._header, **self._motion)
             else:
-                self._body = EntryWriter(stack.enter_context(replacing(self.path)), self._header)
+                temporary = stack.enter_context(replacing(self.path))
+                self._body = EntryWriter(temporary, self._header)
             stack.callback(self._body.close)
             self._stack = stack.pop_all()
         return self

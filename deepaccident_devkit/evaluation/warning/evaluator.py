@@ -5,8 +5,11 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
 from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.evaluation.alarms import drawing_of_alarms, named_alarms, within_horizon
+from deepaccident_devkit.evaluation.drawing import Drawing
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
-from deepaccident_devkit.evaluation.predictions import Prediction
+from deepaccident_devkit.evaluation.map_accidents import AccidentReading
+from deepaccident_devkit.evaluation.predictions import Prediction, checked_prediction
 from deepaccident_devkit.evaluation.truth import AccidentContext, checked_facts, compared_facts
 from deepaccident_devkit.evaluation.warning.anticipation import AnticipationResult, CleanWarnings
 from deepaccident_devkit.evaluation.warning.field import FieldResult, FieldWarnings
@@ -83,6 +86,15 @@ class WarningEvaluator(Evaluator[Any]):
         """
         checked_facts(label, context)
         self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
+
+    def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
+        """Describe the alarms up to the horizon, and the collision that follows at any time."""
+        label, context = truth
+        checked = checked_prediction(prediction)
+        alarms = named_alarms(checked, label, context.truth, AccidentReading())
+        shown_alarms = [alarm for alarm, _ in within_horizon(alarms, context.truth)]
+        threshold = getattr(self.protocol, "threshold", None)
+        return drawing_of_alarms(context.truth.impact, shown_alarms, threshold)
 
     def result_of(self, counts: Collection[Counts]) -> _Result:
         """Compute the metrics from the counts of samples, in any order; they can be `pooled`."""

@@ -25,8 +25,9 @@ with its message:
 - `/<agent>/annotations` (SceneUpdate): the agent's own boxes, in its colour.
 - `/<agent>/motion_labels/points` (PointCloud): one point per cell and frame, only with
   `motion_labels`.
-- `/<agent>/prediction/…` (as the labels): `motion/points`, `accidents` and `boxes`, only with a
-  prediction.
+- `/<agent>/prediction/…`: `paths`, `boxes` and `marks` (SceneUpdate), `motion/points`
+  (PointCloud), and `alarm` (DoubleValue: the score of the alarm); only with a prediction. True
+  paths are white, and paths are opaque by their probability.
 - `/road/points` (PointCloud): the ground in world, from the agents' BEV cameras; sent once.
 - `/<agent>/speed` (DoubleValue): the speed in m/s, for plots.
 - `/time_to_impact` (DoubleValue): seconds, only if meta names a collision.
@@ -95,7 +96,7 @@ def export_mcap(
             addition to the labels.
         progress: Whether to show a progress bar.
         **choices: Fields of `McapConfig`: `agents`, `channels`, `frames`, `points`,
-            `motion_labels`.
+            `motion_labels`, `task`.
 
     Returns:
         The path.
@@ -103,7 +104,8 @@ def export_mcap(
     Raises:
         MissingExtraError: If the extra `mcap` is not installed.
         TokenError: If there is no such scenario.
-        ChoiceError: If there is no such choice, agent, channel or frame, or the path is a folder.
+        ChoiceError: If there is no such choice, agent, channel, frame or task, or the path is a
+            folder.
         NotAvailableError: If an agent is not in this (partial) release, or no sample in the file
             has a prediction.
         SensorFileError: If a sensor file cannot be read.
@@ -140,6 +142,7 @@ class McapConfig:
         points: n for every n-th point of a cloud; 1 for all.
         motion_labels: Configuration of motion labels, or the name of a preset (`motion.PRESETS`);
             None to leave them out.
+        task: Task that draws predictions, also of a plug-in; None for the one that they are for.
     """
 
     agents: Agents = None
@@ -147,6 +150,7 @@ class McapConfig:
     frames: Iterable[int] | None = None
     points: int = 1
     motion_labels: MotionLabelConfig | str | None = None
+    task: str | None = None
 
     def __post_init__(self) -> None:
         """Check the fields; raise ChoiceError if one is impossible."""

@@ -36,8 +36,8 @@ number = encodings.VisualizerComponentMapping(
     selector=".value",
 )
 curves = {{each: rerun.SeriesLines().visualizer(mappings=[number]) for each in {values}}}
-values = show.TimeSeriesView(name="speeds (m/s), time to impact (s)", contents=list(curves), \
-overrides=curves)
+values = show.TimeSeriesView(name="speeds (m/s), time to impact (s), alarms", \
+contents=list(curves), overrides=curves)
 blueprint = show.Blueprint(show.Horizontal(scene, show.Vertical(*cameras, values), \
 column_shares=[3, 2]))
 if __name__ == "__main__":
@@ -50,17 +50,25 @@ def write_layouts(path: Path, topics: Sequence[str]) -> None:
     """Write the layouts next to an MCAP file that has these topics.
 
     Their suffixes `.foxglove.json` and `.rerun.py` replace the suffix of the file. They show the
-    road, clouds and actors, the front cameras, and the speeds and the time to the impact as curves.
+    road, clouds, actors and predictions, the front cameras, and the speeds, the time to the impact
+    and the scores of alarms as curves.
     """
     clouds = [topic for topic in topics if topic.endswith(f"/{LIDAR}/points")]
     cameras = [topic for topic in topics if topic.endswith("/Camera_Front/image")][:2]
-    values = [topic for topic in topics if topic.endswith("/speed") or topic == "/time_to_impact"]
+    predicted_points = [
+        topic for topic in topics if "/prediction/" in topic and topic.endswith("/points")
+    ]
+    curve_ends = ("/speed", "/time_to_impact", "/prediction/alarm")
+    values = [topic for topic in topics if topic.endswith(curve_ends)]
     scene_topics: dict[str, Any] = {
         "/road/points": {"visible": True, "colorMode": "rgba-fields", "pointSize": 4},
         "/actors": {"visible": True},
     }
     for topic in clouds:
         scene_topics[topic] = {"visible": True, "colorMode": "colormap", "colorField": "z"}
+    for topic in topics:
+        if f"{topic}/points" in predicted_points or topic.endswith("/motion/points"):
+            scene_topics[topic] = {"visible": True}
     paths = [{"value": f"{topic}.value", "enabled": True} for topic in values]
     panels: dict[str, Any] = {
         "3D!scene": {"followMode": "follow-none", "followTf": "world", "topics": scene_topics},
@@ -75,6 +83,6 @@ def write_layouts(path: Path, topics: Sequence[str]) -> None:
     layout = {"direction": "row", "first": "3D!scene", "second": side, "splitPercentage": 60}
     foxglove = {"configById": panels, "globalVariables": {}, "userNodes": {}, "layout": layout}
     write_bytes(path.with_suffix(".foxglove.json"), json.dumps(foxglove, indent=1).encode())
-    scene = ["/road/points", "/actors/points", "/tf", *clouds]
+    scene = ["/road/points", "/actors/points", "/tf", *clouds, *predicted_points]
     script = _RERUN_TEMPLATE.format(file=path.name, scene=scene, cameras=cameras, values=values)
     write_bytes(path.with_suffix(".rerun.py"), script.encode())

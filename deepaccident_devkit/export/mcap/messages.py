@@ -332,10 +332,10 @@ def make_cube(boxes: Boxes, row: int, color: str) -> Any:
     )
 
 
-def make_lines(segments: FloatArray, color: str) -> Any:
+def make_lines(segments: FloatArray, color: str, alpha: float = 1.0) -> Any:
     """Convert segments (N, 2, 3) to a LinePrimitive that is equally thick at all distances."""
     points = segments.reshape(-1, 3)
-    return _make_line(LinePrimitive.LINE_LIST, points, color)
+    return _make_line(LinePrimitive.LINE_LIST, points, color, alpha)
 
 
 def make_strip(points: FloatArray, color: str) -> Any:
@@ -413,12 +413,12 @@ def join_points(point_arrays: Sequence[AnyArray]) -> AnyArray:
     return np.concatenate([no_points, *point_arrays])
 
 
-def _make_line(kind: int, points: FloatArray, color: str) -> Any:
+def _make_line(kind: int, points: FloatArray, color: str, alpha: float = 1.0) -> Any:
     return LinePrimitive(
         type=kind,
         pose=make_pose(np.zeros(3), _NO_ROTATION),
         thickness=_LINE_PIXELS,
         scale_invariant=True,
         points=make_points(points),
-        color=make_color(color),
+        color=make_color(color, alpha),
     )

@@ -5,11 +5,19 @@ from typing import Any, Final
 
 import numpy as np
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
+from google.protobuf.wrappers_pb2 import DoubleValue
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
+from deepaccident_devkit.evaluation.drawing import (
+    Drawing,
+    DrawnBoxes,
+    DrawnPath,
+    DrawnPlaces,
+    Role,
+)
+from deepaccident_devkit.evaluation.motion import predicted_instances
+from deepaccident_devkit.evaluation.predictions import MotionOutput
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.export.mcap import Predictions
 from deepaccident_devkit.export.mcap.messages import (
@@ -39,16 +47,16 @@ from deepaccident_devkit.motion import (
     MotionLabelConfig,
     MotionLabels,
     motion_labels_of,
-    predict_instances,
 )
+from deepaccident_devkit.render.outcomes.described import prediction_kind, task_drawing
+from deepaccident_devkit.render.outcomes.drawings import ROLE_COLORS, path_opacity
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     COLLIDER_COLOR,
     INSTANCE_COLORS,
-    PREDICTED_COLOR,
 )
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray
-from deepaccident_devkit.taxonomy import CATEGORIES
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
+from deepaccident_devkit.taxonomy import CATEGORIES, INFRASTRUCTURE, POLE_HEIGHT
 
 CELL_POINT: Final = np.dtype(
     [
@@ -62,7 +70,12 @@ FRAME_HEIGHT: Final = 0.2
 """Metres from each future frame up to the next one, so that no frame hides another one."""
 # Share of its opacity that an instance loses until the last frame.
 _FADED_SHARE = 0.6
-# Diameter of the spheres at the positions of a predicted accident, and their height.
+# Height of paths above the ground, metres.
+_PATH_HEIGHT_M = 0.1
+# Viewers have dark backgrounds, so the truth is white there instead of black.
+_COLORS: Mapping[Role, str] = {**ROLE_COLORS, "truth": "#ffffff"}
+_TRUE_ROLES = ("truth", "missed")
+# Diameter of the spheres at marked positions, and their height above the ground.
 _MARK_DIAMETER_M = 1.0
 _MARK_HEIGHT_M = 1.0
 _NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -156,14 +169,19 @@ def _choose_colors(ids: Sequence[int], fixed_colors: Mapping[int, str]) -> AnyAr
 class PredictedScenes:
     """Renderings of the predictions of moments, on topics below `/<agent>/prediction`."""
 
-    def __init__(self, prediction: Predictions) -> None:
-        """Store predictions by sample token; raise ConfigError for an object of another type."""
+    def __init__(self, dataset: Dataset, prediction: Predictions, task: str | None = None) -> None:
+        """Store predictions by sample token; raise ConfigError for an object of another type.
+
+        `task` is the name of the task that draws them; None for the one that they are for.
+        """
         if not isinstance(prediction, Results | Mapping):
             raise ConfigError(
                 "prediction: expected Results, or a mapping from sample tokens to predictions, "
                 f"found {type(prediction).__name__}"
             )
+        self._dataset = dataset
         self._prediction = prediction
+        self._task = task
 
     def has(self, sample: str) -> bool:
         """Return whether a sample has a prediction."""
@@ -172,8 +190,8 @@ class PredictedScenes:
     def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the predictions for the samples of a moment.
 
-        Raises ConfigError for a prediction of an unknown type, and ResultsError if results cannot
-        be read.
+        Raises ConfigError for a prediction of an unknown type, ChoiceError if the predictions are
+        for another task, and ResultsError if results cannot be read.
         """
         for agent, sample in moment.samples.items():
             if self.has(sample):
@@ -181,104 +199,132 @@ class PredictedScenes:
                     prediction: object = self._prediction.prediction(sample)
                 else:
                     prediction = self._prediction[sample]
-                _write_prediction(agent, prediction, moment.frame_number, recording)
+                messages = _PredictionMessages(agent, moment.frame_number, recording)
+                if isinstance(prediction, MotionOutput):
+                    messages.write_cells(prediction)
+                messages.write(self._describe(sample, prediction))
 
-
-def _write_prediction(
-    agent: str, prediction: object, frame_number: int, recording: McapRecording
-) -> None:
-    """Write a prediction of any kind; raise ConfigError for an object of another type."""
-    topic = f"/{agent}/prediction"
-    if isinstance(prediction, MotionOutput):
-        points = make_cell_points(_decode_instances(prediction), prediction.grid)
-        cloud = make_cloud(points, name_frame(agent, "ego"), frame_number)
-        recording.write(f"{topic}/motion/points", cloud, frame_number)
-    elif isinstance(prediction, DetectedBoxes):
-        _write_boxes(agent, prediction, f"{topic}/boxes", frame_number, recording)
-    elif isinstance(prediction, Sequence) and all(
-        isinstance(item, Accident) for item in prediction
-    ):
-        _write_accidents(agent, prediction, f"{topic}/accidents", frame_number, recording)
-    else:
-        raise ConfigError(
-            "prediction: expected a MotionOutput, a list of Accident or DetectedBoxes for each "
-            f"sample, found {type(prediction).__name__}"
-        )
-
-
-def _decode_instances(output: MotionOutput) -> Any:
-    """Return the instance maps (T, H, W) of the last prediction, in the orientation of the grid."""
-    if output.heads is not None:
-        return predict_instances(output.heads[-1], "motion").instance
-    maps = np.asarray(output.instances)
-    return maps[-1]
-
-
-def _write_boxes(
-    agent: str, detected: DetectedBoxes, topic: str, frame_number: int, recording: McapRecording
-) -> None:
-    boxes = detected.boxes
-    frame = name_frame(agent, boxes.frame)
-    segments = compute_box_segments(boxes)
-    entities = []
-    for row, score in enumerate(detected.scores.tolist()):
-        facts = {"category": CATEGORIES[boxes.category[row]], "score": f"{score:.3f}"}
-        entities.append(
-            make_entity(
-                str(row),
-                frame,
-                frame_number,
-                facts,
-                cubes=[make_cube(boxes, row, PREDICTED_COLOR)],
-                lines=[make_lines(segments[row], PREDICTED_COLOR)],
+    def _describe(self, sample: str, prediction: object) -> Drawing:
+        """Return what is drawn of a prediction; raise ConfigError if it is of an unknown type."""
+        task = self._task or prediction_kind(prediction)
+        if not task:
+            raise ConfigError(
+                "prediction: expected a MotionOutput, DetectedBoxes, or a list of Accidents, Plans "
+                f"or Forecasts for each sample, found {type(prediction).__name__}"
             )
-        )
-    recording.write(topic, make_scene_update(entities, frame_number), frame_number)
-    points = sample_segments(segments.reshape(-1, 2, 3), PREDICTED_COLOR)
-    recording.write(f"{topic}/points", make_cloud(points, frame, frame_number), frame_number)
+        return task_drawing(self._dataset, sample, prediction, task)
 
 
-def _write_accidents(
-    agent: str,
-    accidents: Sequence[Accident],
-    topic: str,
-    frame_number: int,
-    recording: McapRecording,
-) -> None:
-    frame = name_frame(agent, "ego")
-    entities = []
-    points = []
-    for number, accident in enumerate(accidents):
-        positions = np.column_stack([accident.positions, np.full(2, _MARK_HEIGHT_M)])
-        text = f"accident in {accident.time:.1f} s (score {accident.score:.2f})"
-        facts = {"text": text, "time": f"{accident.time:.3f}", "score": f"{accident.score:.3f}"}
-        if accident.ids is not None:
-            facts["actor_ids"] = ", ".join(map(str, accident.ids))
+class _PredictionMessages:
+    """Renderings of the drawing of an agent's sample; positions are in its ego frame."""
+
+    def __init__(self, agent: str, frame_number: int, recording: McapRecording) -> None:
+        self._agent = agent
+        self._frame_number = frame_number
+        self._recording = recording
+        self._topic = f"/{agent}/prediction"
+        self._ground = -POLE_HEIGHT if agent == INFRASTRUCTURE else 0.0
+
+    def write(self, drawing: Drawing) -> None:
+        """Write paths, boxes and marks, and the score of the alarm."""
+        self._write_scene("paths", "ego", [*map(self._render_path, drawing.paths)])
+        boxes_frame = "ego"
+        boxes = []
+        for drawn in drawing.boxes:
+            boxes_frame = drawn.boxes.frame
+            boxes += self._render_boxes(drawn)
+        self._write_scene("boxes", boxes_frame, boxes)
+        self._write_scene("marks", "ego", [*map(self._render_places, drawing.places)])
+        if drawing.alarm is not None:
+            score = DoubleValue(value=drawing.alarm.score)
+            self._recording.write(f"{self._topic}/alarm", score, self._frame_number)
+
+    def write_cells(self, output: MotionOutput) -> None:
+        """Write the cells of predicted instances."""
+        points = make_cell_points(predicted_instances(output), output.grid)
+        cloud = make_cloud(points, self._agent, self._frame_number)
+        self._recording.write(f"{self._topic}/motion/points", cloud, self._frame_number)
+
+    def _write_scene(
+        self, name: str, frame: str, renderings: Sequence[tuple[Any, AnyArray]]
+    ) -> None:
+        """Write entities and their points; without entities, remove the topic's earlier ones."""
+        topic = f"{self._topic}/{name}"
+        if not renderings and topic not in self._recording.topics:
+            return
+        number = self._frame_number
+        entities: list[Any] = []
+        for entity, _ in renderings:
+            entity.id = f"{entity.id} {len(entities)}"
+            entities.append(entity)
+        self._recording.write(topic, make_scene_update(entities, number), number)
+        points = join_points([points for _, points in renderings])
+        cloud = make_cloud(points, name_frame(self._agent, frame), number)
+        self._recording.write(f"{topic}/points", cloud, number)
+
+    def _render_path(self, path: DrawnPath) -> tuple[Any, AnyArray]:
+        positions = self._at_height(path.xy, _PATH_HEIGHT_M)
+        segments = np.stack([positions[:-1], positions[1:]], axis=1)
+        color = _COLORS[path.role]
+        opacity = path_opacity(path)
+        facts = {
+            "label": path.label,
+            "probability": f"{path.probability:.3f}",
+            "end": f"{path.times[-1]:.3f}",
+        }
+        lines = [make_lines(segments, color, opacity)]
+        entity = make_entity(path.role, self._agent, self._frame_number, facts, lines=lines)
+        return entity, sample_segments(segments, color, opacity)
+
+    def _render_boxes(self, drawn: DrawnBoxes) -> list[tuple[Any, AnyArray]]:
+        """Render boxes; true ones have no faces."""
+        boxes = drawn.boxes
+        frame = name_frame(self._agent, boxes.frame)
+        color = _COLORS[drawn.role]
+        renderings = []
+        for row, segments in enumerate(compute_box_segments(boxes)):
+            facts = {"label": drawn.label, "category": CATEGORIES[boxes.category[row]]}
+            if drawn.scores is not None:
+                facts["score"] = f"{drawn.scores[row]:.3f}"
+            cubes = []
+            if drawn.role not in _TRUE_ROLES:
+                cubes = [make_cube(boxes, row, color)]
+            entity = make_entity(
+                drawn.role,
+                frame,
+                self._frame_number,
+                facts,
+                cubes=cubes,
+                lines=[make_lines(segments, color)],
+            )
+            renderings.append((entity, sample_segments(segments, color)))
+        return renderings
+
+    def _render_places(self, places: DrawnPlaces) -> tuple[Any, AnyArray]:
+        positions = self._at_height(places.xy, _MARK_HEIGHT_M)
+        color = _COLORS[places.role]
+        segments = np.stack([positions[:-1], positions[1:]], axis=1)
         label_position = positions.mean(axis=0) + np.array([0.0, 0.0, _MARK_DIAMETER_M])
-        entities.append(
-            make_entity(
-                str(number),
-                frame,
-                frame_number,
-                facts,
-                spheres=list(map(_make_sphere, positions)),
-                lines=[make_lines(positions[None], PREDICTED_COLOR)],
-                texts=[make_label(text, label_position, PREDICTED_COLOR)],
-            )
+        entity = make_entity(
+            places.role,
+            self._agent,
+            self._frame_number,
+            {"label": places.label, "note": places.note, "time": f"{places.time:.3f}"},
+            spheres=[_make_sphere(position, color) for position in positions],
+            lines=[make_lines(segments, color)],
+            texts=[make_label(places.note, label_position, color)],
         )
-        points += [
-            color_points(positions, PREDICTED_COLOR),
-            sample_segments(positions[None], PREDICTED_COLOR),
-        ]
-    recording.write(topic, make_scene_update(entities, frame_number), frame_number)
-    recording.write(
-        f"{topic}/points", make_cloud(join_points(points), frame, frame_number), frame_number
-    )
+        points = [color_points(positions, color), sample_segments(segments, color)]
+        return entity, join_points(points)
+
+    def _at_height(self, xy: FloatArray, height: float) -> FloatArray:
+        """Return positions (N, 2) as points (N, 3) at a height above the ground, metres."""
+        return np.column_stack([xy, np.full(len(xy), self._ground + height)])
 
 
-def _make_sphere(position: Any) -> Any:
+def _make_sphere(position: FloatArray, color: str) -> Any:
     return SpherePrimitive(
         pose=make_pose(position, _NO_ROTATION),
         size=make_vector(np.full(3, _MARK_DIAMETER_M)),
-        color=make_color(PREDICTED_COLOR, 0.8),
+        color=make_color(color, 0.8),
     )

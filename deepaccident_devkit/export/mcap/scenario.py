@@ -161,7 +161,9 @@ def write_scenario(
             MotionMapMessages(dataset, token, resolved_label_config(config.motion_labels)).write
         )
     if prediction is not None:
-        writers.append(_open_predictions(prediction, moments, token).write)
+        scenes = PredictedScenes(dataset, prediction, config.task)
+        _check_samples(scenes, moments, token)
+        writers.append(scenes.write)
     with (
         replacing(path) as temporary,
         temporary.open("wb") as stream,
@@ -179,11 +181,8 @@ def write_scenario(
     return path
 
 
-def _open_predictions(
-    prediction: Predictions, moments: list[Moment], scenario: str
-) -> PredictedScenes:
-    """Return the renderings of predictions; raise NotAvailableError if no sample has one."""
-    scenes = PredictedScenes(prediction)
+def _check_samples(scenes: PredictedScenes, moments: list[Moment], scenario: str) -> None:
+    """Check that a sample of the moments has a prediction; raise NotAvailableError if none has."""
     samples: list[str] = []
     for moment in moments:
         samples += moment.samples.values()
@@ -192,7 +191,6 @@ def _open_predictions(
             f"prediction: has no prediction for {scenario} at these agents and frames, such as "
             f"{moments[0].first_sample!r}"
         )
-    return scenes
 
 
 def collect_metadata(dataset: Dataset, scenario: str) -> dict[str, str]:

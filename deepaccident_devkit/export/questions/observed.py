@@ -220,8 +220,9 @@ class Observations:
         all_boxes, speeds, seen_by = zip(*moments, strict=True)
         boxes = concatenate(list(all_boxes), "world")
         counts = list(map(len, all_boxes))
+        ego_from_world = self._ego_from_world(window)
         return SeenRows(
-            boxes=boxes.transform(self._ego_from_world(window), "ego"),
+            boxes=boxes.transform(ego_from_world, "ego"),
             speed=np.concatenate(speeds),
             seen_by=np.concatenate(seen_by),
             moment=np.repeat(np.arange(len(moments)), counts),

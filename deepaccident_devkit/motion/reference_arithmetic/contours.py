@@ -115,7 +115,8 @@ def _find_start_cell(mask: AnyArray, cells: IntArray) -> int:
     first_cells = cells[first_positions]
     background_parts, _ = label(mask == 0)
     background = background_parts.reshape(-1)
-    is_outside = background[first_cells - 1] == background[0]
+    outside_part = background[0]
+    is_outside = background[first_cells - 1] == outside_part
     return int(first_cells[is_outside].max())
 
 

@@ -37,7 +37,8 @@ def values_in_folder(folder: Path) -> _KeyedValues:
             value = parsed_json(read_bytes(path, "results"), constants=True)
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path}: {shortened(fault_text(error))}; write it again") from error
-        yield from values_in(value, {}, _part_keys([""], path.stem))
+        keys = _part_keys([""], path.stem)
+        yield from values_in(value, {}, keys)
 
 
 def values_in(value: Any, examined: dict[int, object], keys: list[str]) -> _KeyedValues:

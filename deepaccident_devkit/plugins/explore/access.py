@@ -461,7 +461,8 @@ class Gate:
         for header in request.headers.get("cookie", ()):
             for pair in header.split(";"):
                 name, _, value = pair.strip().partition("=")
-                if name == self._access.cookie and _is_same_secret(value, self._access.session):
+                is_our_cookie = name == self._access.cookie
+                if is_our_cookie and _is_same_secret(value, self._access.session):
                     return True
         return False
 

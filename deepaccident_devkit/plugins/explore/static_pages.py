@@ -334,7 +334,9 @@ class _Pages:
         predictions = []
         for name, model in self._models.items():
             results = model.results
-            if results is not None and results.task in FORESEEN and token in model.scenarios:
+            if results is None or results.task not in FORESEEN:
+                continue
+            if token in model.scenarios:
                 predictions.append((name, results))
         return tuple(predictions)
 

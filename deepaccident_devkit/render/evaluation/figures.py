@@ -118,7 +118,8 @@ def complete_figure(run: EvaluationRun, run_figure: RunFigure) -> Figure:
     """
     size = (PANEL[0], run_figure.height)
     figure = detached_figure(size_in_style(size, panels="one", lines=run_figure.lines))
-    run_figure.draw(ax=figure.add_subplot())
+    ax = figure.add_subplot()
+    run_figure.draw(ax=ax)
     if not current_style().shows_few_panels:
         figure.supxlabel(_origin_text(run), fontsize=6, color=MUTED_COLOR, gid=_ORIGIN_GID)
     partial_text = _partial_text(run)

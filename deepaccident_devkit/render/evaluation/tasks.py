@@ -261,7 +261,8 @@ def errors_of_first(evaluator: AccidentEvaluator, error: Literal["position", "ti
     errors = []
     for positive, alarms in _samples(evaluator):
         if positive and alarms:
-            errors.append(alarms[0][error])
+            first_alarm = alarms[0]
+            errors.append(first_alarm[error])
     errors = [value for value in errors if value is not None]
     return np.array(errors, dtype=np.float64)
 

@@ -12,6 +12,7 @@ from deepaccident_devkit.render.outcomes.cameras import (
     render_outcome_in_cameras,
 )
 from deepaccident_devkit.render.outcomes.evaluation import render_evaluation
+from deepaccident_devkit.render.outcomes.results_grid import render_results
 from deepaccident_devkit.render.outcomes.verdicts import Verdict, sample_verdict
 
 __all__ = [
@@ -24,5 +25,6 @@ __all__ = [
     "motion_outcome",
     "render_evaluation",
     "render_outcome_in_cameras",
+    "render_results",
     "sample_verdict",
 ]

@@ -183,7 +183,7 @@ def draw_accidents(
 
 def alarm_words(alarm: Accident) -> str:
     """Describe a foreseen accident by its time and score: `in 1.5 s, score 0.9`."""
-    return f"in {alarm.time:.1f} s, score {alarm.score:.2g}"
+    return alarm.words
 
 
 def difference_words(compared: ComparedAccidents) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -12,21 +11,22 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.predictions import Prediction
-from deepaccident_devkit.geometry import SE3, Boxes, PinholeCamera
+from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import (
     EDGES,
     draw_boxes_in_image,
     segments_in_image,
-    write_beside,
 )
-from deepaccident_devkit.render.camera import draw_camera_boxes, draw_image
-from deepaccident_devkit.render.captions import draw_legend, has_sensor_file, set_scene_title
-from deepaccident_devkit.render.chips import keep_free
+from deepaccident_devkit.render.camera import draw_camera_boxes
+from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, lay_out_figure
 from deepaccident_devkit.render.motion_maps import MotionMaps
 from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
+from deepaccident_devkit.render.outcomes.camera_view import CASINGS, CameraView, view_of
+from deepaccident_devkit.render.outcomes.described import sample_drawing, task_to_describe
+from deepaccident_devkit.render.outcomes.drawings import draw_drawing_in_camera, drawing_handles
 from deepaccident_devkit.render.outcomes.verdicts import (
     AccidentVerdict,
     DetectionVerdict,
@@ -37,7 +37,6 @@ from deepaccident_devkit.render.outcomes.verdicts import (
 )
 from deepaccident_devkit.render.samples import CAMERA_GRID, TALL_CAMERA_GRID
 from deepaccident_devkit.render.styles import (
-    CASING_COLOR,
     COLLIDER_COLOR,
     OUTCOME_COLORS,
     current_style,
@@ -45,161 +44,27 @@ from deepaccident_devkit.render.styles import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray
 from deepaccident_devkit.support.text import choice
-from deepaccident_devkit.taxonomy import CAMERAS, INFRASTRUCTURE, OWN_ACTOR_ID, POLE_HEIGHT
-from deepaccident_devkit.v2x.poses import camera_of
+from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Height in metres of the posts that mark positions; without them, distant rings look flat.
-_POST_HEIGHT_M = 1.5
-# Margin in points around a post that words do not cover: left, below, right and above.
-_MARK_MARGIN_PT = (-6.0, -6.0, 6.0, 6.0)
-# How much wider than a line its casing is, in points.
-_CASING_WIDTH_PT = 1.4
-# Casing colour by line colour, for pale lines; all other casings are white.
-CASINGS: Final = {OUTCOME_COLORS["missed"]: "black"}
 _FIGURE_SIZE_IN = (14.7, 7.1125)
 _ANGLES_RAD = np.linspace(0, 2 * np.pi, 33)
 # The ring around a true position and the cross at a foreseen one, of a radius of 1 m.
 _RING = [np.column_stack([np.cos(_ANGLES_RAD), np.sin(_ANGLES_RAD)])]
 _CROSS = [np.sqrt(0.5) * np.array(arm) for arm in ([[-1, -1], [1, 1]], [[-1, 1], [1, -1]])]
-# Margin in points around the middle of a panel's upper edge, where the words about a missing image
-# are: left, below, right and above.
-_MISSING_WORDS_MARGIN_PT = (-58.0, -48.0, 58.0, 0.0)
 # Opacity of instances' cells on the ground.
 _GROUND_OPACITY = 0.3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CameraView:
-    """The panel of a camera, with the geometry to draw on the ground in it.
-
-    The ground is flat: z = 0 in a vehicle's ego frame, `POLE_HEIGHT` below the infrastructure's.
-
-    Attributes:
-        camera: Token of the image (sample data).
-        sample: Token of the sample; the image is this sample's, or another agent's in the same
-            frame.
-        lens: Intrinsics of the camera.
-        optical_from_ego: Pose of the sample's ego frame in the optical frame.
-        ground: Height z of the ground in the ego frame, metres.
-        ax: Axes in pixels.
-    """
-
-    camera: str
-    sample: str
-    lens: PinholeCamera
-    optical_from_ego: SE3
-    ground: float
-    ax: Axes
-
-    def optical(self, positions: FloatArray, height: float = 0.0) -> FloatArray:
-        """Transform positions (N, 2) in the ego frame to points (N, 3) in the optical frame.
-
-        `height` is their height above the ground, metres.
-        """
-        z = np.full(len(positions), self.ground + height)
-        ego_points = np.column_stack([positions, z])
-        return self.optical_from_ego.apply(ego_points)
-
-    def on_ground(self, lines: Sequence[FloatArray]) -> list[FloatArray]:
-        """Project the parts of ground lines that are in front of the camera to pixels.
-
-        Where a line is cut, the new ends are far below the image, and so is the line between them.
-
-        Args:
-            lines: Lines in the ego frame, shape (P, 2) each, metres.
-
-        Returns:
-            The parts of each line that has any, shape (V, 2) each, pixels.
-        """
-        if not lines:
-            return []
-        points = self.optical(np.concatenate(lines))
-        line_numbers = np.repeat(np.arange(len(lines)), [*map(len, lines)])
-        is_within_line = line_numbers[1:] == line_numbers[:-1]
-        segments = np.stack([points[:-1], points[1:]], axis=1)[is_within_line]
-        segment_numbers = line_numbers[1:][is_within_line]
-        pixels, is_drawn = segments_in_image(segments, self.lens)
-        numbers, first_segments = np.unique(segment_numbers[is_drawn], return_index=True)
-        if not len(numbers):
-            return []
-        return np.split(pixels.reshape(-1, 2), 2 * first_segments[1:])
-
-    def draw_lines(
-        self, lines: Sequence[FloatArray], color: str, *, width: float, dashed: bool = False
-    ) -> None:
-        """Render lines (V, 2) in pixels, with a casing that sets them off from the image."""
-        from matplotlib.collections import LineCollection
-
-        casing_color = CASINGS.get(color, CASING_COLOR)
-        casings = LineCollection(
-            lines, colors=casing_color, linewidths=width + _CASING_WIDTH_PT, alpha=0.7
-        )
-        line_style = DASHED if dashed else "solid"
-        collection = LineCollection(lines, colors=color, linewidths=width, linestyles=line_style)
-        self.ax.add_collection(casings, autolim=False)  # the image has set the limits
-        self.ax.add_collection(collection, autolim=False)
-
-    def posts(self, positions: FloatArray) -> FloatArray:
-        """Return the feet and tops, shape (V, 2, 2), pixels, of posts at positions (N, 2).
-
-        Positions are in the ego frame; posts behind the camera are left out.
-        """
-        feet = self.optical(positions)
-        tops = self.optical(positions, _POST_HEIGHT_M)
-        segments = np.stack([feet, tops], axis=1)
-        pixels, _ = segments_in_image(segments, self.lens)
-        return pixels
-
-    def write(self, words: str, positions: FloatArray, color: str) -> None:
-        """Write words near positions (N, 2) in the ego frame.
-
-        They are written at the mean position of the posts' feet in the image. If no foot is in the
-        image, nothing is written.
-        """
-        posts = self.posts(positions)
-        feet = posts[:, 0]
-        in_image = self.lens.in_image(feet)
-        if in_image.any():
-            u, v = feet[in_image].mean(axis=0).tolist()
-            keep_free(self.ax, posts[in_image], margin=_MARK_MARGIN_PT)
-            write_beside(self.ax, words, (u, v), color)
-
-
-def view_of(
-    dataset: Dataset, sample: str, camera: str, ax: Axes, *, image: bool = True
-) -> CameraView:
-    """Render an image in a panel, or words about its absence, and return its `CameraView`.
-
-    The image may be of any agent in the sample's frame; `sample` and `camera` are tokens.
-    """
-    lens = camera_of(dataset, camera)
-    draw_image(dataset, dataset.get("sample_data", camera), ax, image=image)
-    if not has_sensor_file(dataset, camera):
-        keep_free(ax, [[(lens.width / 2, 0.0)]], margin=_MISSING_WORDS_MARGIN_PT)
-    optical_from_world = dataset.world_from(*camera.rsplit("/", 1)).inverse()
-    ground = 0.0
-    if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE:
-        ground = -POLE_HEIGHT
-    return CameraView(
-        camera=camera,
-        sample=sample,
-        lens=lens,
-        optical_from_ego=optical_from_world @ dataset.world_from(sample, "ego"),
-        ground=ground,
-        ax=ax,
-    )
 
 
 @in_own_settings
 def render_outcome_in_cameras(
     dataset: Dataset,
     sample: RowArgument,
-    prediction: Prediction | DetectedBoxes,
+    prediction: Prediction | DetectedBoxes | Sequence[Any],
     *,
     task: str | None = None,
     protocol: Any = None,
@@ -225,19 +90,54 @@ def render_outcome_in_cameras(
     show (None: the current one); a later frame shows, in the current image, where instances will
     be.
     """
-    verdict = sample_verdict(dataset, sample, prediction, task=task, protocol=protocol, label=label)
+    described_task = task_to_describe(prediction, task)
+    if described_task:
+        described = sample_drawing(
+            dataset, sample, prediction, task=described_task, protocol=protocol
+        )
+        drawing = described.drawing
+
+        def draw(channel: str, ax: Axes) -> None:
+            camera = f"{described.sample}/{channel}"
+            draw_drawing_in_camera(dataset, described.sample, drawing, camera, ax)
+
+        handles = drawing_handles(drawing)
+        return _render_cameras(dataset, described.sample, draw, handles, described.words, fig)
+    verdict = sample_verdict(
+        dataset, sample, cast(Any, prediction), task=task, protocol=protocol, label=label
+    )
     number = _checked_frame(verdict, frame)
     words = ""
     if isinstance(verdict, MotionVerdict):
         seconds = number * verdict.outcome.true.step
         if seconds:
             words = f"instances in {seconds:.1f} s"
+
+    def draw_verdict(channel: str, ax: Axes) -> None:
+        draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
+
+    handles = _handles(verdict)
+    return _render_cameras(
+        dataset, verdict.sample, draw_verdict, handles, verdict.words, fig, words
+    )
+
+
+def _render_cameras(
+    dataset: Dataset,
+    sample: str,
+    draw: Callable[[str, Axes], object],
+    handles: Sequence[Artist],
+    verdict_words: str,
+    fig: Figure | None,
+    words: str = "",
+) -> Figure:
+    """Render a panel for each camera of a sample's agent, a legend and a title."""
     fig = figure_or_new(fig, _FIGURE_SIZE_IN, column=1.3)
     grid = TALL_CAMERA_GRID if current_style().layout == "column" else CAMERA_GRID
     for channel, ax in fig.subplot_mosaic([[*row] for row in grid]).items():
-        draw_outcome_in_camera(dataset, verdict, channel, frame=frame, ax=ax)
-    draw_legend(fig, _handles(verdict))
-    set_scene_title(fig, dataset, verdict.sample, words, below=verdict.words)
+        draw(channel, ax)
+    draw_legend(fig, handles)
+    set_scene_title(fig, dataset, sample, words, below=verdict_words)
     return lay_out_figure(fig)
 
 

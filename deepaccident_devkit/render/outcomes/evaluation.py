@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +40,17 @@ from deepaccident_devkit.render.outcomes.above import (
     shown_square,
 )
 from deepaccident_devkit.render.outcomes.cameras import draw_accidents_in_camera
+from deepaccident_devkit.render.outcomes.described import (
+    SampleDrawing,
+    sample_drawing,
+    task_to_describe,
+)
+from deepaccident_devkit.render.outcomes.drawings import (
+    DRAWING_LAYERS,
+    best_camera_of_drawing,
+    draw_drawing_from_above,
+    draw_drawing_in_camera,
+)
 from deepaccident_devkit.render.outcomes.verdicts import (
     AccidentVerdict,
     DetectionVerdict,
@@ -65,8 +76,9 @@ _LAYERS_OF_TASK: Mapping[str, Layers] = {
     "accident": ("image", "bev", *ACCIDENT_LAYERS),
     "detection": DETECTION_LAYERS,
 }
-# Width and height in inches of the figure for each task.
-FIGURE_SIZES: Final = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12.4, 6.9)}
+# Width and height in inches of the figure for each judged task, and for a task that draws itself.
+_FIGURE_SIZES = {"motion": (12.4, 6.9), "accident": (12.4, 5.9), "detection": (12.4, 6.9)}
+_DRAWING_SIZE = (12.4, 5.9)
 # Relative widths of a camera's panel and the panel next to it, and relative heights of a camera's
 # panel and the panel below it.
 _CAMERA_WIDTH_RATIOS = (1.4, 1.0)
@@ -77,7 +89,7 @@ _CAMERA_HEIGHT_RATIOS = (0.6, 1.0)
 def render_evaluation(
     dataset: Dataset,
     sample: RowArgument,
-    prediction: Prediction | DetectedBoxes,
+    prediction: Prediction | DetectedBoxes | Sequence[Any],
     *,
     task: str | None = None,
     protocol: Any = None,
@@ -91,17 +103,19 @@ def render_evaluation(
     frame. For detections, boxes are matched, false or missed. For accidents, one panel shows the
     colliding pair in the camera (of any agent) that shows it best; the other shows, from above, the
     road, the actors, and the true and foreseen positions of the collision with their distances in
-    metres. The true colliding pair is red.
+    metres. The true colliding pair is red. Other tasks, also of plug-ins, draw themselves
+    (`Evaluator.drawing`): one panel shows their paths, boxes and alarms in the agent's camera, the
+    other shows them from above.
 
     Args:
         dataset: The release.
         sample: Token or record.
-        prediction: Motion, explicit accidents (a list, empty for none), or detected boxes in any
-            frame of the sample.
-        task: `motion`, `accident` or `detection`; None for the task that the prediction is for.
-            Motion can be evaluated as motion or as accident.
-        protocol: Protocol of the task, by name, or your own; None for `released`, or `boxes` for
-            explicit accidents.
+        prediction: Motion, explicit accidents (a list, empty for none), detected boxes in any frame
+            of the sample, or a list of plans or forecasts.
+        task: Task that draws the prediction; None for the one that the prediction is for. Motion
+            can be evaluated as motion, accident or warning.
+        protocol: Protocol of the task, by name, or your own; None for `released`, for `boxes` for
+            explicit accidents, or otherwise for the first of the task.
         label: Motion labels to compare motion with. None makes the labels that the protocol needs,
             on the prediction's grid and half a second apart.
         layers: For motion, any of `labels`, `trajectories`, `ids`, `grid`; for accidents, any of
@@ -120,10 +134,16 @@ def render_evaluation(
         ChoiceError: No such task, protocol or layer, or the prediction is for another task.
         EvaluationError: The protocol cannot evaluate such a prediction.
     """
+    described_task = task_to_describe(prediction, task)
+    if described_task:
+        described = sample_drawing(
+            dataset, sample, prediction, task=described_task, protocol=protocol
+        )
+        return _render_drawing(dataset, described, layers, fig)
     checked, task = check_judged_prediction(prediction, task)
     shown_layers = layers_without_ids(layers, _LAYERS_OF_TASK[task])
     verdict = sample_verdict(dataset, sample, checked, task=task, protocol=protocol, label=label)
-    fig = figure_or_new(fig, FIGURE_SIZES[task], column=1.8)
+    fig = figure_or_new(fig, figure_size(task), column=1.8)
     has_camera = task == "accident"
     if current_style().layout == "column":
         height_ratios = _CAMERA_HEIGHT_RATIOS if has_camera else None
@@ -142,6 +162,37 @@ def render_evaluation(
     else:
         _draw_accident(dataset, verdict, shown_layers, left_ax, right_ax)
     set_scene_title(fig, dataset, verdict.sample, below=verdict.words)
+    return lay_out_figure(fig)
+
+
+def figure_size(task: str) -> tuple[float, float]:
+    """Return width and height of a task's figure, inches."""
+    return _FIGURE_SIZES.get(task, _DRAWING_SIZE)
+
+
+def _render_drawing(
+    dataset: Dataset,
+    described: SampleDrawing,
+    layers: Iterable[Layer] | None,
+    fig: Figure | None,
+) -> Figure:
+    """Render a drawing in the camera that shows most of it and, next to it, from above."""
+    shown_layers = layers_without_ids(layers, DRAWING_LAYERS)
+    fig = figure_or_new(fig, _DRAWING_SIZE, column=1.8)
+    if current_style().layout == "column":
+        camera_ax, above_ax = fig.subplots(2, 1, height_ratios=_CAMERA_HEIGHT_RATIOS)
+    else:
+        camera_ax, above_ax = fig.subplots(1, 2, width_ratios=_CAMERA_WIDTH_RATIOS)
+    sample = described.sample
+    drawing = described.drawing
+    handles = draw_drawing_from_above(dataset, sample, drawing, shown_layers, above_ax)
+    draw_legend(fig, handles)
+    camera = best_camera_of_drawing(dataset, sample, drawing)
+    has_image = "image" in shown_layers
+    draw_drawing_in_camera(dataset, sample, drawing, camera, camera_ax, image=has_image)
+    agent, _, channel = camera.rsplit("/", 3)[1:]
+    camera_ax.set_title(f"{short_name(agent)}, {camera_name(channel)}", fontsize=text_size())
+    set_scene_title(fig, dataset, sample, below=described.words)
     return lay_out_figure(fig)
 
 

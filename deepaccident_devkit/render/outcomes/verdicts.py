@@ -1,7 +1,7 @@
 """The verdict of a protocol on a prediction of motion, accidents or detections for a sample."""
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
@@ -38,6 +38,8 @@ from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import cooperative_boxes
 
+# Tasks whose predictions have a verdict; the others draw themselves.
+JUDGED_TASKS: Final = ("motion", "accident", "detection")
 Judged: TypeAlias = MotionOutput | list[Accident] | DetectedBoxes
 # Configuration of the released labels: half a second from frame to frame, two seconds ahead.
 _RELEASED_CONFIG = MotionLabelConfig()
@@ -173,7 +175,7 @@ def _accident_verdict(
 ) -> AccidentVerdict:
     if label is None and hasattr(evaluator.protocol, "labels"):
         label = _make_label(dataset, token, prediction, evaluator.protocol.labels)
-    frames = _frame_count(prediction)
+    frames = num_motion_frames(prediction)
     future_frames = _RELEASED_CONFIG.future_frames if frames is None else frames - 1
     horizon = future_frames * _RELEASED_CONFIG.step * FRAME_PERIOD
     context = accident_context(dataset, token, horizon)
@@ -208,7 +210,7 @@ def _detection_verdict(
     )
 
 
-def _frame_count(prediction: Prediction) -> int | None:
+def num_motion_frames(prediction: object) -> int | None:
     """Return how many frames a motion prediction has; None for other predictions."""
     if not isinstance(prediction, MotionOutput):
         return None
@@ -222,7 +224,7 @@ def _make_label(
 ) -> MotionLabels:
     """Make a sample's motion labels (by token) on the grid and for the frames of a prediction."""
     config = replace(_RELEASED_CONFIG, protocol=protocol or "released")
-    frames = _frame_count(prediction)
+    frames = num_motion_frames(prediction)
     if isinstance(prediction, MotionOutput) and frames is not None:
         config = replace(config, grid=prediction.grid, future_frames=frames - 1)
     return motion_labels(dataset, token, config)

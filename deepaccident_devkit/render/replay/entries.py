@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +26,7 @@ from deepaccident_devkit.evaluation.predictions import checked_prediction
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
 from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
-from deepaccident_devkit.geometry import SE3, Boxes, quaternions, time_to_collision
-from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
+from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import actor_color, agent_letters, camera_name, recorders_of
 from deepaccident_devkit.render.outcomes.above import alarm_words, count_words, error_words
@@ -45,13 +44,13 @@ from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agen
 from deepaccident_devkit.v2x.agents import agents_of
 from deepaccident_devkit.v2x.collisions import default_scenario
 from deepaccident_devkit.v2x.cooperation import visible_actors
-from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
+from deepaccident_devkit.v2x.tracks import ScenarioTracks, pair_approach, scenario_tracks
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-# A results file of motion or accidents, or predictions by sample token.
-ReplayPrediction = Results | Mapping[str, MotionOutput | Iterable[Accident]]
+# A results file, or predictions by sample token.
+ReplayPrediction = Results | Mapping[str, Any]
 _PROTOCOL = BoxAccidents()
 # Maximum number of alarms of a sample that are shown: right ones first, then the most confident.
 _MAX_ALARMS = 3
@@ -206,18 +205,9 @@ def pair_entries(recording: ReplayRecording) -> dict[str, list[int | None]] | No
     """
     if not recording.pair:
         return None
+    actor, other_actor = recording.pair
     tracks = scenario_tracks(recording.dataset, recording.scenario)
-    boxes = np.full((2, len(recording.frames), 5), np.nan)
-    velocity = np.full((2, len(recording.frames), 2), np.nan)
-    for member, actor in enumerate(recording.pair):
-        rows = np.flatnonzero(tracks.actor_id == actor)
-        track = tracks.boxes.select(rows)
-        frame = tracks.index[rows] - 1
-        columns = [track.center[:, :2], track.size[:, :2], track.yaw]
-        boxes[member, frame] = np.column_stack(columns)
-        velocity[member, frame] = track.velocity[:, :2]
-    gap = gaps_of_pairs(*boxes)
-    ttc = time_to_collision(*boxes, *velocity)
+    gap, ttc = pair_approach(tracks, (actor, other_actor), len(recording.frames))
     return {"gap": _round_finite(gap * 100), "ttc": _round_finite(ttc * 10)}
 
 
@@ -339,6 +329,28 @@ def _seen_masks(recording: ReplayRecording, ids: IntArray) -> AnyArray:
     return masks
 
 
+def predicted_samples(
+    recording: ReplayRecording, prediction: ReplayPrediction
+) -> list[tuple[AgentName, int]]:
+    """Return the agents and frames with a prediction, ordered by frame.
+
+    Raises:
+        NotAvailableError: There is no prediction for this scenario and these agents.
+    """
+    samples = []
+    for frame in recording.frames:
+        for agent in recording.agents:
+            if recording.sample(agent, frame) in prediction:
+                samples.append((agent, frame))
+    if not samples:
+        raise NotAvailableError(
+            f"prediction: has no sample of {recording.scenario['token']} and "
+            f"{', '.join(recording.agents)}; choose a scenario and agents that the prediction "
+            "has, or replay without a prediction"
+        )
+    return samples
+
+
 def prediction_entries(recording: ReplayRecording, prediction: ReplayPrediction) -> dict[str, Any]:
     """Return the rule in words, and the foreseen accidents of each sample with a prediction.
 
@@ -353,16 +365,8 @@ def prediction_entries(recording: ReplayRecording, prediction: ReplayPrediction)
         seconds = (prediction.form.frames - 1) * prediction.form.step
         horizon = min(RELEASED_HORIZON, seconds)
     samples = []
-    for frame in recording.frames:
-        for agent in recording.agents:
-            if recording.sample(agent, frame) in prediction:
-                samples.append(_sample_entry(recording, prediction, agent, frame, horizon))
-    if not samples:
-        raise NotAvailableError(
-            f"prediction: has no sample of {recording.scenario['token']} and "
-            f"{', '.join(recording.agents)}; choose a scenario and agents that the prediction "
-            "has, or replay without a prediction"
-        )
+    for agent, frame in predicted_samples(recording, prediction):
+        samples.append(_sample_entry(recording, prediction, agent, frame, horizon))
     rule = (
         f"Protocol boxes: an accident within {horizon:g} s counts as predicted if the position "
         f"errors of both actors sum to less than {ERRORS_AT:g} m."

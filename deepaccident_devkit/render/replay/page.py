@@ -13,6 +13,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
 from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.captions import scenario_words
+from deepaccident_devkit.render.replay.drawn import drawing_entries, task_to_draw
 from deepaccident_devkit.render.replay.entries import (
     ReplayPrediction,
     ReplayRecording,
@@ -74,6 +75,7 @@ def render_replay(
     path: PathType,
     *,
     prediction: ReplayPrediction | None = None,
+    task: str | None = None,
     agents: Agents = None,
     progress: bool = False,
 ) -> Path:
@@ -98,9 +100,12 @@ def render_replay(
         scenario: Token or record; None for the first that ends in an accident, or if there is no
             accident, for the first one.
         path: Path of the file to write.
-        prediction: Results of a model for motion or accidents, or predictions by sample token: the
-            page shows the foreseen accidents and whether they are right by the accident protocol
-            `boxes`. None for no prediction.
+        prediction: Results of a model, or predictions by sample token; boxes in a mapping are in
+            the frame of the task's protocol. Of motion and accidents, the page shows the foreseen
+            accidents and whether they are right by the accident protocol `boxes`; of other
+            predictions, what the task draws. None for no prediction.
+        task: Name of the task that draws the predictions, also of a plug-in, such as `warning` for
+            accidents; None for the kind of the predictions.
         agents: Agents whose cameras, views and predictions the page shows, as in
             `v2x.cooperating_agents`; None for all present agents.
         progress: Whether to show a progress bar.
@@ -111,10 +116,11 @@ def render_replay(
 
     Raises:
         TokenError: No such scenario.
-        ChoiceError: No such agent, or `path` is a folder or does not end in `.html` or `.htm`.
+        ChoiceError: No such agent or task, the predictions are for another task, or `path` is a
+            folder or does not end in `.html` or `.htm`.
         NotAvailableError: The release has no scenario, lacks one of the agents, or the prediction
             is of other samples.
-        EvaluationError: The prediction is neither of motion nor of accidents.
+        EvaluationError: No task has such predictions.
         SensorFileError: An image or a point cloud cannot be read.
     """
     target = path_of(path)
@@ -127,7 +133,7 @@ def render_replay(
     recording = recording_of(dataset, scenario, agents)
     files = camera_files(recording)
     clouds = lidar_files(recording)
-    data, followed = _page_data(recording, prediction, files, clouds)
+    data, followed = _page_data(recording, prediction, task, files, clouds)
     cloud_count = sum(map(sum, clouds))
     cloud_bytes = PAGE_CLOUD_BYTES if cloud_count else 0
     page_without_sensors = replay_page("", data).encode()
@@ -177,7 +183,7 @@ def served_replay(
     recording = recording_of(dataset, scenario, None)
     files = camera_files(recording)
     clouds = lidar_files(recording)
-    data, _ = _page_data(recording, prediction, files, clouds)
+    data, _ = _page_data(recording, prediction, None, files, clouds)
     for agent, cameras in zip(recording.agents, data["cameras"], strict=True):
         for channel, camera in zip(CAMERAS, cameras, strict=True):
             camera["channel"] = channel
@@ -202,6 +208,7 @@ def lidar_files(recording: ReplayRecording) -> list[list[bool]]:
 def _page_data(
     recording: ReplayRecording,
     prediction: ReplayPrediction | None,
+    task: str | None,
     files: CameraFiles,
     clouds: list[list[bool]],
 ) -> tuple[dict[str, Any], Followed]:
@@ -221,7 +228,11 @@ def _page_data(
         impact = recording.page_coordinates(recording.contact.point[:2])
     predicted = None
     if prediction is not None:
-        predicted = prediction_entries(recording, prediction)
+        drawing_task = task_to_draw(prediction, task)
+        if drawing_task:
+            predicted = drawing_entries(recording, prediction, drawing_task)
+        else:
+            predicted = prediction_entries(recording, prediction)
     data: dict[str, Any] = {
         "scenario": token,
         "facts": facts(recording),

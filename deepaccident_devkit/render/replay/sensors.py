@@ -325,7 +325,8 @@ def _estimate_bytes(
     large_count = sum(image.large for image in images)
     small_count = len(images) - large_count
     total = large_count * large_bytes + small_count * small_bytes
-    return total / len(probes)
+    num_probes = len(probes)
+    return total / num_probes
 
 
 def _present_images(images: _Images) -> list[_Image]:

@@ -5,6 +5,7 @@ import json
 import logging
 import re
 import sys
+from dataclasses import replace
 from io import BytesIO
 from itertools import product
 from pathlib import Path
@@ -26,7 +27,14 @@ from deepaccident_devkit.errors import (
     SensorFileError,
     TokenError,
 )
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
+from deepaccident_devkit.evaluation.detection import (
+    DetectedBoxes,
+    detection_protocol,
+    detection_truth,
+)
+from deepaccident_devkit.evaluation.forecasting import Forecast
+from deepaccident_devkit.evaluation.forecasting.truth import forecasting_truth
+from deepaccident_devkit.evaluation.planning import Plan, planning_scene
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
 from deepaccident_devkit.evaluation.results import ResultsWriter, read_results
 from deepaccident_devkit.export.mcap import EPOCH, export_mcap
@@ -34,7 +42,14 @@ from deepaccident_devkit.export.mcap.layouts import write_layouts
 from deepaccident_devkit.motion import MotionHeads, motion_labels
 from deepaccident_devkit.release.npz import TAGS
 from deepaccident_devkit.render.styles import AGENT_COLORS, COLLIDER_COLOR, MAP_COLORS
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID
+from deepaccident_devkit.taxonomy import (
+    AGENTS,
+    CAMERAS,
+    INFRASTRUCTURE,
+    LIDAR,
+    OWN_ACTOR_ID,
+    POLE_HEIGHT,
+)
 from deepaccident_devkit.v2x import cooperative_boxes
 
 NUM_FRAMES = 6
@@ -552,8 +567,8 @@ def test_predicted_accidents_are_drawn_at_their_positions(
         prediction=results,
         frames=[1, 2],
     )
-    ((record, message),) = recording.messages["/ego_vehicle/prediction/accidents"]
-    (entity,) = message.entities
+    ((record, message),) = recording.messages["/ego_vehicle/prediction/marks"]
+    true, entity = message.entities
     second_transform, _ = recording.messages["/tf"][1]
 
     assert record.log_time == second_transform.log_time
@@ -561,28 +576,124 @@ def test_predicted_accidents_are_drawn_at_their_positions(
 
     positions = [sphere.pose.position for sphere in entity.spheres]
     np.testing.assert_allclose([[point.x, point.y] for point in positions], accident.positions)
-    assert ("actor_ids", "3, 9") in [(pair.key, pair.value) for pair in entity.metadata]
+    facts = {pair.key: pair.value for pair in entity.metadata}
+    assert (facts["label"], facts["time"]) == ("predicted collision", "1.500")
+    assert {pair.key: pair.value for pair in true.metadata}["label"] == "actual collision"
+    assert [alarm.value for alarm in recording.decoded("/ego_vehicle/prediction/alarm")] == [0.75]
 
 
-def test_detected_boxes_are_drawn_in_their_own_frame(
+def test_detected_boxes_are_drawn_right_false_and_missed(
     da: DeepAccident, scenario: str, tmp_path: Path
 ) -> None:
-    boxes = DetectedBoxes.from_arrays(
-        [[5, 1, 0]], [[4, 2, 1.5]], [0.5], [0.9], category=["van"], frame="lidar"
-    )
     token = sample_token(scenario, "ego_vehicle", 2)
-    recording = export_small(da, scenario, tmp_path, prediction={token: boxes})
+    true_boxes = detection_truth(da, token, detection_protocol("released"))
+    (row, *_) = np.flatnonzero(np.hypot(*true_boxes.center[:, :2].T) < 30)
+    boxes = true_boxes.select(np.array([row, row]))
+    boxes = replace(boxes, center=boxes.center + np.array([[0.0, 0, 0], [0, 25, 0]]))
+    right, false = boxes
+    in_world = boxes.transform(da.world_from(token, boxes.frame), "world")
+    detected = DetectedBoxes(boxes=in_world, scores=np.array([0.9, 0.8]))
+
+    recording = export_small(da, scenario, tmp_path, prediction={token: detected})
+
     (message,) = recording.decoded("/ego_vehicle/prediction/boxes")
-    (entity,) = message.entities
-    cube = entity.cubes[0]
-
-    assert entity.frame_id == f"ego_vehicle/{LIDAR}"
-    assert (cube.pose.position.x, cube.size.y) == (5, 2)
-
+    centers = {}
+    for entity in message.entities:
+        assert entity.frame_id == f"ego_vehicle/{LIDAR}"
+        if entity.cubes:
+            position = entity.cubes[0].pose.position
+            centers[entity.id.split()[0]] = (position.x, position.y, position.z)
+    np.testing.assert_allclose(centers["right"], right.center, atol=1e-6)
+    np.testing.assert_allclose(centers["false"], false.center, atol=1e-6)
+    assert {*centers} == {"right", "false"}
     cloud = read_cloud(recording.decoded("/ego_vehicle/prediction/boxes/points")[0])
-    offsets = read_positions(cloud)[None] - boxes.boxes.corners()[0][:, None]
+    offsets = read_positions(cloud)[None] - boxes.corners()[0][:, None]
     distances_m = np.linalg.norm(offsets, axis=-1)
     assert (distances_m.min(axis=1) < 1e-4).all()
+
+
+def read_paths(recording: McapFile) -> list[tuple[tuple[float, ...], np.ndarray]]:
+    """Read the colours (RGBA) and positions of an agent's drawn paths."""
+    (message,) = recording.decoded("/ego_vehicle/prediction/paths")
+    paths = []
+    for entity in message.entities:
+        assert entity.frame_id == "ego_vehicle"
+        (line,) = entity.lines
+        points = np.array([[point.x, point.y] for point in line.points])
+        color = (line.color.r, line.color.g, line.color.b, line.color.a)
+        paths.append((color, np.vstack([points[::2], points[-1:]])))
+    return paths
+
+
+def test_plans_and_forecasts_are_drawn_where_predictions_and_records_say(
+    da: DeepAccident, scenario: str, tmp_path: Path
+) -> None:
+    token = sample_token(scenario, "ego_vehicle", 2)
+    times = np.array([1.0, 2.0])
+    path = np.array([[5.0, 0.5], [11.0, 2.0]])
+    truth = forecasting_truth(da, token)
+    present = np.concatenate([truth.present[0], path[0]]).reshape(2, 2)
+    forecast = Forecast(
+        actor_id=int(truth.actor_id[0]),
+        times=times,
+        paths=np.stack([path, path + 1.0]),
+        probabilities=[0.8, 0.2],
+    )
+    recorded = planning_scene(da, token).recorded[:, :2]
+    true_path = np.concatenate([present[:1], truth.path[0]])
+    for prediction, expected, opacities in (
+        (Plan(times=times, path=path), [np.vstack([np.zeros(2), path]), recorded], [1, 1]),
+        (forecast, [path, path + 1.0, true_path[np.isfinite(true_path[:, 0])]], [1, 0.4, 1]),
+    ):
+        recording = export_small(da, scenario, tmp_path, prediction={token: [prediction]})
+        paths = read_paths(recording)
+        cloud = read_cloud(recording.decoded("/ego_vehicle/prediction/paths/points")[0])
+        points = read_positions(cloud)[None, :, :2]
+        for positions, opacity in zip(expected, opacities, strict=True):
+            (color,) = [
+                color
+                for color, drawn in paths
+                if len(drawn) == len(positions) and np.allclose(drawn, positions, atol=1e-5)
+            ]
+            assert color[3] == pytest.approx(opacity)
+            distances = np.linalg.norm(points - positions[:, None], axis=-1)
+            assert distances.min(axis=1).max() < 1e-4
+        if isinstance(prediction, Plan):
+            assert paths[1][0] == (1, 1, 1, 1)
+
+
+def test_marks_of_an_earlier_frame_are_removed(
+    da: DeepAccident, scenario: str, tmp_path: Path
+) -> None:
+    first, second = (sample_token(scenario, "ego_vehicle", number) for number in (2, 3))
+    alarm = Accident(positions=np.array([[5.0, 1.0], [6.0, 1.0]]), time=0.1, score=0.9)
+    plan = Plan(times=np.array([1.0]), path=np.array([[0.0, 90.0]]))
+    predictions: Any = {first: [alarm], second: [plan]}
+    recording = export_small(da, scenario, tmp_path, prediction=predictions, frames=[2, 3])
+    counts = [len(marks.entities) for marks in recording.decoded("/ego_vehicle/prediction/marks")]
+    assert counts[0] >= 1
+    assert counts[1] == 0
+
+
+@pytest.mark.slow
+def test_a_release_without_the_truth_still_shows_the_prediction(
+    unlabelled_dataset: DeepAccident, tmp_path: Path
+) -> None:
+    scenario = unlabelled_dataset.scenario[0]["token"]
+    token = sample_token(scenario, "infrastructure", 1)
+    alarm = Accident(positions=np.array([[5.0, 1.0], [6.0, 1.0]]), time=1.0, score=0.9)
+    recording = export_small(
+        unlabelled_dataset,
+        scenario,
+        tmp_path,
+        prediction={token: [alarm]},
+        agents=["infrastructure"],
+        frames=[1],
+    )
+    (marks,) = recording.decoded("/infrastructure/prediction/marks")
+    (entity,) = marks.entities
+    heights = [sphere.pose.position.z for sphere in entity.spheres]
+    assert heights == [1.0 - POLE_HEIGHT] * 2
 
 
 def test_unknown_scenarios_and_invalid_predictions_are_refused(
@@ -607,7 +718,7 @@ def test_unknown_scenarios_and_invalid_predictions_are_refused(
         (
             lambda: export({token: "an accident"}),
             ConfigError,
-            ("Accident or DetectedBoxes", "found str"),
+            ("DetectedBoxes, or a list of Accidents", "found str"),
         ),
         (
             lambda: export({token: []}, frames=[3]),
@@ -659,4 +770,6 @@ def test_the_command_exports_the_first_accident_or_a_chosen_scenario(
         f"/ego_vehicle/{LIDAR}/points",
         f"/{AGENTS[-1]}/{LIDAR}/points",
     }
-    assert len(recording.decoded("/ego_vehicle/prediction/accidents")) == 1
+    assert [alarm.value for alarm in recording.decoded("/ego_vehicle/prediction/alarm")] == [0.0]
+    curves = json.loads((tmp_path / "a.foxglove.json").read_text())["configById"]["Plot!values"]
+    assert curves["paths"][-1]["value"] == "/ego_vehicle/prediction/alarm.value"

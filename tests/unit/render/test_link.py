@@ -49,12 +49,11 @@ def test_arrows_are_as_long_as_the_pose_error(da_motion: DeepAccident, moving_sa
     assert ax.get_title() == "Box positions (largest error 0.50 m, means below)"
 
 
-def test_the_largest_visible_error_is_magnified(
+def test_the_two_largest_visible_errors_are_magnified(
     da_motion: DeepAccident, moving_sample: Any
 ) -> None:
     figure = draw_link(da_motion, moving_sample, Link(latency=0.2), layers=["boxes"])
     (ax,) = figure.axes
-    (inset,) = ax.child_axes
     shared = shared_boxes(da_motion, moving_sample, Link(latency=0.2))
     starts, ends = map(np.concatenate, zip(*[boxes.shifts for boxes in shared], strict=True))
 
@@ -62,9 +61,14 @@ def test_the_largest_visible_error_is_magnified(
     low, high = np.array([ax.get_xlim(), ax.get_ylim()]).T
     is_visible = ((low < positions) & (positions < high)).all(axis=(0, 2))
     errors = np.where(is_visible, np.linalg.norm(ends - starts, axis=1), 0)
-    low, high = np.array([inset.get_xlim(), inset.get_ylim()]).T
-    assert ((low < positions[:, errors.argmax()]) & (positions[:, errors.argmax()] < high)).all()
-    assert inset.texts[0].get_text().startswith(f"{errors.max():.2f} m, ×")
+    for letter, inset in zip("AB", ax.child_axes, strict=True):
+        low, high = np.array([inset.get_xlim(), inset.get_ylim()]).T
+        is_magnified = ((low < positions) & (positions < high)).all(axis=(0, 2))
+        assert is_magnified[errors.argmax()]
+        assert inset.texts[0].get_text().startswith(f"{letter}: {errors.max():.2f} m, ×")
+        errors[is_magnified] = 0
+    first, second = (inset.get_position() for inset in ax.child_axes)
+    assert not first.overlaps(second)
 
     exact = draw_link(da_motion, moving_sample, Link(), layers=["boxes"])
     assert exact.axes[0].child_axes == []
@@ -101,6 +105,7 @@ def test_clouds_are_side_by_side(da: DeepAccident) -> None:
         points = cloud.xyz[:, :2]
         visible_points = points[(np.abs(points) < 50).all(axis=1)]
         drawn_clouds = [np.asarray(shape.get_offsets()) for shape in ax.collections]
+        assert len(ax.images) == 1  # the road
         assert any(
             drawn.shape == visible_points.shape and np.allclose(drawn, visible_points)
             for drawn in drawn_clouds

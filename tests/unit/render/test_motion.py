@@ -43,6 +43,7 @@ from deepaccident_devkit.render.boxes import collider_ids
 from deepaccident_devkit.render.motion_maps import MIN_TRAIL_OPACITY
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
+    BEV_COLORS,
     COLLIDER_COLOR,
     INSTANCE_COLORS,
     OWN_COLOR,
@@ -195,10 +196,26 @@ def test_a_sample_of_an_accident(da_motion: DeepAccident) -> None:
         labels.id_map[OWN_BOX_ID if actor_id == -100 else actor_id]
         for actor_id in collider_ids(da_motion, sample)
     ]
-    are_red = [
-        np.isclose(first_image(ax), to_rgb(COLLIDER_COLOR)).all(axis=-1) for ax in figure.axes[:5]
-    ]
+    pictures = np.stack([first_image(ax) for ax in figure.axes[:5]])
+    are_red = np.isclose(pictures[..., :3], to_rgb(COLLIDER_COLOR)).all(axis=-1)
     np.testing.assert_array_equal(are_red, np.isin(labels.instance, pair))
+    np.testing.assert_array_equal(pictures[..., 3], labels.instance > 0)
+
+
+@pytest.mark.parametrize("style", ["maps", "trail"])
+def test_the_road_is_beneath_instances(da: DeepAccident, style: Any) -> None:
+    sample = da.get_sample(da.scenario[0], "ego_vehicle", frame=3)
+    figure = detached_figure((12, 9))
+    da.render_motion_labels(sample, style=style, fig=figure)
+    cells, road = figure.axes[0].images
+    assert road.get_zorder() < cells.get_zorder()
+    road_rgb = np.rint(255 * np.array(to_rgb(BEV_COLORS["road"])))
+    assert (road.get_array() == road_rgb).all(axis=-1).any()
+    assert {len(ax.images) for ax in figure.axes[6:]} <= {0, 1}  # the other maps have none
+
+    figure = detached_figure((12, 9))
+    da.render_motion_labels(sample, style=style, layers=["labels"], fig=figure)
+    assert len(figure.axes[0].images) == 1
 
 
 def test_unknown_maps_frames_and_predictions_are_refused(labels: MotionLabels) -> None:

@@ -80,6 +80,9 @@ VIEWS: dict[str, Callable[[DeepAccident, Any], Any]] = {
     "link": lambda da, scenario: da.render_link(
         ego_sample(scenario), Link(latency=0.1, pose_noise=0.5), layers=["boxes"]
     ),
+    "teaser": lambda da, scenario: da.render_teaser(
+        scenario, seconds=seconds_before(), layers=SENSORLESS_LAYERS
+    ),
     "visibility": lambda da, scenario: da.render_visibility(scenario["last_frame_token"]),
     "visibility matrix": lambda da, scenario: da.render_visibility_matrix(
         scenario["last_frame_token"]
@@ -222,6 +225,11 @@ REFUSED_CASES: list[tuple[Draw, type[Exception], str]] = [
     (lambda da, _: da.render_instance("no/one/actor/9999"), TokenError, "has no token"),
     (
         lambda da, _: da.render_accident(normal_scenario(da)),
+        NotAvailableError,
+        "nobody collides",
+    ),
+    (
+        lambda da, _: da.render_teaser(normal_scenario(da)),
         NotAvailableError,
         "nobody collides",
     ),

@@ -75,6 +75,7 @@ PICTURES: dict[str, Draw] = {
     "annotation": lambda da, _: da.render_annotation(da.annotation[0]),
     "visibility": lambda da, sample: da.render_visibility(frame_of(da, sample)),
     "accident": lambda da, sample: da.render_accident(scenario_of(sample), seconds=(1.0, 0.0)),
+    "teaser": lambda da, sample: da.render_teaser(scenario_of(sample), seconds=(1.0, 0.0)),
     "motion labels": lambda da, sample: da.render_motion_labels(sample),
     "town map": lambda da, sample: da.render_town_map(
         da.get("scenario", scenario_of(sample))["town"]

@@ -59,7 +59,7 @@ def test_a_stored_map_replaces_a_missing_bev_camera_but_none_is_made_for_it(
 
     other_sample = sample.replace("ego_vehicle", "other_vehicle")
     ax = render_bev(unmapped_da, other_sample, ax=new_axes())
-    assert [image.get_zorder() for image in ax.images] == [0]  # only the camera's own picture
+    assert [image.get_zorder() for image in ax.images] == [-0.5]  # only the camera's own picture
 
 
 @pytest.mark.slow

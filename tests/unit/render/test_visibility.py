@@ -4,14 +4,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex, to_rgba
+from matplotlib.colors import to_hex, to_rgb, to_rgba
 from support.rendered_pixels import read_texts
 from support.replay_page import normal_scenario
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.styles import AGENT_COLORS
+from deepaccident_devkit.render.styles import AGENT_COLORS, BEV_COLORS
 from deepaccident_devkit.render.visibility import (
     render_visibility,
     render_visibility_matrix,
@@ -147,3 +147,28 @@ def test_a_normal_scenario_hides_nothing(da_motion: DeepAccident) -> None:
     sample = da_motion.get_sample(scenario, "ego_vehicle", 5)
     assert read_texts(draw_panel(da_motion, sample)) == []
     assert not visibility_of(da_motion, f"{scenario}/005").hidden_from("ego_vehicle").any()
+
+
+def test_the_road_is_from_the_bev_camera_nearest_to_the_middle(
+    da: DeepAccident, da_motion: DeepAccident
+) -> None:
+    sample = da.get_sample(da.scenario[0], "ego_vehicle", 3)
+    ax = draw_panel(da, sample)
+    (road,) = ax.images
+    road_rgb = np.rint(255 * np.array(to_rgb(BEV_COLORS["road"])))
+    assert (road.get_array() == road_rgb).all(axis=-1).any()
+    middle = np.mean(ax.viewLim.get_points(), axis=0)
+    ego_from_world = da.world_from(sample, "ego").inverse()
+    positions = []
+    for agent in AGENTS:
+        agent_sample = da.get_sample(da.scenario[0], agent, 3)
+        pose = ego_from_world @ da.world_from(agent_sample, "ego")
+        positions.append(pose.translation[:2])
+    distances = np.abs(np.array(positions) - middle).max(axis=1)
+    origin = road.get_transform().transform((0, 0))
+    expected = ax.transData.transform(positions[distances.argmin()])
+    np.testing.assert_allclose(origin, expected)
+
+    assert len(draw_panel(da, sample, layers=["boxes"]).images) == 0
+    without_sensors = da_motion.get_sample(da_motion.scenario[0], "ego_vehicle", 10)
+    assert len(draw_panel(da_motion, without_sensors).images) == 0

@@ -21,7 +21,12 @@ from deepaccident_devkit.evaluation.breakdowns import (
     sample_attributes,
 )
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
-from deepaccident_devkit.evaluation.runs.setups import SampleLoader, agent_of, scenario_of
+from deepaccident_devkit.evaluation.runs.setups import (
+    SampleLoader,
+    agent_of,
+    evaluator_class,
+    scenario_of,
+)
 from deepaccident_devkit.plugins.explore.background import Job
 from deepaccident_devkit.plugins.explore.choices import MAX_WORD_LENGTH
 from deepaccident_devkit.plugins.explore.evaluations import (
@@ -42,7 +47,7 @@ from deepaccident_devkit.plugins.explore.pages.scenario import read_sample_token
 from deepaccident_devkit.plugins.explore.scenarios import UNKNOWN_VALUE
 from deepaccident_devkit.render.figures import detached_figure
 from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
-from deepaccident_devkit.render.outcomes.evaluation import FIGURE_SIZES
+from deepaccident_devkit.render.outcomes.evaluation import figure_size
 from deepaccident_devkit.support.human_names import metric_name
 from deepaccident_devkit.support.pages import path_in_address
 from deepaccident_devkit.support.text import natural_order
@@ -277,13 +282,11 @@ def explain_missing_picture(explorer: Explorer, model: Model, token: str) -> str
         return f"The predictions of {model.name} were not given."
     if not model.has(token):
         return f"{model.name} has no prediction for this sample."
-    if _choose_picture_task(model) not in FIGURE_SIZES:
-        return f"There are no pictures of {model.setup.task}."
     try:
         SampleLoader(explorer.dataset, model.results, model.setup)
     except EvaluationError as error:
         return str(error)
-    needs_meta = _choose_picture_task(model) == "accident"
+    needs_meta = evaluator_class(model.setup.task).needs_meta
     return _explain_missing_truth(explorer, token, needs_meta=needs_meta)
 
 
@@ -299,9 +302,7 @@ def _explain_missing_truth(explorer: Explorer, token: str, *, needs_meta: bool) 
 
 def describe_rules(model: Model) -> str:
     """Explain how pictures deviate from the bundle's rules; empty if they do not."""
-    if model.setup.task == "warning":
-        return "Warnings are judged over whole recordings; these pictures judge single accidents."
-    if _choose_picture_task(model) == "accident" and model.results is not None:
+    if model.setup.task in ("accident", "warning") and model.results is not None:
         form = model.results.form
         ahead = _ACCIDENT_HORIZON_S
         if form is not None:
@@ -341,24 +342,17 @@ def list_frames_ahead(explorer: Explorer, model: Model, token: str) -> list[floa
     return [number * form.step for number in range(count)]
 
 
-def _choose_picture_task(model: Model) -> str:
-    if model.setup.task == "warning":
-        return "accident"
-    return model.setup.task
-
-
 def _render_picture(explorer: Explorer, model: Model, token: str, choice: _PictureChoice) -> Any:
     results = model.results
     if results is None:
         raise NotAvailableError(f"{model.name}: its predictions were not given")
     loader = SampleLoader(explorer.dataset, results, model.setup)
     prediction = loader.prediction(token)
-    task = _choose_picture_task(model)
-    protocol = None if model.setup.task == "warning" else model.setup.rules
-    arguments: dict[str, Any] = {"task": task, "protocol": protocol}
+    task = model.setup.task
+    arguments: dict[str, Any] = {"task": task, "protocol": model.setup.rules}
     if not isinstance(prediction, DetectedBoxes):
         arguments["label"] = loader.label(token)
-    size = _FIGURE_SIZES.get((choice.kind, choice.size), FIGURE_SIZES[task])
+    size = _FIGURE_SIZES.get((choice.kind, choice.size), figure_size(task))
     arguments["fig"] = detached_figure(size)
     if choice.kind == "above":
         return render_evaluation(explorer.dataset, token, prediction, **arguments)
@@ -525,7 +519,7 @@ def make_sample_context(explorer: Explorer, model: Model, token: str) -> Variabl
     missing_path = ""
     if model.results is None and model.bundle is not None:
         missing_path = str(model.bundle.summary["results"]["path"])
-    _, figure_height = FIGURE_SIZES.get(_choose_picture_task(model), (0.0, 0.0))
+    _, figure_height = figure_size(model.setup.task)
     return {
         "model": model,
         "token": token,

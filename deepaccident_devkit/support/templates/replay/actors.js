@@ -83,6 +83,26 @@ export function verdictColor(verdict, colors) {
 }
 
 /**
+ * Return the colour of a sample's mark. Where a task draws the sample, it is red if an alarm fires, or something collides.
+ * @param {Sample} sample
+ * @param {Colors} colors
+ */
+export function sampleColor(sample, colors) {
+  if (!sample.lines) return verdictColor(sample.verdict, colors);
+  const isGrave = sample.alarm ? sample.alarm.fires : sample.places?.some((place) => place.color === colors.pair);
+  return isGrave ? colors.pair : colors.points;
+}
+
+/**
+ * Return the lines that samples draw at a frame: passing ones only at the frame of their sample.
+ * @param {Sample[]} samples
+ * @param {number} frame
+ */
+export function linesAt(samples, frame) {
+  return samples.flatMap((sample) => (sample.lines ?? []).filter((line) => !line.passing || sample.frame === frame));
+}
+
+/**
  * @param {Alarm} alarm
  * @param {Colors} colors
  */

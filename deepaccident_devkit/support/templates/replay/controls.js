@@ -9,6 +9,7 @@ import { map } from "./map.js";
 import { ZOOM_STEP } from "./map_view.js";
 import { play, setSpeed, step } from "./playback.js";
 import { onPointers } from "./pointers.js";
+import { savePicture } from "./saved_picture.js";
 import { space } from "./space.js";
 import { state } from "./state.js";
 
@@ -111,6 +112,7 @@ function zoom(factor) {
 byId("closer").addEventListener("click", () => zoom(ZOOM_STEP));
 byId("farther").addEventListener("click", () => zoom(1 / ZOOM_STEP));
 byId("top").addEventListener("click", () => space.fromAbove());
+byId("save").addEventListener("click", () => void savePicture());
 byId("whole").addEventListener("click", () => {
   stay();
   map.showWhole();
@@ -186,6 +188,7 @@ const keys = {
   0: () => enlarge(""),
   b: () => byId("boxes").click(),
   t: () => byId("top").click(),
+  s: () => byId("save").click(),
   ".": () => chooseNext(1),
   ",": () => chooseNext(-1),
   Escape: () => choose(null),

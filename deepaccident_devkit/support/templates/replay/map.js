@@ -1,6 +1,6 @@
 // The scene from above, on a canvas.
 
-import { actorOf, agentByNumber, alarmColor, isSeen, joinedAlarms, seersOf } from "./actors.js";
+import { actorOf, agentByNumber, alarmColor, isSeen, joinedAlarms, linesAt, seersOf } from "./actors.js";
 import { channelsOf, lightened } from "./colors.js";
 import { data, pair, sources } from "./data.js";
 import { byId } from "./elements.js";
@@ -10,7 +10,7 @@ import { actorOnMap } from "./picking.js";
 import { state } from "./state.js";
 
 /** @import { JoinedAlarm } from "./actors.js" */
-/** @import { Actor, ActorState, Alarm, Pixel, Point, Rectangle, Road, SceneView } from "./types.js" */
+/** @import { Actor, ActorState, DrawnLine, Pixel, Point, Rectangle, Road, SceneView } from "./types.js" */
 
 export const TRAIL_FRAMES = 20;
 export const GRID_METRES = 10;
@@ -58,7 +58,7 @@ class SceneMap {
   /** Give the canvas the pixels of the screen. */
   fit() {
     const box = this.canvas.getBoundingClientRect();
-    const ratio = window.devicePixelRatio || 1;
+    const ratio = state.sharpness * (window.devicePixelRatio || 1);
     this.view.fit(this.canvas.clientWidth || box.width, this.canvas.clientHeight || box.height);
     const [wide, tall] = [Math.round(this.view.width * ratio), Math.round(this.view.height * ratio)];
     if (this.canvas.width !== wide || this.canvas.height !== tall) {
@@ -92,12 +92,18 @@ class SceneMap {
     if (layers.trails) for (const actor of data.actors) this.drawTrail(actor);
     this.drawSights();
     const samples = layers.prediction ? state.foreseen : [];
-    for (const alarm of samples.flatMap((sample) => sample.alarms)) this.drawPlaces(alarm);
+    for (const alarm of samples.flatMap((sample) => sample.alarms)) this.drawPlaces(alarm.places, alarmColor(alarm, data.colors));
+    for (const line of linesAt(samples, state.frame)) this.drawLine(line);
+    const places = samples.flatMap((sample) => sample.places ?? []);
+    for (const place of places) this.drawPlaces(place.points, thin(place.color));
     for (const [actor, now] of [...actors].reverse()) this.drawActor(actor, now);
     if (layers.agents) this.drawPoles();
     if (data.impact) this.drawImpact(data.impact);
     this.drawNames();
     for (const alarm of joinedAlarms(samples, data.agents, pair.map((actor) => actor.id))) this.drawAlarm(alarm);
+    for (const { note, points, color } of places) {
+      if (note) this.writeBeside(note, around(this.view.pixel(points[0]), RING_METRES * this.view.scale + 4), color);
+    }
   }
 
   /**
@@ -341,15 +347,37 @@ class SceneMap {
   }
 
   /**
-   * Draw where an alarm has the pair at the impact: thin rings below the actors.
-   * @param {Alarm} alarm
+   * Draw a path, above a ribbon of its width if it has one, or the outline of a box.
+   * @param {DrawnLine} line
    */
-  drawPlaces(alarm) {
+  drawLine({ points, color, opacity = 1, width = 0, dashed }) {
     const pen = this.pen;
-    pen.strokeStyle = alarmColor(alarm, data.colors);
+    pen.beginPath();
+    for (const point of points) pen.lineTo(...this.view.pixel(point));
+    pen.strokeStyle = thin(color);
+    pen.lineJoin = "round";
+    pen.lineWidth = width * this.view.scale;
+    pen.globalAlpha = 0.3 * opacity;
+    if (width) pen.stroke();
+    pen.lineWidth = dashed ? 1.5 : 2.5;
+    pen.globalAlpha = 0.2 + 0.8 * opacity;
+    if (dashed) pen.setLineDash([5, 3]);
+    pen.stroke();
+    pen.setLineDash([]);
+    pen.globalAlpha = 1;
+  }
+
+  /**
+   * Draw where something is predicted, such as the pair at the impact: thin rings below the actors.
+   * @param {Point[]} points
+   * @param {string} color
+   */
+  drawPlaces(points, color) {
+    const pen = this.pen;
+    pen.strokeStyle = color;
     pen.lineWidth = 1;
     pen.setLineDash([3, 2]);
-    for (const point of alarm.places) {
+    for (const point of points) {
       pen.beginPath();
       pen.arc(...this.view.pixel(point), RING_METRES * this.view.scale, 0, 2 * Math.PI);
       pen.stroke();

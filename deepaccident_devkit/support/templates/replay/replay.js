@@ -1,6 +1,6 @@
 // The page of a replay: what is drawn when, what does not change with time, and what the pages around may ask for.
 
-import { verdictColor } from "./actors.js";
+import { sampleColor } from "./actors.js";
 import { showCameras, showEveryCamera } from "./cameras.js";
 import { shareOf } from "./clock.js";
 import { stay } from "./controls.js";
@@ -37,7 +37,7 @@ for (const [name, value] of data.facts) {
   byId("facts").append(made("dt", { textContent: name }), made("dd", { textContent: value }));
 }
 byId("notes").append(...data.notes.map((note) => made("li", { textContent: note })));
-byId("foreseen-key").hidden = !data.prediction;
+byId("foreseen-key").hidden = !data.prediction || Boolean(data.prediction.legend);
 
 const others = data.actors.filter((actor) => actor.role === "other");
 const categories = new Map(
@@ -47,6 +47,7 @@ byId("legend").append(
   ...(pair.length ? [made("span", {}, chip(data.colors.pair), "colliding pair")] : []),
   ...data.agents.map((agent) => made("span", {}, chip(agent.color), `${agent.short} ${agent.title}`)),
   ...[...categories].map(([name, mark]) => made("span", {}, mark, name)),
+  ...(data.prediction?.legend ?? []).map(([label, color]) => made("span", {}, chip(color), label)),
 );
 
 /**
@@ -61,7 +62,7 @@ function addMark(frame, color) {
   byId("marks").append(mark);
 }
 
-for (const [frame, [sample]] of samplesAt) addMark(frame, verdictColor(sample.verdict, data.colors));
+for (const [frame, [sample]] of samplesAt) addMark(frame, sampleColor(sample, data.colors));
 const impact = data.countdown.indexOf(0);
 if (impact >= 0) addMark(impact, data.colors.pair);
 

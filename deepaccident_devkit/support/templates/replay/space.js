@@ -1,6 +1,6 @@
 // The scene in three dimensions: clouds, boxes with headings and trails, cameras, and names.
 
-import { actorOf, agentByNumber, alarmColor, isSeen } from "./actors.js";
+import { actorOf, agentByNumber, alarmColor, isSeen, linesAt } from "./actors.js";
 import { centreInMetres, cornersOf, EDGES, FACES, GroundPlane } from "./boxes.js";
 import { cameraOf, cards } from "./cameras.js";
 import { changed, channelsOf, lightened, mixed } from "./colors.js";
@@ -116,8 +116,13 @@ class Space {
     this.isWaiting = true;
     requestAnimationFrame(() => {
       this.isWaiting = false;
-      if (this.gpu && this.canvas.clientWidth) this.render(this.gpu);
+      this.drawNow();
     });
+  }
+
+  /** Draw without waiting for the screen's next picture. */
+  drawNow() {
+    if (this.gpu && this.canvas.clientWidth) this.render(this.gpu);
   }
 
   /** Look at whom the reader follows; at the pair as closely as the map does. */
@@ -143,7 +148,7 @@ class Space {
 
   /** @param {Gpu} gpu */
   render(gpu) {
-    const ratio = window.devicePixelRatio || 1;
+    const ratio = state.sharpness * (window.devicePixelRatio || 1);
     const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
     const [wide, tall] = [Math.round(width * ratio), Math.round(height * ratio)];
     const hasOtherSize = this.canvas.width !== wide || this.canvas.height !== tall;
@@ -353,6 +358,15 @@ class Space {
     for (const alarm of state.foreseen.flatMap((sample) => sample.alarms)) {
       const color = channelsOf(alarmColor(alarm, data.colors));
       for (const [x, y] of alarm.places) this.addRing(x / 100, y / 100, color);
+    }
+    for (const { points, color } of state.foreseen.flatMap((sample) => sample.places ?? [])) {
+      for (const [x, y] of points) this.addRing(x / 100, y / 100, this.thin(color));
+    }
+    for (const { points, color, opacity = 1, dashed } of linesAt(state.foreseen, state.frame)) {
+      const corners = points.map(([x, y]) => this.onGround(x / 100, y / 100, 0.2));
+      for (const [number, corner] of corners.slice(1).entries()) {
+        this.line(corners[number], corner, this.thin(color), dashed ? 1.5 : 3, 0.2 + 0.8 * opacity);
+      }
     }
   }
 

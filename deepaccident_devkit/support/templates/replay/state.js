@@ -21,6 +21,7 @@ export const state = {
   chosen: null,
   lit: null,
   foreseen: [],
+  sharpness: 1,
 };
 
 /** Return the actor that all views highlight, if there is one. */

@@ -1,7 +1,7 @@
 // The strip below the slider, on its scale: the pair's speeds, gap and time to collision, who sees it, and verdicts.
 // Below the slider itself: which frames have files. A click on the strip goes to a frame.
 
-import { isSeen, seersOf, verdictColor } from "./actors.js";
+import { isSeen, sampleColor, seersOf } from "./actors.js";
 import { frameAtShare, shareOf } from "./clock.js";
 import { barExtent, curvePath, known, runs } from "./curves.js";
 import { data, last, pair } from "./data.js";
@@ -136,12 +136,52 @@ function addSight(actor) {
 
 /** @param {Sample[]} samples */
 function addVerdicts(samples) {
-  const lines = samples.map(({ frame, agent, verdict }) =>
-    bar([frame, frame], agent * BAND, BAND - 0.8, verdictColor(verdict, data.colors)),
+  const lines = samples.map((sample) =>
+    bar([sample.frame, sample.frame], sample.agent * BAND, BAND - 0.8, sampleColor(sample, data.colors)),
   );
   return addRow("verdicts", plot(BAND * data.agents.length, ...lines), () => {
     const words = state.foreseen.map((sample) => `${data.agents[sample.agent].short} ${sample.verdict}`);
     return words.join(", ") || "none yet";
+  });
+}
+
+/**
+ * Add the alarms of the samples: the higher the score, the darker the bar; red where they fire.
+ * @param {Sample[]} samples
+ */
+function addAlarms(samples) {
+  const lines = samples.flatMap((sample) => {
+    if (!sample.alarm) return [];
+    const line = bar([sample.frame, sample.frame], sample.agent * BAND, BAND - 0.8, sampleColor(sample, data.colors));
+    line.setAttribute("fill-opacity", String(0.2 + 0.8 * sample.alarm.score));
+    return [line];
+  });
+  return addRow("alarm", plot(BAND * data.agents.length, ...lines), () => {
+    const words = state.foreseen.map((sample) => `${data.agents[sample.agent].short} ${sample.alarm?.score.toFixed(2) ?? "–"}`);
+    return words.join(", ") || "none yet";
+  });
+}
+
+/**
+ * Mark when the places of one label happen, such as the contacts that plans run into.
+ * @param {string} label
+ * @param {Sample[]} samples
+ */
+function addTimes(label, samples) {
+  const lines = samples.flatMap((sample) =>
+    (sample.places ?? []).flatMap((place) => {
+      const frame = sample.frame + Math.round(place.time / data.period);
+      if (place.label !== label || frame > last) return [];
+      return [bar([frame, frame], sample.agent * BAND, BAND - 0.8, place.color)];
+    }),
+  );
+  return addRow(label, plot(BAND * data.agents.length, ...lines), () => {
+    const words = state.foreseen.flatMap((sample) =>
+      (sample.places ?? [])
+        .filter((place) => place.label === label)
+        .map((place) => `${data.agents[sample.agent].short} in ${place.time.toFixed(1)} s`),
+    );
+    return words.join(", ") || "–";
   });
 }
 
@@ -153,7 +193,13 @@ if (data.pair) {
   rows.push(addMeasure("time to collision", data.pair.ttc, "s", 10, LONGEST_TIME));
 }
 for (const actor of pair) rows.push(addSight(actor));
-if (data.prediction) rows.push(addVerdicts(data.prediction.samples));
+if (data.prediction) {
+  const { samples } = data.prediction;
+  rows.push(addVerdicts(samples));
+  if (samples.some((sample) => sample.alarm)) rows.push(addAlarms(samples));
+  const labels = samples.flatMap((sample) => (sample.places ?? []).map((place) => place.label));
+  rows.push(...[...new Set(labels)].map((label) => addTimes(label, samples)));
+}
 
 /** Show what the strip says of the frame. */
 export function showStrip() {

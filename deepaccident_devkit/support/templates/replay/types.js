@@ -88,7 +88,31 @@
  * @property {string} verdict
  * @property {string} text
  * @property {Alarm[]} alarms
- * @property {number} more how many alarms are left out
+ * @property {number} more how many alarms or lines are left out
+ * @property {DrawnLine[]} [lines] where a task draws the sample
+ * @property {DrawnPlace[]} [places]
+ * @property {{ score: number, fires: boolean } | null} [alarm]
+ */
+
+/**
+ * A path or the outline of a box; `width` (metres) is that of a ribbon. A passing line is only right at its sample's frame.
+ * @typedef {object} DrawnLine
+ * @property {Point[]} points
+ * @property {string} color
+ * @property {number} [opacity] from 0 to 1
+ * @property {number} [width]
+ * @property {boolean} dashed
+ * @property {boolean} [passing]
+ */
+
+/**
+ * Points where something happens `time` seconds after the sample.
+ * @typedef {object} DrawnPlace
+ * @property {Point[]} points
+ * @property {number} time
+ * @property {string} note
+ * @property {string} label
+ * @property {string} color
  */
 
 /**
@@ -133,7 +157,7 @@
  * @property {Actor[]} actors the colliding pair first
  * @property {{ gap: (number | null)[], ttc: (number | null)[] } | null} pair gap (cm) and time to collision (ds)
  * @property {Road | null} road
- * @property {{ rule: string, samples: Sample[] } | null} prediction
+ * @property {{ rule: string, samples: Sample[], legend?: [label: string, color: string][] } | null} prediction
  * @property {Camera[][]} cameras those of each agent
  * @property {number[]} files how many sensor files each frame has
  * @property {number} sensors how many it would have
@@ -166,6 +190,7 @@
  * @property {number | null} chosen id of the actor that was clicked
  * @property {number | null} lit id of the actor that all views highlight: pointed at, or else chosen
  * @property {Sample[]} foreseen the samples of the last evaluated frame
+ * @property {number} sharpness pixels of the scene's drawings by the screen's
  */
 
 /**

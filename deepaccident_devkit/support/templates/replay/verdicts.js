@@ -1,6 +1,6 @@
 // What a model predicts, and what its predictions count as.
 
-import { lastBefore, samplesByFrame, verdictColor } from "./actors.js";
+import { lastBefore, sampleColor, samplesByFrame } from "./actors.js";
 import { data } from "./data.js";
 import { badge, byId, made, smallText } from "./elements.js";
 import { go } from "./playback.js";
@@ -14,7 +14,7 @@ export const samplesAt = samplesByFrame(data.prediction?.samples ?? []);
 
 /** @param {Sample} sample */
 export function verdictBadge(sample) {
-  return badge(sample.verdict, verdictColor(sample.verdict, data.colors));
+  return badge(sample.verdict, sampleColor(sample, data.colors));
 }
 
 /**

@@ -14,14 +14,13 @@ from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import EvaluationError, NotAvailableError
 from deepaccident_devkit.evaluation import (
     Accident,
-    DetectedBoxes,
     Results,
     ResultsWriter,
     instances_of,
     read_results,
 )
 from deepaccident_devkit.evaluation.predictions import labels_at_present
-from deepaccident_devkit.geometry import Boxes, quaternions
+from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
 from deepaccident_devkit.render.boxes import camera_name
@@ -232,9 +231,6 @@ def test_predictions_of_something_else_are_refused(
     da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
 ) -> None:
     token = next(iter(predictions))
-    boxes = Boxes.from_arrays(np.zeros((0, 3)), np.zeros((0, 3)), [], frame="world")
-    detected = DetectedBoxes(boxes=boxes, scores=np.zeros(0))
-    detection = write_results(tmp_path / "boxes.json", "detection", {token: detected})
     normal = normal_scenario(da_motion)
 
     def replay(prediction: Any, scenario: str | None = None) -> Callable[[], object]:
@@ -248,7 +244,6 @@ def test_predictions_of_something_else_are_refused(
             NotAvailableError,
             ("prediction", normal, "ego_vehicle"),
         ),
-        (replay(detection), EvaluationError, ("contains detection results", "motion or accident")),
         (
             replay({token: [7]}),
             EvaluationError,

@@ -1,0 +1,126 @@
+"""`Drawing`: what a picture shows of a sample's prediction and its truth.
+
+A task describes its pictures by these records (`Evaluator.drawing`). Views draw the records, and do
+not know the task.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, ShortRepr
+
+Role = Literal["truth", "past", "predicted", "right", "false", "missed", "collision"]
+"""What a thing in a picture is, which decides its colour.
+
+`predicted` has no verdict; predictions with a verdict are `right` or `false`, and true things
+without a prediction are `missed`.
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnPath(FrozenArrays):
+    """A path on the ground; arrays are read-only.
+
+    Attributes:
+        xy: (T, 2) positions, x forward, y left, metres in the current ego frame.
+        times: (T,) seconds after the current frame; negative in the past.
+        role: What the path is.
+        width: Width of the ribbon that a vehicle on the path covers, metres; 0 for a line.
+        probability: Probability of the path; improbable paths are paler.
+        label: Words for the legend.
+    """
+
+    xy: FloatArray
+    times: FloatArray
+    role: Role
+    width: float = 0.0
+    probability: float = 1.0
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnBoxes(FrozenArrays):
+    """Boxes of one kind, in any frame of the sample.
+
+    Attributes:
+        boxes: N boxes.
+        role: What the boxes are.
+        scores: (N,) confidences; None for boxes without scores.
+        label: Words for the legend.
+    """
+
+    boxes: Boxes
+    role: Role
+    scores: FloatArray | None = None
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnPlaces(FrozenArrays):
+    """Positions at which something happens at one time; arrays are read-only.
+
+    Attributes:
+        xy: (N, 2) positions, x forward, y left, metres in the current ego frame.
+        time: Seconds after the current frame.
+        role: What the positions are.
+        note: Words beside the positions, such as `contact in 1.5 s`.
+        label: Words for the legend.
+    """
+
+    xy: FloatArray
+    time: float
+    role: Role
+    note: str = ""
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrawnAlarm:
+    """The alarm of a sample.
+
+    Attributes:
+        score: Confidence from 0 (no alarm) to 1.
+        fires: Whether the score raises an alarm.
+    """
+
+    score: float
+    fires: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drawing(ShortRepr):
+    """What is drawn of a sample's prediction and its truth.
+
+    Attributes:
+        paths: Paths on the ground.
+        boxes: Boxes by kind.
+        places: Marked positions.
+        alarm: Alarm of the sample; None for tasks without alarms.
+        words: Summary for the title, such as `contact in 1.5 s`; if it is empty, views print the
+            sample's main numbers.
+    """
+
+    paths: tuple[DrawnPath, ...] = ()
+    boxes: tuple[DrawnBoxes, ...] = ()
+    places: tuple[DrawnPlaces, ...] = ()
+    alarm: DrawnAlarm | None = None
+    words: str = ""
+
+
+def joined_drawing(predictions: Iterable[Any]) -> Drawing:
+    """Join what predictions draw of themselves, by their methods `drawing`.
+
+    Predictions without the method add nothing.
+    """
+    paths: list[DrawnPath] = []
+    boxes: list[DrawnBoxes] = []
+    places: list[DrawnPlaces] = []
+    for prediction in predictions:
+        if hasattr(prediction, "drawing"):
+            drawing: Drawing = prediction.drawing()
+            paths += drawing.paths
+            boxes += drawing.boxes
+            places += drawing.places
+    return Drawing(paths=tuple(paths), boxes=tuple(boxes), places=tuple(places))
