@@ -11,17 +11,13 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.export.bulk import Format, Output, Unit, flat_name
 from deepaccident_devkit.export.format import README, format_readme
 from deepaccident_devkit.export.frames import keyframes
-from deepaccident_devkit.support.arrays import checked_setting
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.agents import agents_of
-from deepaccident_devkit.v2x.windows import WindowConfig, configured_window
+from deepaccident_devkit.v2x.windows import WindowConfig, configured_window, count_units
 
 if TYPE_CHECKING:
     from deepaccident_devkit.dataset import Dataset
@@ -64,10 +60,7 @@ class Av2(Format):
         """Check the settings; raise ConfigError if a time does not fit."""
         super().__post_init__()
         WindowConfig(past=self.past, future=self.future)
-        expected = "a multiple of 0.1 s, from 0.1"
-        every = checked_setting("every", self.every, expected, FRAME_PERIOD)
-        if not np.isclose(every, round(every / FRAME_PERIOD) * FRAME_PERIOD):
-            raise ConfigError(f"every: expected {expected}, found {every:g}")
+        self._count_frames()
 
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write the samples of a scenario whose agents have a track of their own."""
@@ -78,8 +71,7 @@ class Av2(Format):
         absent = len(self.agents) - len(agents)
         output.leave_out("agents of scenarios that are not in this release", absent)
         num_frames = dataset.scenario.get(scenario)["num_frames"]
-        frame_step = round(self.every / FRAME_PERIOD)
-        numbers = keyframes(num_frames, frame_step)
+        numbers = keyframes(num_frames, self._count_frames())
         for agent, number in product(agents, numbers):
             token = sample_token(scenario, agent, number)
             if not dataset.sample.get(token)["labelled"]:
@@ -93,6 +85,10 @@ class Av2(Format):
             with output.file(path) as temporary:
                 window.write_av2(temporary)
             output.tally.samples += 1
+
+    def _count_frames(self) -> int:
+        """Return the frames from one sample to the next; raise ConfigError if it is no number."""
+        return count_units("every", self.every, FRAME_PERIOD, minimum=FRAME_PERIOD)
 
     def finish(
         self,

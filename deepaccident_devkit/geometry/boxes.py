@@ -260,10 +260,8 @@ class Boxes(FrozenArrays, PictureRepr):
         special_tokens = {OWN_ACTOR_ID: own_token, UNTRACKED_ID: None}
         tokens = []
         for actor_id in self.actor_id.tolist():
-            if actor_id in special_tokens:
-                tokens.append(special_tokens[actor_id])
-            else:
-                tokens.append(f"{prefix}{actor_id}")
+            token = special_tokens.get(actor_id, f"{prefix}{actor_id}")
+            tokens.append(token)
         return tokens
 
     @property

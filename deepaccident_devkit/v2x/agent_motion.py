@@ -9,6 +9,7 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.geometry.box_arrays import normals
 from deepaccident_devkit.geometry.conventions import stored_transforms
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays
+from deepaccident_devkit.tables.build import timestamps
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 MIN_CURVATURE_SPEED: Final = 0.5
@@ -51,11 +52,10 @@ def agent_motion(dataset: Dataset, agent: RowArgument) -> AgentMotion:
         TokenError: The agent is unknown.
     """
     agent_row = dataset.getind("agent", agent)
-    first_sample = dataset.columns("agent")["first_sample_row"].item(agent_row)
-    scenario_row = dataset.columns("agent")["scenario_row"].item(agent_row)
-    scenarios = dataset.columns("scenario")
-    num_frames = scenarios["num_frames"].item(scenario_row)
-    first_frame = scenarios["first_frame_row"].item(scenario_row)
+    agents = dataset.columns("agent")
+    first_sample = agents["first_sample_row"].item(agent_row)
+    scenario_row = agents["scenario_row"].item(agent_row)
+    num_frames = dataset.columns("scenario")["num_frames"].item(scenario_row)
     poses = dataset.columns("ego_pose")["matrix"][first_sample : first_sample + num_frames]
     world_from_ego = stored_transforms(poses)
     yaw = np.unwrap(np.arctan2(world_from_ego[:, 1, 0], world_from_ego[:, 0, 0]))
@@ -68,7 +68,7 @@ def agent_motion(dataset: Dataset, agent: RowArgument) -> AgentMotion:
     unknown = np.full(num_frames, np.nan)
     moves = speed >= MIN_CURVATURE_SPEED
     return AgentMotion(
-        time=dataset.columns("frame")["timestamp"][first_frame : first_frame + num_frames],
+        time=timestamps(num_frames),
         speed=speed,
         acceleration=(acceleration * forward).sum(axis=1),
         lateral_acceleration=(acceleration * left).sum(axis=1),

@@ -75,13 +75,13 @@ class WindowConfig:
     @property
     def offsets(self) -> IntArray:
         """Frames from the sample to each step, shape (T,), ascending."""
-        step = _count_units("step", self.step, FRAME_PERIOD, minimum=FRAME_PERIOD)
-        num_past = _count_units("past", self.past, self.step)
-        num_future = _count_units("future", self.future, self.step)
+        step = count_units("step", self.step, FRAME_PERIOD, minimum=FRAME_PERIOD)
+        num_past = count_units("past", self.past, self.step)
+        num_future = count_units("future", self.future, self.step)
         return np.arange(-num_past, num_future + 1) * step
 
 
-def _count_units(name: str, value: float, unit: float, minimum: float = 0.0) -> int:
+def count_units(name: str, value: float, unit: float, minimum: float = 0.0) -> int:
     """Return how many times a time contains `unit`, in seconds.
 
     Raises:

@@ -55,6 +55,7 @@ EXPECTED_DEFAULTS = {
     "windows.WindowConfig": "past=2.0, future=3.0, step=0.1, agents=None, visible=None, "
     "actors='present'",
     "windows.configured_window": "frame='ego'",
+    "windows.count_units": "minimum=0.0",
     "windows.window": "past=2.0, future=3.0, step=0.1, agents=None, visible=None, frame='ego', "
     "actors='present'",
     "tracks.Trajectory": "present=None",
