@@ -69,6 +69,8 @@ class Browser:
 
     def faults(self) -> dict[str, Any]:
         """Return by kind what no page may have: overflow, console messages, missing pictures."""
+        self.script("for (const image of document.images) image.loading = 'eager'")
+        self.wait("[...document.images].every((image) => image.complete)")
         missing_pictures = (
             "[...document.images].filter((image) => image.src && "
             "!image.naturalWidth).map((image) => image.outerHTML)"
