@@ -25,12 +25,12 @@ from deepaccident_devkit.errors import (
     TokenError,
 )
 from deepaccident_devkit.taxonomy import CATEGORIES
-from deepaccident_devkit.v2x import WindowConfig, stack_windows
+from deepaccident_devkit.v2x import WindowConfig, cooperative_view, stack_windows
 
 NUM_FRAMES = 6
 SAMPLE = f"{SCENARIO_TOKEN}/ego_vehicle/003"
 POLE_SAMPLE = f"{SCENARIO_TOKEN}/infrastructure/003"
-CYCLIST_ID = 1400
+CYCLIST_ID, VAN_ID = 1400, 1300
 EGO_BIT, POLE_BIT = 1, 16
 
 
@@ -80,6 +80,33 @@ def test_a_hole_stays_and_the_ends_are_not_valid(tiny: DeepAccident) -> None:
     assert window.instance[row] == f"{SCENARIO_TOKEN}/actor/{CYCLIST_ID}"
     assert window.own_actor_id in window.actor_id
     assert -1 not in window.actor_id
+
+
+def test_where_labels_differ_the_own_row_comes_last_and_the_first_agent_first(
+    tiny: DeepAccident, tmp_path: Path
+) -> None:
+    """As in `cooperative_view`, a vehicle's own row counts only if no other agent annotates it."""
+    own_id = tiny.window(SAMPLE).own_actor_id
+    van_lengths = {"ego_vehicle": "7.0", "infrastructure": "6.0"}
+
+    def lines_that_differ(agent: str, frame: int) -> list[str]:
+        van_size = f" {van_lengths[agent]} 2.0 2.2 "
+        lines = [line.replace(" 5.0 2.0 2.2 ", van_size) for line in label_lines(agent, frame)]
+        if agent == "infrastructure":
+            lines.append(f"car 5.0 5.0 -1.2 9.0 1.9 1.5 0.0 0.0 0.0 {own_id} 50 True")
+        return lines
+
+    write_tiny_release(
+        tmp_path, agents=tuple(van_lengths), frames=NUM_FRAMES, lines_of=lines_that_differ
+    )
+    da = DeepAccident("v1", tmp_path, verbose=False)
+    window = da.window(SAMPLE, past=0.0, future=0.0)
+
+    boxes = cooperative_view(da, SAMPLE).boxes
+    lengths = dict(zip(boxes.actor_id.tolist(), boxes.size[:, 0].tolist(), strict=True))
+    assert (lengths[own_id], lengths[VAN_ID]) == (9.0, 7.0)
+    expected_lengths = [lengths[actor] for actor in window.actor_id.tolist()]
+    assert window.size[:, 0, 0].tolist() == expected_lengths
 
 
 def test_headings_pass_through_pi(tiny: DeepAccident) -> None:
