@@ -455,7 +455,7 @@ class Dataset(OpenTables):
         """
         views = self._tables.views
         sensor_row = views["sample_data"]["calibrated_sensor_row"].item(sample_data_row)
-        if sensor_row not in self._compared_cameras:
+        if not self._has_size_warning and sensor_row not in self._compared_cameras:
             self._compared_cameras.add(sensor_row)
             self._compare_image_size(sample_data_row)
         intrinsic: FloatArray = views["calibrated_sensor"]["camera_intrinsic"][sensor_row]

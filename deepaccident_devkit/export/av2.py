@@ -87,7 +87,7 @@ class Av2(Format):
             output.tally.samples += 1
 
     def _count_frames(self) -> int:
-        """Return the frames from one sample to the next; raise ConfigError if it is no number."""
+        """Return the frames from one sample to the next; raise ConfigError if it is wrong."""
         return count_units("every", self.every, FRAME_PERIOD, minimum=FRAME_PERIOD)
 
     def finish(

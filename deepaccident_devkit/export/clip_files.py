@@ -16,7 +16,7 @@ from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
-FPS: Final = 10
+FPS: Final = round(1 / FRAME_PERIOD)
 """Frames per second of recordings and videos."""
 _TASK = "drive"
 _VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"

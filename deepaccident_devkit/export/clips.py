@@ -26,6 +26,7 @@ from deepaccident_devkit.export.clip_files import (
 from deepaccident_devkit.export.clip_rows import clip_cameras, clip_rows
 from deepaccident_devkit.export.format import README, check_names, flat_name, format_readme
 from deepaccident_devkit.export.frames import FrameFiles, sensor_files
+from deepaccident_devkit.export.images import check_pixels
 from deepaccident_devkit.release.images import (
     ImageSize,
     aspect_fault,
@@ -37,7 +38,7 @@ from deepaccident_devkit.release.images import (
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.mp4 import MP4_QUALITY, check_pyav, write_mp4
-from deepaccident_devkit.taxonomy import AGENTS, CAMERAS
+from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, SPLITS
 from deepaccident_devkit.v2x.agents import agents_of
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ _PRESET = "faster"
 # Statistics use this many rows and columns of pixels of the first picture in each second.
 _GRID_SIZE = 6
 _UNKNOWN_SPLIT = "unknown"
-_SPLIT_ORDER = ("train", "val", "test", _UNKNOWN_SPLIT)
+_SPLIT_ORDER = (*SPLITS, _UNKNOWN_SPLIT)
 _BODY = """\
 A LeRobotDataset v3, which `LeRobotDataset(name, root=folder, video_backend="pyav")` opens. An \
 episode is the recording of
@@ -84,7 +85,8 @@ class Clips(Format):
 
     Raises:
         ChoiceError: If there is no such split, agent or camera.
-        ConfigError: If the quality is not a number from 0 to 51.
+        ConfigError: If the size is not two whole numbers of pixels, or the quality is not a number
+            from 0 to 51.
     """
 
     cameras: tuple[str, ...] = CAMERAS[:1]
@@ -98,9 +100,12 @@ class Clips(Format):
     )
 
     def __post_init__(self) -> None:
-        """Check the cameras and the quality."""
+        """Check the cameras, the size and the quality."""
         super().__post_init__()
         object.__setattr__(self, "cameras", check_names("cameras", self.cameras, CAMERAS))
+        if self.size is not None:
+            size = check_pixels("size", self.size, "width and height", (1, 1))
+            object.__setattr__(self, "size", size)
         if self.quality not in range(52):
             raise ConfigError(f"quality: expected a number from 0 to 51, found {self.quality}")
 
@@ -128,12 +133,13 @@ class Clips(Format):
     def write(self, dataset: Dataset, unit: Unit, output: Output) -> None:
         """Write the videos of all recordings, and the rows of each into a part."""
         (scenario,) = unit.scenarios
+        recorded_agents = agents_of(dataset, scenario)
+        num_frames = dataset.scenario.get(scenario)["num_frames"]
         for agent in self.agents:
-            if agent not in agents_of(dataset, scenario):
+            if agent not in recorded_agents:
                 output.leave_out("agents of scenarios that are not in this release")
                 continue
             images = self._find_images(dataset, scenario, agent)
-            num_frames = dataset.scenario.get(scenario)["num_frames"]
             if any(len(files) < num_frames for files in images.values()):
                 output.leave_out("recordings that lack images in this release")
                 continue

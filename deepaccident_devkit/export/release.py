@@ -88,7 +88,8 @@ class ReleasePart(Format):
     Attributes:
         channels: Sensors with files to include.
         size: Width and height to which images are resized by area, in pixels; None keeps them. The
-            intrinsics in calib are scaled with them. BEV camera and point clouds stay as they are.
+            intrinsics in calib are scaled with them. The files of the BEV camera and point clouds
+            stay as they are.
 
     Raises:
         ChoiceError: If there is no such channel.

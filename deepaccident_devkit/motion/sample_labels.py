@@ -14,7 +14,13 @@ from deepaccident_devkit.motion.config import MotionLabelConfig, resolved_label_
 from deepaccident_devkit.motion.drawing import make_labels
 from deepaccident_devkit.motion.labels import MotionLabels
 from deepaccident_devkit.motion.warping import egomotion
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    concatenate_ranges,
+)
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.tables.tokens import agent_token
@@ -261,10 +267,7 @@ def _find_annotations(dataset: Dataset, rows: IntArray) -> tuple[IntArray, IntAr
     """Return the annotation rows of samples, sample by sample, and how many each sample has."""
     samples = dataset.columns("sample")
     counts: IntArray = samples["num_annotations"][rows].astype(np.int64)
-    starts = np.cumsum(counts) - counts
-    offsets = samples["first_annotation_row"][rows] - starts
-    annotation_rows: IntArray = np.repeat(offsets, counts) + np.arange(counts.sum())
-    return annotation_rows, counts
+    return concatenate_ranges(samples["first_annotation_row"][rows], counts), counts
 
 
 def _number_pairs(actor: AnyArray, row: IntArray, frame: IntArray, frames: int) -> IntArray:

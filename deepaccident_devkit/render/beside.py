@@ -10,12 +10,12 @@ import numpy as np
 from deepaccident_devkit.collisions.twins import twin_of
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
+from deepaccident_devkit.render.boxes import recorders_of
 from deepaccident_devkit.render.figures import with_light_grid
 from deepaccident_devkit.render.styles import COLLIDER_COLOR, LINK_COLOR, MUTED_COLOR
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.tables.records import ScenarioRecord
-from deepaccident_devkit.taxonomy import FRAME_PERIOD, AgentName, short_name
-from deepaccident_devkit.v2x.agents import agents_of
+from deepaccident_devkit.taxonomy import FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x.collisions import colliding_pair
 from deepaccident_devkit.v2x.tracks import pair_approach, scenario_tracks
 
@@ -100,8 +100,9 @@ class BesideTwin:
             raise NotAvailableError(
                 f"{record['token']}: neither it nor its twin has a collision; choose an accident"
             )
-        agents = _agents_by_actor(dataset, accident)
-        own_actors = {agent: actor for actor, agent in _agents_by_actor(dataset, normal).items()}
+        agents = recorders_of(dataset, accident["token"])
+        normal_agents = recorders_of(dataset, normal["token"])
+        own_actors = {agent: actor for actor, agent in normal_agents.items()}
         normal_pair = []
         names = []
         for actor in pair:
@@ -141,16 +142,6 @@ class BesideTwin:
         ax.set_xlabel("time since the recordings began (s); dotted: their ends", color=MUTED_COLOR)
         ax.legend(loc="upper left", ncols=2)
         with_light_grid(ax, "both")
-
-
-def _agents_by_actor(dataset: Dataset, scenario: ScenarioRecord) -> dict[int, AgentName]:
-    """Return the agents of a scenario by the ids of their actors."""
-    agents: dict[int, AgentName] = {}
-    for agent in agents_of(dataset, scenario):
-        actor_id = dataset.agent.get(f"{scenario['token']}/{agent}")["actor_id"]
-        if actor_id is not None:
-            agents[actor_id] = agent
-    return agents
 
 
 def _approach(

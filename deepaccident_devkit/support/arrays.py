@@ -281,6 +281,13 @@ def as_floats(values: ArrayLike) -> FloatArray:
         raise GeometryError(f"expected numbers, found {type(values).__name__} ({error})") from error
 
 
+def concatenate_ranges(starts: IntArray, counts: IntArray) -> IntArray:
+    """Concatenate N ranges of consecutive numbers, given by `starts` (N,) and `counts` (N,)."""
+    num_before = np.cumsum(counts) - counts
+    offsets = np.repeat(starts.astype(np.int64) - num_before, counts)
+    return offsets + np.arange(counts.sum())
+
+
 def in_range(numbers: AnyArray | float) -> BoolArray:
     """Return which numbers are neither NaN, nor infinite, nor larger than `LARGEST_NUMBER`."""
     is_small: BoolArray = np.abs(numbers) <= np.float64(LARGEST_NUMBER)  # half precision has no 1e9

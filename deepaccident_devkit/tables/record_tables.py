@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray, concatenate_ranges
 from deepaccident_devkit.tables.arrow_files import damaged_value
 from deepaccident_devkit.tables.columns import Choice, Column, Key, Struct, Subset, Vector
 from deepaccident_devkit.tables.records import table_spec
@@ -68,20 +68,20 @@ class RecordTables:
         agent_rows = agent_rows[np.isin(agent["name"][agent_rows], codes)]
         scenario = self._tables.columns("scenario")
         num_frames = scenario["num_frames"][agent["scenario_row"][agent_rows]]
-        samples = _concatenate_ranges(agent["first_sample_row"][agent_rows], num_frames)
+        samples = concatenate_ranges(agent["first_sample_row"][agent_rows], num_frames)
         num_annotations = sample["num_annotations"][samples]
         return {
             "scenario": scenario_rows,
             "agent": agent_rows,
             "frame": self._find_rows("frame", "scenario_row", scenario_rows),
             "sample": samples,
-            "sample_data": _concatenate_ranges(
+            "sample_data": concatenate_ranges(
                 samples * len(CHANNELS), np.full(len(samples), len(CHANNELS))
             ),
             "calibrated_sensor": self._find_rows("calibrated_sensor", "agent_row", agent_rows),
             "ego_pose": samples,
             "instance": self._find_rows("instance", "scenario_row", scenario_rows),
-            "annotation": _concatenate_ranges(
+            "annotation": concatenate_ranges(
                 sample["first_annotation_row"][samples], num_annotations
             ),
             "track": self._find_rows("track", "scenario_row", scenario_rows),
@@ -112,7 +112,7 @@ class RecordTables:
         column = self._tables.columns(table)[key]
         start = np.searchsorted(column, targets.astype(column.dtype))
         stop = np.searchsorted(column, (targets + 1).astype(column.dtype))
-        return _concatenate_ranges(start, stop - start)
+        return concatenate_ranges(start, stop - start)
 
     def _make_column(self, table: str, column: Column, rows: IntArray) -> Any:  # noqa: PLR0911 - one a kind
         if column.stored is None:
@@ -273,10 +273,3 @@ def _make_open_lists(structs: Any) -> Any:
             field_type = pa.list_(field_type.value_type)
         fields.append((field.name, field_type))
     return pa.array(structs.to_pylist(), type=pa.struct(fields))
-
-
-def _concatenate_ranges(starts: IntArray, counts: IntArray) -> IntArray:
-    """Concatenate N ranges of consecutive numbers, given by `starts` (N,) and `counts` (N,)."""
-    num_before = np.cumsum(counts) - counts
-    offsets = np.repeat(starts.astype(np.int64) - num_before, counts)
-    return offsets + np.arange(counts.sum())

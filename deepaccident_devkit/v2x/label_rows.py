@@ -7,7 +7,13 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.geometry.conventions import stored_transforms
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    concatenate_ranges,
+)
 from deepaccident_devkit.tables import visible_mask
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, INFRASTRUCTURE, LIDAR, OWN_ACTOR_ID
@@ -36,8 +42,7 @@ def label_rows(
     sample_rows = np.add.outer(first_rows, index[steps] - 1).ravel()
     counts = samples["num_annotations"][sample_rows]
     # The boxes of a label are consecutive rows.
-    shifts = samples["first_annotation_row"][sample_rows] - counts.cumsum() + counts
-    rows = np.arange(counts.sum()) + shifts.repeat(counts)
+    rows = concatenate_ranges(samples["first_annotation_row"][sample_rows], counts)
     is_tracked = dataset.columns("annotation")["instance_row"][rows] >= 0
     box_steps = np.tile(steps, len(first_rows)).repeat(counts)
     return rows[is_tracked], box_steps[is_tracked]

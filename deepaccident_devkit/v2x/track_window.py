@@ -172,9 +172,10 @@ def stack_windows(windows: Sequence[TrackWindow]) -> dict[str, AnyArray]:
             "windows: expected at least one window, all with the same frame, past, future and "
             f"step, found {counted(len(windows), 'window')} of {counted(len(kinds), 'kind')}"
         )
+    arrays_of_windows = [window.arrays for window in windows]
     batch = {}
-    for name, first in windows[0].arrays.items():
-        arrays = [window.arrays[name] for window in windows]
+    for name, first in arrays_of_windows[0].items():
+        arrays = [window_arrays[name] for window_arrays in arrays_of_windows]
         blank = _PADDING.get(first.dtype.kind, 0)
         shape = (len(windows), max(map(len, arrays)), *first.shape[1:])
         batch[name] = np.full(shape, blank, dtype=first.dtype)

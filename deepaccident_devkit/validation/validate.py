@@ -477,7 +477,7 @@ def _find_outdated(layout: ReleaseLayout, checks: Sequence[ScenarioCheck]) -> Fi
 
 
 def _find_missing_in_part(part: PartManifest, files: Completeness) -> Findings:
-    """Yield findings about files and scenarios that the manifest of a part names, but it lacks."""
+    """Yield findings about files that a part lacks, and about an interrupted export of it."""
     code = "part-incomplete"
     if part.release is None:
         yield make_finding(code, None, files.dataroot, "the export of this part was interrupted")
@@ -487,9 +487,10 @@ def _find_missing_in_part(part: PartManifest, files: Completeness) -> Findings:
 
 
 def _find_strays(layout: ReleaseLayout, part: PartManifest | None) -> Findings:
-    """Yield findings about scenarios that a part lacks, and about unused files and folders.
+    """Yield findings about scenarios that a part lacks, and about strays.
 
-    They look like parts of a release. `part` is the manifest of a part of a release, or None.
+    Strays are files and folders that look like parts of a release but are unused. `part` is the
+    manifest of a part of a release, or None.
     """
     if part is not None:
         present = {scenario.token for scenario in layout.scenarios}

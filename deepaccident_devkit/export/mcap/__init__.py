@@ -27,7 +27,7 @@ with its message:
   `motion_labels`.
 - `/<agent>/prediction/…`: `paths`, `boxes` and `marks` (SceneUpdate), `motion/points`
   (PointCloud), and `alarm` (DoubleValue: the score of the alarm); only with a prediction. True
-  paths are white, and paths are opaque by their probability.
+  paths are white, and the more probable a path is, the more opaque it is.
 - `/road/points` (PointCloud): the ground in world, from the agents' BEV cameras; sent once.
 - `/<agent>/speed` (DoubleValue): the speed in m/s, for plots.
 - `/time_to_impact` (DoubleValue): seconds, only if meta names a collision.

@@ -172,18 +172,13 @@ def draw_accidents(
             _draw_foreseen_paths(alarm, truth, ax)
         keep_line_free(ax, alarm.positions, margin=_MARK_MARGIN_PT)
         x, y = alarm.positions.mean(axis=0).tolist()
-        write_beside(ax, alarm_words(alarm), (x, y), FORESEEN_COLOR)
+        write_beside(ax, alarm.words, (x, y), FORESEEN_COLOR)
         if compared.true is not None:
             _draw_differences(alarm, compared.true, ax)
     center, half = shown_square(compared, truth)
     show_square(ax, center, half)
     titled_from_above(ax, difference_words(compared), grid="grid" in layers)
     return ax.get_legend_handles_labels()[0]
-
-
-def alarm_words(alarm: Accident) -> str:
-    """Describe a foreseen accident by its time and score: `in 1.5 s, score 0.9`."""
-    return alarm.words
 
 
 def difference_words(compared: ComparedAccidents) -> str:

@@ -23,7 +23,7 @@ from deepaccident_devkit.render.camera import draw_camera_boxes
 from deepaccident_devkit.render.captions import draw_legend, set_scene_title
 from deepaccident_devkit.render.figures import axes_or_new, figure_or_new, lay_out_figure
 from deepaccident_devkit.render.motion_maps import MotionMaps
-from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR, alarm_words
+from deepaccident_devkit.render.outcomes.above import DASHED, FORESEEN_COLOR
 from deepaccident_devkit.render.outcomes.camera_view import CASINGS, CameraView, view_of
 from deepaccident_devkit.render.outcomes.described import sample_drawing, task_to_describe
 from deepaccident_devkit.render.outcomes.drawings import draw_drawing_in_camera, drawing_handles
@@ -191,7 +191,7 @@ def draw_accidents_in_camera(
         view.write(f"in {true.time:.1f} s", true.positions, COLLIDER_COLOR)
     for alarm in verdict.compared.predicted:
         _draw_positions(alarm.positions, _CROSS, FORESEEN_COLOR, view)
-        view.write(alarm_words(alarm), alarm.positions, FORESEEN_COLOR)
+        view.write(alarm.words, alarm.positions, FORESEEN_COLOR)
     return ax
 
 
@@ -247,9 +247,9 @@ def _draw_edges(
 
 
 def _draw_motion(verdict: MotionVerdict, frame: int, view: CameraView) -> None:
+    """Draw the cells of predicted instances on the ground, and the outlines of missed true ones."""
     from matplotlib.collections import PolyCollection
 
-    """Draw the cells of predicted instances on the ground, and the outlines of missed true ones."""
     outcome = verdict.outcome
     missed_ids = outcome.judged("true", frame)["missed"]
     for kind, ids in outcome.judged("predicted", frame).items():

@@ -8,6 +8,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.evaluation.alarms import LABEL_STEP
 from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.drawing import Drawing
 from deepaccident_devkit.evaluation.evaluator import Evaluator
@@ -30,8 +31,6 @@ _KINDS: Mapping[type, str] = {
     Plan: "planning",
     Forecast: "forecasting",
 }
-# Seconds between the frames of motion that is given without a results file.
-_MOTION_STEP_S = 0.5
 # Number of headlines in the title of a sample without a main number.
 _OTHER_NUMBERS = 3
 
@@ -158,7 +157,7 @@ def _form_and_horizon(prediction: Any) -> tuple[MotionForm | None, float]:
     form = MotionForm(
         stored="instances", grid=prediction.grid, predictions=len(prediction), frames=frames
     )
-    return form, (frames - 1) * _MOTION_STEP_S
+    return form, (frames - 1) * LABEL_STEP
 
 
 def _number_words(evaluator: Evaluator[Any], token: str, prediction: Any, *truth: Any) -> str:

@@ -195,8 +195,7 @@ def _detection_verdict(
     truth = detection_truth(dataset, token, rules)
     world_from_prediction = dataset.world_from(token, prediction.boxes.frame)
     truth_from_world = dataset.world_from(token, rules.frame).inverse()
-    boxes = prediction.boxes.transform(truth_from_world @ world_from_prediction, rules.frame)
-    detected = DetectedBoxes(boxes=boxes, scores=prediction.scores)
+    detected = prediction.transform(truth_from_world @ world_from_prediction, rules.frame)
     evaluator = DetectionEvaluator(rules)
     evaluator.update(token, detected, truth)
     precision = evaluator.compute().mean_average_precision

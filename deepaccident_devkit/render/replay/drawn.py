@@ -70,7 +70,7 @@ def drawing_entries(
         NotAvailableError: There is no prediction for this scenario and these agents.
     """
     evaluator_type = evaluator_class(task)
-    evaluator = evaluator_type(next(iter(evaluator_type.protocols)))
+    evaluator = evaluator_type(next(iter(evaluator_type.protocols), ""))
     legend: dict[str, str] = {}
     samples = []
     for agent, frame in predicted_samples(recording, prediction):
@@ -119,7 +119,7 @@ def _describe(
 
 
 def _sample_entry(recording: ReplayRecording, token: str, drawing: Drawing) -> dict[str, Any]:
-    """Return the lines and places of a drawing in the page's coordinates, and what colours mean."""
+    """Return the lines, places and alarm of a drawing, in the page's coordinates."""
     # the page has trails of its own for the past
     paths = [path for path in drawing.paths if path.role != "past"]
     paths.sort(key=lambda path: -path.probability)

@@ -29,7 +29,7 @@ from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.boxes import actor_color, agent_letters, camera_name, recorders_of
-from deepaccident_devkit.render.outcomes.above import alarm_words, count_words, error_words
+from deepaccident_devkit.render.outcomes.above import count_words, error_words
 from deepaccident_devkit.render.styles import AGENT_COLORS
 from deepaccident_devkit.support.arrays import (
     AnyArray,
@@ -435,7 +435,7 @@ def _alarm_entry(
     error = None
     if counts["alarms"]:
         error = counts["alarms"][0]
-    text = f"predicted {alarm_words(accident)}"
+    text = f"predicted {accident.words}"
     if error and error["position"] is not None:
         text += f": {error_words(error['position'], error['time'])}"
     elif error is None:

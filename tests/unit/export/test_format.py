@@ -87,6 +87,7 @@ def test_a_wrong_choice_is_refused_before_a_release_is_opened(
     ("kind", "options", "message"),
     [
         (Clips, {"quality": 52}, "quality: expected a number from 0 to 51, found 52"),
+        (Clips, {"size": (640,)}, "size: expected width and height in pixels, found"),
         (ReleasePart, {"size": (640,)}, "size: expected width and height in pixels, found"),
         (Parquet, {"shard_scenarios": 0}, "shard_scenarios: .*from 1.*0"),
         (
