@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, ShortRepr
+from deepaccident_devkit.geometry import BevGrid, Boxes
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, ShortRepr
 
 Role = Literal["truth", "past", "predicted", "right", "false", "missed", "collision"]
 """What a thing in a picture is, which decides its colour.
@@ -58,6 +58,26 @@ class DrawnBoxes(FrozenArrays):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnCells(FrozenArrays):
+    """Cells of instances of one kind over time; arrays are read-only.
+
+    Attributes:
+        instance: (T, H, W) ids from 1 that stay the same over time, 0 for other cells; all maps are
+            in the current ego frame.
+        grid: Cells of the maps, in the devkit's orientation.
+        times: (T,) seconds after the current frame.
+        role: What the instances are.
+        label: Words for the legend.
+    """
+
+    instance: AnyArray
+    grid: BevGrid
+    times: FloatArray
+    role: Role
+    label: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnPlaces(FrozenArrays):
     """Positions at which something happens at one time; arrays are read-only.
 
@@ -96,6 +116,7 @@ class Drawing(ShortRepr):
     Attributes:
         paths: Paths on the ground.
         boxes: Boxes by kind.
+        cells: Cells of instances by kind.
         places: Marked positions.
         alarm: Alarm of the sample; None for tasks without alarms.
         words: Summary for the title, such as `contact in 1.5 s`; if it is empty, views print the
@@ -104,6 +125,7 @@ class Drawing(ShortRepr):
 
     paths: tuple[DrawnPath, ...] = ()
     boxes: tuple[DrawnBoxes, ...] = ()
+    cells: tuple[DrawnCells, ...] = ()
     places: tuple[DrawnPlaces, ...] = ()
     alarm: DrawnAlarm | None = None
     words: str = ""

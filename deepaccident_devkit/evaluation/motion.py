@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnPath, Role
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnCells, DrawnPath, Role
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
     CLASSES,
@@ -26,6 +26,7 @@ from deepaccident_devkit.evaluation.instances import (
     prediction_accuracy,
     trajectory_errors,
     vpq_counts,
+    vpq_matches,
 )
 from deepaccident_devkit.evaluation.predictions import (
     MotionOutput,
@@ -35,6 +36,7 @@ from deepaccident_devkit.evaluation.predictions import (
     compared_labels,
     first_frames,
     labels_at_present,
+    num_recorded_frames,
 )
 from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.geometry import BevGrid
@@ -207,6 +209,34 @@ def _drawn_paths(
     return drawn_paths
 
 
+def _drawn_cells(
+    predicted: AnyArray, true: AnyArray, grid: BevGrid, step: float
+) -> tuple[DrawnCells, ...]:
+    """Describe instances (T, H, W) by their outcome in each frame; `step` is in seconds."""
+    within = (slice(None), *cells_within(grid, max(RANGES.values())))
+    matches = vpq_matches(predicted[within], true[within])
+    frames, predicted_ids, true_ids = matches.T
+    times = np.arange(len(true), dtype=np.float64) * step
+    kinds = []
+    sides: tuple[tuple[AnyArray, AnyArray, tuple[tuple[Role, str], ...]], ...] = (
+        (true, true_ids, (("truth", "found"), ("missed", "missed"))),
+        (predicted, predicted_ids, (("right", "right"), ("false", "false"))),
+    )
+    for maps, ids, roles in sides:
+        matched = np.zeros_like(maps)
+        unmatched = np.zeros_like(maps)
+        for frame, instance in enumerate(maps):
+            is_matched = np.isin(instance, ids[frames == frame])
+            is_counted = np.isin(instance, instance[within[1:]])
+            matched[frame] = np.where(is_matched, instance, 0)
+            unmatched[frame] = np.where(is_counted & ~is_matched, instance, 0)
+        for instance, (role, kind) in zip((matched, unmatched), roles, strict=True):
+            kinds.append(
+                DrawnCells(instance=instance, grid=grid, times=times, role=role, label=kind)
+            )
+    return tuple(kinds)
+
+
 class MotionEvaluator(Evaluator[MotionResult]):
     """Evaluator of motion: IoU and VPQ of the last prediction, path errors of all predictions.
 
@@ -268,18 +298,26 @@ class MotionEvaluator(Evaluator[MotionResult]):
         self.add(token, counts)
 
     def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
-        """Describe the paths of predicted instances (the last prediction) and of true ones."""
+        """Describe the cells and paths of predicted instances (the last prediction) and true ones.
+
+        Instances are matched frame by frame, as VPQ does within the largest range; instances
+        outside it have no cells in the picture.
+        """
         (label,) = truth
         present = labels_at_present(label)
         step = label.config.step * FRAME_PERIOD
-        true_instances = np.where(present.label_valid[:, None, None], present.instance, 0)
-        predicted = instance_paths(predicted_instances(prediction), prediction.grid)
-        true = instance_paths(true_instances, present.config.grid)
+        grid = label.config.grid
+        true_maps = np.where(present.label_valid[:, None, None], present.instance, 0)
+        true = grid.reorient(true_maps, "devkit")
+        predicted = prediction.grid.reorient(predicted_instances(prediction), "devkit")
+        grid = grid.with_orientation("devkit")
         paths = [
-            *_drawn_paths(predicted, step, "predicted", "predicted"),
-            *_drawn_paths(true, step, "truth", "true path"),
+            *_drawn_paths(instance_paths(predicted, grid), step, "predicted", "predicted path"),
+            *_drawn_paths(instance_paths(true, grid), step, "truth", "true path"),
         ]
-        return Drawing(paths=tuple(paths))
+        frames = num_recorded_frames(label)
+        cells = _drawn_cells(predicted[:frames], true[:frames], grid, step)
+        return Drawing(paths=tuple(paths), cells=cells)
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
         """Compute the metrics from the counts of samples, in any order."""
