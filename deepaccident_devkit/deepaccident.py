@@ -14,6 +14,7 @@ from deepaccident_devkit.release import find_release
 from deepaccident_devkit.release.store import Dataroot, open_dataroot
 from deepaccident_devkit.support.nuscenes_names import with_keywords_named
 from deepaccident_devkit.support.text import PathType, counted, path_of
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables import open_index
 from deepaccident_devkit.taxonomy import OnError
 
@@ -116,7 +117,7 @@ class DeepAccident(Dataset):
             IndexStoreError: If the index cannot be written.
             MissingExtraError: If the dataroot is a URL, and the extra `cloud` is not installed.
         """
-        engine: dict[str, Any] = {"workers": workers, "executor": executor, "progress": verbose}
+        engine: NamedValues = {"workers": workers, "executor": executor, "progress": verbose}
         index_path: Path | None = None
         if index_dir is not None:
             path = path_of(index_dir, "index_dir: expected a path")

@@ -185,13 +185,21 @@ def test_a_scenario_without_a_collision_has_rows_too(da_motion: DeepAccident) ->
     assert instance_token.startswith(f"{token}/actor/")
 
 
-def test_evaluation_draws_a_sample_of_the_results(da_motion: DeepAccident, tmp_path: Path) -> None:
+def test_evaluation_and_video_draw_the_results(da_motion: DeepAccident, tmp_path: Path) -> None:
     tokens = da_motion.samples("train", "evaluate")[:2]
     results = predict_results(da_motion, "accident", tokens, tmp_path / "results.json", workers=1)
     command = ["evaluation", da_motion.dataroot, "--results", results, "--out", tmp_path / "a.png"]
     assert tokens[0] in run(*command, "--size", "600x300")
     message = "has no prediction for 'no/such/ego_vehicle/001'"
     assert_raises((lambda: run(*command, "no/such/ego_vehicle/001"), TokenError, message))
+
+    out = tmp_path / "video.gif"
+    video = ["video", da_motion.dataroot, "--out", out, "--size", "320x180", "--workers", 1]
+    run(*video, "--beside", f"baseline={results}", "--task", "warning", "--frame-range", "20")
+    with Image.open(out) as image:
+        assert image.size == (320, 180)
+    refusal = invoke_command("render", *video, "--task", "warning", status=2).output
+    assert "--task has no effect without a results file" in refusal
 
 
 def test_video_writes_the_chosen_views(da: DeepAccident, accident: str, tmp_path: Path) -> None:

@@ -128,6 +128,7 @@ def _run_all(names: Sequence[str], work: Path, environments: Path) -> list[Run]:
         **{name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
         "CI_TOP": str(TOP),
         "CI_ENVIRONMENTS": str(environments),
+        "CI_STEPS": " ".join(names),
         "CI_SOURCE_HASH": _hash_of(source),
         "CI_WORKERS": str(max(1, len(os.sched_getaffinity(0)) // num_parallel)),
         "PYTHON": sys.executable,

@@ -2,6 +2,8 @@
 # checks.
 set -euo pipefail
 export PIP_DISABLE_PIP_VERSION_CHECK=1 MPLBACKEND=Agg PYTEST_XDIST_AUTO_NUM_WORKERS="$CI_WORKERS"
+# Python compiles the modules that a step imports; pip would compile all of them, which takes longer than to unpack them.
+export PIP_COMPILE=0
 # A CPU build; plain `torch` would download gigabytes of CUDA. Where PyPI offers only that:
 # TORCH='torch --index-url https://download.pytorch.org/whl/cpu' .ci/run
 TORCH="${TORCH:-torch==2.13.0}"

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -74,6 +74,7 @@ from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.release.store import Dataroot
 from deepaccident_devkit.support.parallel import keep_workers
 from deepaccident_devkit.support.plugins import LazyVerb, Plugin
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import AGENTS
 
 _FINDINGS_STATUS = 1
@@ -298,8 +299,8 @@ def _complete_run(
     dataset: DeepAccident,
     results: Results,
     by: tuple[str, ...],
-    options: dict[str, Any],
-) -> tuple[Mapping[str, Any], str]:
+    options: NamedValues,
+) -> tuple[ReadOnlyValues, str]:
     """Add breakdowns and checks to a run, and save it if requested.
 
     Returns:
@@ -332,7 +333,7 @@ def _complete_run(
     return run.summary(), text
 
 
-def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
+def _refuse_unused(setup: EvaluationSetup, options: NamedValues) -> None:
     """Raise a usage error for an option that has no effect here, or that needs another option."""
     if options["out"] is None:
         refuse_unused("without --out", "overwrite", "include_results", "style", "no_title")
@@ -360,7 +361,7 @@ def _refuse_unused(setup: EvaluationSetup, options: dict[str, Any]) -> None:
         refuse_unused(f"with --samples all, as {reason}", "horizon")
 
 
-def _select_samples(setup: EvaluationSetup, options: Mapping[str, Any]) -> SampleSelection:
+def _select_samples(setup: EvaluationSetup, options: ReadOnlyValues) -> SampleSelection:
     """Return the selection of samples that a subcommand's options describe."""
     agents = agent_names(options["agents"])
     return default_selection(

@@ -39,6 +39,7 @@ from deepaccident_devkit.errors import ExportError
 from deepaccident_devkit.motion import PRESETS
 from deepaccident_devkit.support.plugins import LazyFormat, LazyVerb, Plugin
 from deepaccident_devkit.support.text import choice, counted, size_text
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import (
     AGENTS,
     CAMERAS,
@@ -88,7 +89,7 @@ def bulk_parameters(agents: _Parameter = agents_parameter) -> _Parameter:
 
 def run_export(
     kind: Callable[..., Any],
-    settings: dict[str, Any],
+    settings: NamedValues,
     *,
     out: Path,
     split: str | None,
@@ -174,7 +175,7 @@ def _make_format_verb(
     return export_format
 
 
-def _pop_own_fields(kind: type[Any], options: dict[str, Any]) -> dict[str, Any]:
+def _pop_own_fields(kind: type[Any], options: NamedValues) -> NamedValues:
     """Remove the fields that only this format has from the options, and return them."""
     from deepaccident_devkit.export.bulk import Format
 

@@ -26,6 +26,7 @@ from deepaccident_devkit.motion.config import NO_PRESETS, slip_names
 from deepaccident_devkit.motion.label_folder import LabelManifest, folder_path
 from deepaccident_devkit.selection.samples import Purpose
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.v2x import AGENT_SETS
 
 
@@ -124,7 +125,7 @@ def labels(
     click.echo(f"wrote {out}: {samples} ({files}, {outcome.kept:,} already there)")
 
 
-def _pop_config(options: dict[str, Any]) -> MotionLabelConfig:
+def _pop_config(options: NamedValues) -> MotionLabelConfig:
     """Remove the options for the label configuration from `options`; return the configuration."""
     preset = options.pop("preset")
     switches = options.pop("switches")
@@ -133,7 +134,7 @@ def _pop_config(options: dict[str, Any]) -> MotionLabelConfig:
         "agents": options.pop("seen_by"),
         "only_vehicle": options.pop("only_vehicle") or None,
     }
-    changes: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    changes: NamedValues = {name: value for name, value in values.items() if value is not None}
     config = MotionLabelConfig.preset(preset, **changes)
     if switches:
         return replace(config, protocol=_switch_rules(config.rules, switches))

@@ -17,6 +17,7 @@ from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.plugins import Opener, offers
 from deepaccident_devkit.support.text import PathType, counted
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import VERSIONS, StyleName
 
 _BOOLEAN_WORDS = {"yes": "true", "no": "false"}
@@ -160,7 +161,7 @@ release_parameters = together(dataroot_argument, release_options)
 """DATAROOT and the release's options, for a subcommand that works on a release."""
 
 
-def engine_options(options: Mapping[str, Any]) -> dict[str, Any]:
+def engine_options(options: ReadOnlyValues) -> NamedValues:
     """Return the options of a subcommand that configure its workers."""
     return {name: options[name] for name in ("workers", "executor")}
 
@@ -191,12 +192,12 @@ def release_of(options: Mapping[str, Any]) -> dict[str, Any]:
     return {name: options[name] for name in ("dataroot", "version", "index_dir", "on_error")}
 
 
-def parse_switches(texts: Sequence[str]) -> dict[str, Any]:
+def parse_switches(texts: Sequence[str]) -> NamedValues:
     """Return name → value from repeated --switch NAME=VALUE.
 
     A value that is not yes, no or valid JSON remains a string.
     """
-    switches: dict[str, Any] = {}
+    switches: NamedValues = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):

@@ -28,6 +28,7 @@ from deepaccident_devkit.cli.render_targets import picture_paths, rows_to_draw
 from deepaccident_devkit.cli.verbs import Verb, WordChoice, advanced, together, verb
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.evaluation.results import Results, read_results
+from deepaccident_devkit.evaluation.runs.setups import scenario_of
 from deepaccident_devkit.render.accident import COUNTDOWN, render_accident
 from deepaccident_devkit.render.actors import render_annotation, render_instance
 from deepaccident_devkit.render.bev import render_bev
@@ -62,6 +63,7 @@ from deepaccident_devkit.render.teaser import TEASER_SECONDS, render_teaser
 from deepaccident_devkit.render.video import SUFFIXES, VIEWS, check_target, render_scenario_video
 from deepaccident_devkit.render.visibility import render_visibility, render_visibility_matrix
 from deepaccident_devkit.support.text import size_text
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import BEV_CAMERA, CAMERAS, LIDAR, Frame, StyleName
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.collisions import default_scenario
@@ -117,16 +119,21 @@ def _parse_named_paths(
     return tuple(named_paths)
 
 
+def _read_named(named_paths: Sequence[tuple[str, Path]], task: str | None) -> dict[str, Results]:
+    """Open results files by the names of their models."""
+    opened = [(name, read_results(path)) for name, path in named_paths]
+    return named_results(opened, task)
+
+
 def _open_with_results(
-    choices: dict[str, Any], tokens: Sequence[str], release: Mapping[str, Any]
+    choices: NamedValues, tokens: Sequence[str], release: ReadOnlyValues
 ) -> tuple[Dataset, Sequence[str]]:
     """Open the results among the options of a view, then the release; choose the samples."""
     pick = choices.pop("pick", None)
     if pick is not None and tokens:
         raise click.UsageError("--pick chooses the samples; leave out their names, or --pick")
-    opened = [(name, read_results(path)) for name, path in choices.get("results", ())]
-    if opened:
-        choices["results"] = named_results(opened, choices.get("task"))
+    if "results" in choices:
+        choices["results"] = _read_named(choices["results"], choices.get("task"))
         tokens = tokens or shared_samples(choices["results"])[:1]
     dataset = open_release(**release)
     if pick is not None:
@@ -197,6 +204,12 @@ _LAYERS = click.option(
     help=f"Draw only these layers. Each view has some of {', '.join(LAYERS)}.",
 )
 _NO_TITLE = no_title_option()
+_RESULTS_TASK = click.option(
+    "--task",
+    metavar="TASK",
+    help="Task that draws the results, also of a plug-in, such as warning for accidents.  "
+    "[default: the kind of the results]",
+)
 # Options for views that show several agents.
 _AGENT_OPTIONS = (_AGENTS, _BY_CLASS, _LAYERS)
 
@@ -232,7 +245,7 @@ class _Picture:
         row: str | Sequence[str],
         size: tuple[int, int] | None,
         dpi: float,
-        choices: dict[str, Any],
+        choices: NamedValues,
     ) -> Any:
         """Draw a row, or several side by side, into a figure.
 
@@ -543,10 +556,14 @@ for _name, _picture in _PICTURES.items():
 )
 @click.option(
     "--beside",
-    type=WordChoice(("twin",)),
+    multiple=True,
+    callback=_parse_named_paths,
+    metavar="twin|[NAME=]PATH",
     help="twin: show an accident and its normal twin side by side, with one clock, verdicts and "
-    "the pair's time to collision.",
+    "the pair's time to collision. A results file: show its predictions beside the recording; "
+    "two files: two models side by side.",
 )
+@_RESULTS_TASK
 @_AGENTS
 @_LAYERS
 @frame_range_parameter
@@ -569,25 +586,35 @@ def video(
     agents: tuple[str, ...],
     layers: tuple[str, ...],
     no_title: bool,
-    turntable: bool,
+    beside: tuple[tuple[str, Path], ...],
     **options: Any,
 ) -> None:
     """Write one scenario of the release in DATAROOT as a video.
 
-    Without SCENARIO the command takes the first accident, or if there is none, the first scenario.
+    Without SCENARIO the command takes the first scenario that the results predict; without results
+    the first accident, or if there is none, the first scenario.
     MP4 needs the extra `video`: pip install '.[video]' in a checkout.
     """
     release = {option: options.pop(option) for option in _RELEASE_OPTIONS}
     check_target(out, size=options["size"], fps=options["fps"])  # before the release is indexed
-    if turntable:
+    if options.pop("turntable"):
         views = (*views, "turntable")
+    sides: Any = "twin"
+    if beside != (("", Path("twin")),):
+        sides = _read_named(beside, options["task"]) or None
+        scenario = scenario or (sides and scenario_of(shared_samples(sides)[0]))
+    if not isinstance(sides, dict):
+        refuse_unused("without a results file for --beside", "task")
+    elif len(sides) > 1:
+        refuse_unused("with two models, which are shown from above", "views", "layers")
     dataset = open_release(**release)
     click.get_current_context().with_resource(style(title=not no_title))
     path = render_scenario_video(
         dataset,
         scenario or default_scenario(dataset),
         out,
-        views=split_words(views) or ("bev" if options["beside"] else "frame"),
+        views=split_words(views) or ("bev" if sides else "frame"),
+        beside=sides,
         agents=names_or_configuration(agents),
         layers=cast(list[Layer] | None, split_words(layers) or None),
         workers=release["workers"],
@@ -612,12 +639,7 @@ def video(
     type=click.Path(),
     help="Results file to show, with its verdicts.",
 )
-@click.option(
-    "--task",
-    metavar="TASK",
-    help="Task that draws the results, also of a plug-in, such as warning for accidents.  "
-    "[default: the kind of the results]",
-)
+@_RESULTS_TASK
 @cooperating_parameter("Agents to show", "available")
 def replay(
     scenario: str | None,

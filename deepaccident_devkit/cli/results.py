@@ -8,6 +8,7 @@ import click
 from deepaccident_devkit.cli.options import DATAROOT, PATH, refuse_unused, release_options
 from deepaccident_devkit.cli.verbs import verb
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import NamedValues
 
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
@@ -58,7 +59,7 @@ def results(
         _convert_answers(file, truth, out, threshold, {} if method is None else {"method": method})
 
 
-def _convert_detections(file: Path, out: Path, release: dict[str, Any]) -> None:
+def _convert_detections(file: Path, out: Path, release: NamedValues) -> None:
     from deepaccident_devkit.deepaccident import DeepAccident
     from deepaccident_devkit.evaluation.results import ResultsWriter
     from deepaccident_devkit.export.nuscenes.detections import results_from_nuscenes

@@ -17,6 +17,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.maps.making import town_map, towns_of
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import NamedValues
 
 
 @verb("town-maps", short_help="Write the roads and sidewalks of each town as GeoJSON.")
@@ -39,7 +40,7 @@ def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -
         raise click.UsageError(
             "no scenario matches --where, so there is no map; change --where or omit it"
         )
-    written: dict[str, dict[str, Any]] = {}
+    written: dict[str, NamedValues] = {}
     for town in towns_of(dataset, scenarios):
         try:
             town_plan = town_map(
@@ -63,7 +64,7 @@ def town_maps(where: tuple[str, ...], out: str, as_json: bool, **release: Any) -
         click.echo("\n".join(map(_format_town, written.values())))
 
 
-def _format_town(facts: dict[str, Any]) -> str:
+def _format_town(facts: NamedValues) -> str:
     pictures = counted(facts["looks"], "picture")
     scenarios = counted(facts["scenarios"], "scenario")
     area = f"{facts['drivable_square_metres']:,.0f} m²"

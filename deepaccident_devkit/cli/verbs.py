@@ -13,6 +13,7 @@ import click
 from deepaccident_devkit.errors import MissingPluginError
 from deepaccident_devkit.support.plugins import LazyVerb, Offers, Plugin, offers
 from deepaccident_devkit.support.text import meant_text
+from deepaccident_devkit.support.values import NamedValues
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 if TYPE_CHECKING:
@@ -199,7 +200,7 @@ def field_option(
     default = changes.get("default", config.__dataclass_fields__[field].default)
     hint = get_type_hints(config)[field]
     name = field.replace("_", "-")
-    settings: dict[str, Any] = {
+    settings: NamedValues = {
         "default": default,
         "help": field_text(config, field),
         "show_default": default is not None and default is not False,

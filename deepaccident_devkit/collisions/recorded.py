@@ -57,7 +57,7 @@ MASS_UNCERTAINTY: Final = 0.3
 Figures that depend on them are also stated for masses that are heavier and lighter by this share.
 """
 # Length, width, height in metres: medians of 250,378 real boxes (docs/format.md).
-_MEDIAN_SIZES: Mapping[str, tuple[float, float, float]] = {
+_MEDIAN_SIZES = {
     "car": (4.60, 1.93, 1.52),
     "truck": (8.47, 2.89, 3.83),
     "van": (4.48, 1.99, 2.04),
@@ -294,7 +294,7 @@ def agents_by_actor(dataset: Dataset, scenario: str) -> dict[int, AgentName]:
 
     Vehicles without an id in the meta file are missing.
     """
-    agents: dict[int, AgentName] = {}
+    agents = {}
     for name in agents_of(dataset, scenario):
         actor_id = dataset.agent.get(f"{scenario}/{name}")["actor_id"]
         if actor_id is not None:

@@ -14,7 +14,7 @@ from deepaccident_devkit.errors import TokenError
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
 
-_OTHER_ENDING: Mapping[str, str] = {"normal": "accident", "accident": "normal"}
+_OTHER_ENDING = {"normal": "accident", "accident": "normal"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

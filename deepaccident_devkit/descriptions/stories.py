@@ -358,7 +358,7 @@ def scenario_facts(
             to compute it.
     """
     record = dataset.scenario[dataset.getind("scenario", scenario)]
-    unknown_facts: list[str] = []
+    unknown_facts = []
     collides = None
     if record["weather"] is not None:
         collides = record["collision"] is not None

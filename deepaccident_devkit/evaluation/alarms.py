@@ -5,7 +5,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnAlarm, DrawnPlaces, joined_drawing
+from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.evaluation.drawing import (
+    Drawing,
+    DrawnAlarm,
+    DrawnPath,
+    DrawnPlaces,
+    drawn_pair,
+    joined_drawing,
+)
 from deepaccident_devkit.evaluation.map_accidents import (
     AccidentReading,
     InstanceAccident,
@@ -32,8 +40,6 @@ Pair = tuple[int | None, int | None]
 # An alarm and the actors that it names.
 NamedAlarm = tuple[Accident, Pair]
 _RELEASED_LABELS = MotionLabelConfig()
-# Pictures show an alarm from this score on, if the protocol has no threshold.
-_FIRES_FROM = 0.5
 
 
 def named_alarms(
@@ -69,19 +75,26 @@ def named_alarms(
 
 
 def drawing_of_alarms(
-    true: Accident | None, alarms: Sequence[Accident], threshold: float | None = None
+    dataset: Dataset,
+    token: str,
+    true: Accident | None,
+    alarms: Sequence[Accident],
+    truth: BoxTruth,
+    threshold: float,
 ) -> Drawing:
-    """Describe alarms and the true accident for a picture.
+    """Describe alarms, the true accident and the colliding pair for a picture.
 
     Args:
+        dataset: The release.
+        token: Token of the sample.
         true: The accident that follows; None for none.
         alarms: Alarms in descending order of score.
-        threshold: Lowest score that raises an alarm; None for 0.5.
+        truth: Boxes of all actors.
+        threshold: Lowest score that raises an alarm.
     """
-    words = "no collision ahead"
+    paths: tuple[DrawnPath, ...] = ()
     places = joined_drawing(alarms).places
     if true is not None:
-        words = f"collision in {true.time:.1f} s"
         actual = DrawnPlaces(
             xy=true.positions,
             time=true.time,
@@ -90,14 +103,68 @@ def drawing_of_alarms(
             label="actual collision",
         )
         places = (actual, *places)
+        paths = _drawn_pair_paths(true, truth)
+    alarm = DrawnAlarm(score=0.0, fires=False)
+    if alarms:
+        score = alarms[0].score
+        alarm = DrawnAlarm(score=score, fires=score >= threshold)
+    return Drawing(
+        paths=paths,
+        boxes=drawn_pair(dataset, token),
+        places=places,
+        alarm=alarm,
+        words=_alarm_words(true, alarms, truth, fires=alarm.fires),
+    )
+
+
+def _drawn_pair_paths(true: Accident, truth: BoxTruth) -> tuple[DrawnPath, ...]:
+    """Describe the paths of the pair that the truth names, up to the impact."""
+    impact = truth.impact or truth.accident
+    if impact is None or impact.ids is None:
+        return ()
+    is_before = truth.time <= true.time + TIME_TOLERANCE_S
+    paths = []
+    for column in np.flatnonzero(np.isin(truth.actor_id, impact.ids)).tolist():
+        xy = truth.footprint[:, column, :2]
+        is_drawn = is_before & np.isfinite(xy[:, 0])
+        if is_drawn.sum() > 1:
+            path = DrawnPath(
+                xy=xy[is_drawn],
+                times=truth.time[is_drawn],
+                role="collision",
+                label="path to the collision",
+            )
+            paths.append(path)
+    return tuple(paths)
+
+
+def _alarm_words(
+    true: Accident | None, alarms: Sequence[Accident], truth: BoxTruth, *, fires: bool
+) -> str:
+    """State when an accident follows, and the errors of the most confident alarm if it fires."""
+    words = "no collision ahead"
+    if true is not None:
+        words = f"collision in {true.time:.1f} s"
+    elif truth.unplaced is not None:
+        words = f"collision in {truth.unplaced:.1f} s, but no label shows both actors"
     if not alarms:
-        alarm = DrawnAlarm(score=0.0, fires=False)
-        return Drawing(places=places, alarm=alarm, words=f"{words}; no alarm")
-    highest = alarms[0]
-    lowest_score = _FIRES_FROM if threshold is None else threshold
-    alarm = DrawnAlarm(score=highest.score, fires=highest.score >= lowest_score)
-    words = f"{words}; alarm for a collision {highest.words}"
-    return Drawing(places=places, alarm=alarm, words=words)
+        return f"{words}; no alarm"
+    alarm = alarms[0]
+    if not fires:
+        return f"{words}; no alarm, with a score of {alarm.score:.2g}"
+    words = f"{words}; alarm for a collision {alarm.words}"
+    if true is None:
+        return words
+    difference = position_difference(alarm.positions, true.positions)
+    return f"{words}: {error_words(difference, alarm.time - true.time)}"
+
+
+def error_words(position_error: float, delay: float) -> str:
+    """Describe an alarm's errors: `position error 3.2 m (both actors), 0.5 s late`."""
+    timing = "on time"
+    if round(delay, 1):
+        timing = f"{abs(delay):.1f} s {'late' if delay > 0 else 'early'}"
+    return f"position error {position_error:.1f} m (both actors), {timing}"
 
 
 def within_horizon(alarms: list[NamedAlarm], truth: BoxTruth) -> list[NamedAlarm]:

@@ -13,6 +13,7 @@ from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.parallel import Places, Store, run_batch
 from deepaccident_devkit.support.text import PathType, path_of
+from deepaccident_devkit.support.values import NamedValues
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -116,7 +117,7 @@ _Counted: TypeAlias = tuple[Any, dict[str, EvaluationError]]
 
 
 def _count_batches(
-    batches: Sequence[_Batch[Any]], store: Store | None, engine: dict[str, Any]
+    batches: Sequence[_Batch[Any]], store: Store | None, engine: NamedValues
 ) -> Sequence[_Counted]:
     """Count each batch; return its counts and errors."""
     if store is None:
@@ -138,7 +139,7 @@ def _count_batch(batch: _Batch[Any]) -> _Counted:
         for token, counts in parsed_json(content, constants=True).items():
             evaluator.add(token, counts)
         return evaluator, {}
-    errors: dict[str, EvaluationError] = {}
+    errors = {}
     for token, task in batch.samples:
         try:
             evaluator.update(token, *batch.load(task))

@@ -4,12 +4,18 @@ A task describes its pictures by these records (`Evaluator.drawing`). Views draw
 not know the task.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
+from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.geometry import BevGrid, Boxes
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, ShortRepr
+from deepaccident_devkit.v2x.cooperation import cooperative_boxes
 
 Role = Literal["truth", "past", "predicted", "right", "false", "missed", "collision"]
 """What a thing in a picture is, which decides its colour.
@@ -48,12 +54,14 @@ class DrawnBoxes(FrozenArrays):
         boxes: N boxes.
         role: What the boxes are.
         scores: (N,) confidences; None for boxes without scores.
+        time: Seconds after the current frame.
         label: Words for the legend.
     """
 
     boxes: Boxes
     role: Role
     scores: FloatArray | None = None
+    time: float = 0.0
     label: str = ""
 
 
@@ -116,7 +124,7 @@ class Drawing(ShortRepr):
     Attributes:
         paths: Paths on the ground.
         boxes: Boxes by kind.
-        cells: Cells of instances by kind.
+        cells: Cells of instances by kind, all on the same grid and at the same times.
         places: Marked positions.
         alarm: Alarm of the sample; None for tasks without alarms.
         words: Summary for the title, such as `contact in 1.5 s`; if it is empty, views print the
@@ -129,6 +137,35 @@ class Drawing(ShortRepr):
     places: tuple[DrawnPlaces, ...] = ()
     alarm: DrawnAlarm | None = None
     words: str = ""
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether predicted boxes or cells are right or false, or true ones are missed."""
+        roles = {drawn.role for drawn in self.boxes} | {drawn.role for drawn in self.cells}
+        return not roles.isdisjoint(("right", "false", "missed"))
+
+    @property
+    def truth(self) -> Drawing:
+        """What is drawn of the truth. The collision of a plan is not true, but the plan's own."""
+        roles = {"truth", "past", "missed"}
+        if self.alarm is not None or self.is_judged:
+            roles.add("collision")
+        return self._part(roles)
+
+    @property
+    def prediction(self) -> Drawing:
+        """What is drawn of the prediction, and the true things that it misses."""
+        roles = {"predicted", "right", "false", "missed", "collision"}
+        return replace(self._part(roles), alarm=self.alarm)
+
+    def _part(self, roles: Collection[str]) -> Drawing:
+        """Return the things with some roles, without the alarm and the words."""
+        return Drawing(
+            paths=tuple(drawn for drawn in self.paths if drawn.role in roles),
+            boxes=tuple(drawn for drawn in self.boxes if drawn.role in roles),
+            cells=tuple(drawn for drawn in self.cells if drawn.role in roles),
+            places=tuple(drawn for drawn in self.places if drawn.role in roles),
+        )
 
 
 def joined_drawing(predictions: Iterable[Any]) -> Drawing:
@@ -146,3 +183,23 @@ def joined_drawing(predictions: Iterable[Any]) -> Drawing:
             boxes += drawing.boxes
             places += drawing.places
     return Drawing(paths=tuple(paths), boxes=tuple(boxes), places=tuple(places))
+
+
+def drawn_pair(dataset: Dataset, token: str, frame: str = "ego") -> tuple[DrawnBoxes, ...]:
+    """Describe the colliding pair of a sample's scenario, in the current frame.
+
+    Args:
+        dataset: The release.
+        token: Token of the sample.
+        frame: Coordinate frame of the boxes.
+
+    Returns:
+        The pair's boxes, wherever an agent labels them; empty without a collision.
+    """
+    record = dataset.get("sample", token)
+    collision = dataset.get("scenario", record["scenario_token"])["collision"]
+    if collision is None:
+        return ()
+    boxes = cooperative_boxes(dataset, record, frame=frame)
+    pair = boxes.select(np.isin(boxes.actor_id, collision["ids"]))
+    return (DrawnBoxes(boxes=pair, role="collision", label="colliding pair"),)

@@ -391,9 +391,9 @@ def match_trajectories(prediction: Paths, truth: Paths) -> TrajectoryMatches:
     max_cost = _MATCH_DISTANCE_M * longest(truth)
     free_predicted = dict.fromkeys(sorted(predicted))
     free_true = dict.fromkeys(sorted(true))
-    pairs: list[tuple[int, int]] = []
-    pair_costs: list[float] = []
-    far_pairs: list[tuple[int, int]] = []
+    pairs = []
+    pair_costs = []
+    far_pairs = []
     for flat in np.argsort(costs, axis=None, kind="stable").tolist():
         row, column = divmod(flat, len(true))
         predicted_id = predicted[row]

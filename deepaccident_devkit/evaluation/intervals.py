@@ -127,8 +127,8 @@ def intervals_of(
     drawn_values = draws_of_parts(evaluator, clusters, names, settings)
     rows = evaluator.result_class.rows
     low, high, part_counts = ends_of_draws(names, values, drawn_values, settings.confidence, rows)
-    ends: dict[str, tuple[float, float]] = {}
-    parts_without_interval: dict[str, int] = {}
+    ends = {}
+    parts_without_interval = {}
     for index, name in enumerate(names):
         if np.isfinite(low[index]):
             ends[name] = float(low[index]), float(high[index])

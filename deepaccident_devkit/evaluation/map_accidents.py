@@ -20,6 +20,7 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.geometry.bev_grid import Orientation, cells_in
 from deepaccident_devkit.motion import LabelProtocol, MotionHeads, predict_instances
 from deepaccident_devkit.support.arrays import (
+    NO_INDICES,
     AnyArray,
     BoolArray,
     FloatArray,
@@ -526,8 +527,8 @@ def _near_pairs(
     shapes: _Shapes, cell_size: FloatArray, danger_distance: float
 ) -> tuple[IntArray, IntArray]:
     """Return pairs of shapes in the same frame with bounding boxes nearer than the distance."""
-    first_rows = [np.zeros(0, dtype=np.int64)]
-    second_rows = [np.zeros(0, dtype=np.int64)]
+    first_rows = [NO_INDICES]
+    second_rows = [NO_INDICES]
     frame_starts = np.flatnonzero(np.diff(shapes.frame, prepend=-1)).tolist()
     for start, end in pairwise([*frame_starts, len(shapes.frame)]):
         low = shapes.low[start:end]

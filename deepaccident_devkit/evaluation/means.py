@@ -15,6 +15,7 @@ from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio
 from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.text import counted, natural_order
+from deepaccident_devkit.support.values import NamedValues
 
 MEAN_OF_SCENARIOS: Final = "mean of scenarios"
 """Name of the row that averages each scenario's mean in the main row over scenarios."""
@@ -243,7 +244,7 @@ def _round_values(values: FloatArray | float) -> FloatArray:
     return np.asarray(steps / _STEPS_PER_UNIT)
 
 
-def _make_counts(terms: Mapping[str, FloatArray], notes: Mapping[str, int]) -> dict[str, Any]:
+def _make_counts(terms: Mapping[str, FloatArray], notes: Mapping[str, int]) -> NamedValues:
     """Build counts as JSON-compatible values.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnCells, DrawnPath, Role
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnCells, DrawnPath, Role, drawn_pair
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator, ratio, total
 from deepaccident_devkit.evaluation.instances import (
     CLASSES,
@@ -50,6 +50,7 @@ from deepaccident_devkit.motion import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, ShortRepr
 from deepaccident_devkit.support.text import counted, settle_choices
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 __all__ = [
@@ -297,7 +298,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
         counts = motion_counts(prediction, label, self.protocol, trajectories=self.trajectories)
         self.add(token, counts)
 
-    def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
+    def drawing(self, dataset: Dataset, token: str, prediction: Any, /, *truth: Any) -> Drawing:
         """Describe the cells and paths of predicted instances (the last prediction) and true ones.
 
         Instances are matched frame by frame, as VPQ does within the largest range; instances
@@ -317,7 +318,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
         ]
         frames = num_recorded_frames(label)
         cells = _drawn_cells(predicted[:frames], true[:frames], grid, step)
-        return Drawing(paths=tuple(paths), cells=cells)
+        return Drawing(paths=tuple(paths), boxes=drawn_pair(dataset, token), cells=cells)
 
     def result_of(self, counts: Collection[Counts]) -> MotionResult:
         """Compute the metrics from the counts of samples, in any order."""
@@ -326,7 +327,7 @@ class MotionEvaluator(Evaluator[MotionResult]):
     def sample_row(self, token: str) -> dict[str, Any]:
         """Return a sample's row: IoU and PQ (%), instances, cells by range; path errors (m)."""
         result = self.compute([token])
-        row: dict[str, Any] = {"frames": result.frames}
+        row: NamedValues = {"frames": result.frames}
         cells_by_range = self._counts[token]["cells"]
         for (name, metrics), cells in zip(result.ranges.items(), cells_by_range, strict=True):
             row[f"iou_{name}"] = metrics.iou
@@ -489,7 +490,7 @@ def _read_paths(heads: MotionHeads, grid: BevGrid) -> dict[int, FloatArray]:
     return trajectories(instances, grid, half_cell_shift=False)
 
 
-def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
+def _sum_counts(counts: Collection[Counts]) -> NamedValues:
     """Sum the counts of samples; the sums look like the counts of a sample with one frame."""
     vpq = []
     cells = []

@@ -257,7 +257,7 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
     # Boxes are iterable, too, and empty ones would pass as an empty list
     is_list = isinstance(prediction, Iterable) and not isinstance(prediction, Boxes)
     items = prediction if is_list else [prediction]
-    alarms: list[Accident] = []
+    alarms = []
     for item in cast("Iterable[object]", items):
         if item is prediction or not isinstance(item, Accident):
             raise EvaluationError(

@@ -15,6 +15,7 @@ from deepaccident_devkit.support.arrays import ShortRepr, json_numbers
 from deepaccident_devkit.support.human_names import metric_name
 from deepaccident_devkit.support.reports import table_html
 from deepaccident_devkit.support.text import choice, counted, meant_text, possible_text
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -52,7 +53,7 @@ def switch_names(rules: DataclassInstance) -> list[str]:
     return names
 
 
-def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
+def switched(rules: Rules, switches: ReadOnlyValues) -> Rules:
     """Return a copy of a protocol with some fields changed.
 
     Args:
@@ -67,8 +68,8 @@ def switched(rules: Rules, switches: Mapping[str, Any]) -> Rules:
     """
     if not switches:
         return rules
-    changes: dict[str, Any] = {}
-    nested_switches: dict[str, dict[str, Any]] = {}
+    changes: NamedValues = {}
+    nested_switches: dict[str, NamedValues] = {}
     names = switch_names(rules)
     for name, value in switches.items():
         if name not in names:

@@ -20,6 +20,7 @@ from deepaccident_devkit.geometry.box_arrays import gaps, time_to_collision
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import FloatArray, FrozenArrays, IntArray, ShortRepr
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD, INFRASTRUCTURE, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.collisions import labelled_pair
 from deepaccident_devkit.v2x.cooperation import seen_actors
@@ -274,8 +275,8 @@ def box_truth(dataset: Dataset, sample: RowArgument, horizon: float = RELEASED_H
 
 def _make_box_truth(
     dataset: Dataset,
-    record: Mapping[str, Any],
-    scenario: Mapping[str, Any],
+    record: ReadOnlyValues,
+    scenario: ReadOnlyValues,
     tracks: ScenarioTracks,
     horizon: float,
 ) -> BoxTruth:
@@ -320,7 +321,7 @@ def _footprints(boxes: Boxes) -> FloatArray:
     return np.column_stack([positions, length_and_width, boxes.yaw])
 
 
-def _frame_number(sample: Mapping[str, Any]) -> int:
+def _frame_number(sample: ReadOnlyValues) -> int:
     """Return the number (from 1) of a sample's frame in its scenario."""
     _, _, frame = sample["token"].rpartition("/")
     return int(frame)
@@ -369,7 +370,7 @@ def labelled_sample(dataset: Dataset, sample: RowArgument) -> Any:
     return record
 
 
-def _twin_of(dataset: Dataset, scenario: Mapping[str, Any]) -> Any:
+def _twin_of(dataset: Dataset, scenario: ReadOnlyValues) -> Any:
     """Return the twin of a scenario, which has the same design and name but ends differently.
 
     Return None if there is no twin, or if one of the two has no meta file, which states how a
@@ -381,7 +382,7 @@ def _twin_of(dataset: Dataset, scenario: Mapping[str, Any]) -> Any:
     return twin
 
 
-def _collides(scenario: Mapping[str, Any] | None) -> bool:
+def _collides(scenario: ReadOnlyValues | None) -> bool:
     """Return whether there is a collision in a scenario; False if the scenario is None."""
     return scenario is not None and scenario["collision"] is not None
 
@@ -389,8 +390,8 @@ def _collides(scenario: Mapping[str, Any] | None) -> bool:
 def _involvement(
     agent: str,
     own_actor_id: int | None,
-    collision: Mapping[str, Any] | None,
-    twin: Mapping[str, Any] | None,
+    collision: ReadOnlyValues | None,
+    twin: ReadOnlyValues | None,
 ) -> Involvement:
     """Return the involvement of an agent in the accident of its scenario, or of the twin."""
     if agent == INFRASTRUCTURE:
@@ -407,7 +408,7 @@ def _involvement(
 
 def _foresee_accidents(
     dataset: Dataset,
-    sample: Mapping[str, Any],
+    sample: ReadOnlyValues,
     tracks: ScenarioTracks,
     own_actor_id: int | None,
     involvement: Involvement,

@@ -64,6 +64,7 @@ from deepaccident_devkit.support.reading import (
     read_member,
 )
 from deepaccident_devkit.support.text import PathType, counted, differing_text, path_of
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 
 if TYPE_CHECKING:
@@ -496,7 +497,7 @@ class Export:
         self,
         jobs: Mapping[str, _Job],
         finished_units: Sequence[_FinishedUnit],
-        settings: dict[str, Any],
+        settings: NamedValues,
     ) -> Manifest:
         """Write the files that span units, and return the manifest of the complete export.
 
@@ -677,7 +678,7 @@ def _collect_states(jobs: Mapping[str, _Job]) -> dict[str, dict[str, str | None]
     return all_states
 
 
-def _remove_sensor_states(states: States) -> dict[str, dict[str, Any]]:
+def _remove_sensor_states(states: States) -> dict[str, NamedValues]:
     """Return the states of scenarios without their sensor files."""
     truth = {}
     for token, state in states.items():

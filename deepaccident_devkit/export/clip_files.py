@@ -14,6 +14,7 @@ from deepaccident_devkit.export.bulk import Output
 from deepaccident_devkit.export.clip_rows import CLIP_COLUMNS, ClipColumn, ClipRows
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 FPS: Final = round(1 / FRAME_PERIOD)
@@ -57,7 +58,7 @@ def video_path(channel: str, place: tuple[int, int]) -> str:
 
 def describe_video(
     channel: str, place: tuple[int, int], size: tuple[int, int], length: int
-) -> dict[str, Any]:
+) -> NamedValues:
     """Return what the record of an episode says about a camera's video.
 
     Args:
@@ -78,7 +79,7 @@ def describe_video(
     }
 
 
-def write_episode(path: Path, clip: ClipRows, record: Mapping[str, Any]) -> None:
+def write_episode(path: Path, clip: ClipRows, record: ReadOnlyValues) -> None:
     """Write the rows of an episode and its record, without numbers, into a file."""
     import pyarrow as pa
     from pyarrow.parquet import write_table
@@ -93,7 +94,7 @@ def write_episode(path: Path, clip: ClipRows, record: Mapping[str, Any]) -> None
         write_table(rows, temporary)
 
 
-def read_episode(path: Path) -> tuple[Any, dict[str, Any]]:
+def read_episode(path: Path) -> tuple[Any, NamedValues]:
     """Return the rows and the record that `write_episode` wrote."""
     from pyarrow.parquet import read_table
 
@@ -103,7 +104,7 @@ def read_episode(path: Path) -> tuple[Any, dict[str, Any]]:
 
 
 def write_files(
-    episodes: Sequence[tuple[Any, dict[str, Any]]], cameras: Sequence[str], output: Output
+    episodes: Sequence[tuple[Any, NamedValues]], cameras: Sequence[str], output: Output
 ) -> None:
     """Write everything but the videos.
 
@@ -177,7 +178,7 @@ def _number_rows(tables: Sequence[Any]) -> Any:
     return rows.select(list(ROW_COLUMNS))
 
 
-def _number_episodes(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _number_episodes(records: Sequence[ReadOnlyValues]) -> list[NamedValues]:
     """Return the records of the table of episodes."""
     start = 0
     numbered_records = []
@@ -210,8 +211,8 @@ def _flatten_lists(rows: Any) -> Any:
 
 
 def _compute_statistics(
-    records: Sequence[Mapping[str, Any]], cameras: Sequence[str], rows: Any
-) -> dict[str, Any]:
+    records: Sequence[ReadOnlyValues], cameras: Sequence[str], rows: Any
+) -> NamedValues:
     """Return the statistics of each column of numbers, and of some pixels of each camera."""
     statistics = {}
     for name, column in ROW_COLUMNS.items():
@@ -220,7 +221,7 @@ def _compute_statistics(
             statistics[name] = _summarise(values.reshape(len(rows), -1))
     for channel in cameras:
         pixels = np.concatenate([record[f"pixels.{channel}"] for record in records])
-        summary: dict[str, Any] = _summarise(pixels / 255)
+        summary: NamedValues = _summarise(pixels / 255)
         for name in ("min", "max", "mean", "std"):
             summary[name] = [[[value]] for value in summary[name]]
         statistics[_video_key(channel)] = summary
@@ -242,10 +243,10 @@ def _summarise(values: AnyArray) -> dict[str, list[float]]:
 
 
 def _describe_dataset(
-    records: Sequence[Mapping[str, Any]], cameras: Sequence[str], num_frames: int
-) -> dict[str, Any]:
+    records: Sequence[ReadOnlyValues], cameras: Sequence[str], num_frames: int
+) -> NamedValues:
     """Return the content of info.json."""
-    features: dict[str, Any] = {}
+    features: NamedValues = {}
     for channel in cameras:
         features[_video_key(channel)] = _describe_pictures(records, channel)
     for name, column in ROW_COLUMNS.items():
@@ -273,7 +274,7 @@ def _describe_dataset(
     }
 
 
-def _describe_pictures(records: Sequence[Mapping[str, Any]], channel: str) -> dict[str, Any]:
+def _describe_pictures(records: Sequence[ReadOnlyValues], channel: str) -> NamedValues:
     """Return the feature of a camera; raise ConfigError if its pictures have different sizes."""
     sizes = sorted({tuple(record[f"size.{channel}"]) for record in records})
     if len(sizes) > 1:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from deepaccident_devkit.interactions.compute import actor_motion
 from deepaccident_devkit.interactions.scenario import interactions
 from deepaccident_devkit.interactions.table import InteractionConfig
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, readonly
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.record_tables import RecordTables
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x.agent_motion import agent_motion
@@ -141,7 +142,7 @@ def clip_rows(dataset: Dataset, agent: RowArgument) -> ClipRows:
     partners = seen_by & ~np.uint8(1 << AGENTS.index(record["name"]))
     num_partners = np.unpackbits(partners[:, None], axis=1).sum(axis=1)
     weather = scenario["weather"] or "unknown"
-    values: dict[str, Any] = {
+    values: NamedValues = {
         "observation.state": np.column_stack([getattr(motion, name) for name in _STATE]),
         "action": _compute_steps(dataset.columns("ego_pose")["matrix"][samples]),
         "time_to_impact": sample_columns["time_to_impact"][samples],

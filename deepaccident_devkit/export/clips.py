@@ -38,6 +38,7 @@ from deepaccident_devkit.release.images import (
 from deepaccident_devkit.release.store import ReleasePath
 from deepaccident_devkit.support.arrays import ByteArray
 from deepaccident_devkit.support.mp4 import MP4_QUALITY, check_pyav, write_mp4
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, SPLITS
 from deepaccident_devkit.v2x.agents import agents_of
 
@@ -228,7 +229,7 @@ class Clips(Format):
         split = self._find_split(dataset, scenario)
         scenario_row = dataset.getind("scenario", scenario)
         place = (scenario_row, AGENTS.index(agent))
-        record: dict[str, Any] = {**clip.episode, "split": split, "length": len(clip)}
+        record: NamedValues = {**clip.episode, "split": split, "length": len(clip)}
         for channel, files in images.items():
             paths = [path for path, _ in files.values()]
             size = self._choose_size(paths[0])

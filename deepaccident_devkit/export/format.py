@@ -23,6 +23,7 @@ from deepaccident_devkit.selection import parse_where
 from deepaccident_devkit.support.files import place_in, remove_in, replacing, replacing_folder
 from deepaccident_devkit.support.reading import fault_text, open_file, read_bytes
 from deepaccident_devkit.support.text import PathType, choices, members_of, settle_choices
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tables import split_choice
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS
@@ -135,7 +136,7 @@ class Output:
         self.folder = folder
         self.parts = parts
         self.tally = Tally() if tally is None else tally
-        self.contents: dict[str, Any] = {}
+        self.contents: NamedValues = {}
         self._link = link
         self._note = note
 
@@ -393,7 +394,7 @@ def format_readme(
     form: Format,
     dataset: Dataset,
     title: str,
-    head: Mapping[str, Any],
+    head: ReadOnlyValues,
     body: str,
     axes: str = _RIGHT_HANDED,
 ) -> bytes:

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,6 +39,7 @@ from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import (
     BEV_CAMERA,
@@ -62,7 +63,7 @@ logger = logging.getLogger(__name__)
 # Existing files by agent, then by channel.
 _AgentFiles: TypeAlias = "dict[str, dict[str, FrameFiles]]"
 # Folder in OPV2V for each split.
-_SPLITS: Mapping[str | None, str] = {
+_SPLITS = {
     "train": "train",
     "val": "validate",
     "test": "test",
@@ -71,7 +72,7 @@ _SPLITS: Mapping[str | None, str] = {
 _AGENTS_FILE = "agents.json"
 # Name of each camera in OPV2V, which has four: front, right rear, left rear, back. Loaders ignore
 # the other two.
-_CAMERA_NAMES: Mapping[str, str] = {
+_CAMERA_NAMES = {
     "Camera_Front": "camera0",
     "Camera_BackRight": "camera1",
     "Camera_BackLeft": "camera2",
@@ -190,7 +191,7 @@ class OpenCood(Format):
                     output.link(image_path, f"{stem}_{name}.png")
 
 
-def _encode_yaml(content: Mapping[str, Any]) -> bytes:
+def _encode_yaml(content: ReadOnlyValues) -> bytes:
     import yaml
 
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # Most builds have the one in C.
@@ -257,7 +258,7 @@ class _Recording:
         for number, vehicle in enumerate(ego_first, start=1):
             self.folders[vehicle] = str(number)
 
-    def describe_source(self) -> dict[str, Any]:
+    def describe_source(self) -> NamedValues:
         """Describe where the scenario comes from; no loader reads this."""
         agents = {}
         for agent in self.agents:
@@ -325,7 +326,7 @@ class _AgentFrames:
         self._labelled = samples["labelled"][rows]
         self._extrinsic = {name: self._compute_extrinsic(name) for name in _CAMERA_NAMES}
 
-    def make_facts(self, number: int, output: Output) -> dict[str, Any]:
+    def make_facts(self, number: int, output: Output) -> NamedValues:
         """Return the content of the file of a frame, and count the boxes that it leaves out.
 
         Args:
@@ -352,7 +353,7 @@ class _AgentFrames:
             "vehicles": self._make_vehicles(index, output),
         }
 
-    def _make_vehicles(self, index: int, output: Output) -> dict[int, dict[str, Any]]:
+    def _make_vehicles(self, index: int, output: Output) -> dict[int, NamedValues]:
         """Return the vehicles that the agent's LiDAR hits, except the agent itself, by actor id.
 
         OPV2V selects boxes in the same way, and merges the boxes of all agents by their ids.
@@ -386,9 +387,7 @@ class _AgentFrames:
             vehicles[actor] = {name: values[row] for name, values in columns.items()}
         return vehicles
 
-    def _make_camera(
-        self, name: str, index: int, raw_world_from_lidar: FloatArray
-    ) -> dict[str, Any]:
+    def _make_camera(self, name: str, index: int, raw_world_from_lidar: FloatArray) -> NamedValues:
         """Return the pose, extrinsic and intrinsic of a camera at a frame."""
         token = f"{self.samples[index]}/{name}"
         lens = load_camera(self._dataset, token, self._files[name].get(index + 1))

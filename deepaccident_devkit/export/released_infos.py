@@ -11,10 +11,10 @@ docs/exports.md lists what is left out, and where the classes look for files.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from deepaccident_devkit.release import Labels, ScenarioFolder, read_calib, read
 from deepaccident_devkit.release.pickles import pickled_items, write_joined
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.tokens import frame_token
 from deepaccident_devkit.taxonomy import (
     AGENTS,
@@ -41,7 +42,7 @@ from deepaccident_devkit.v2x.agents import agents_of
 logger = logging.getLogger(__name__)
 
 # Version that the converter writes into the file of each split.
-_SPLITS: Mapping[str, str] = {
+_SPLITS = {
     "train": "v1.0-trainval",
     "val": "v1.0-trainval",
     "train_mini": "v1.0-mini",
@@ -182,7 +183,7 @@ def _find_fault(dataset: Dataset, scenario: str) -> str | None:
 
 def _make_infos(
     folder: ScenarioFolder, agent: str, numbers: range, root_prefix: str
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[NamedValues]:
     """Yield the infos of an agent's keyframes, with the keys that the converter uses."""
     calibs = [read_calib(folder.calib_path(agent, number), raw=True) for number in numbers]
     name_parts = folder.name.split("_")
@@ -219,7 +220,7 @@ def _make_infos(
         }
 
 
-def _make_box_columns(label: Labels) -> dict[str, Any]:
+def _make_box_columns(label: Labels) -> NamedValues:
     speed_x, speed_y = label.agent_velocity[0].tolist()
     return {
         "vehicle_speed_x": speed_x,

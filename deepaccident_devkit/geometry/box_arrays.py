@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepaccident_devkit.errors import GeometryError
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import NO_INDICES, AnyArray, FloatArray, IntArray
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 BOX_COLUMNS: dict[str, tuple[tuple[int | None, ...], type]] = {
@@ -464,8 +464,8 @@ def _in_windows(
     """
     point_count = max(1, len(x))
     step = max(1, _WINDOWS_AT_ONCE // point_count)
-    windows = [np.zeros(0, dtype=np.int64)]
-    rows = [np.zeros(0, dtype=np.int64)]
+    windows = [NO_INDICES]
+    rows = [NO_INDICES]
     for start in range(0, len(low), step):
         batch = slice(start, start + step)
         low_x, low_y = low[batch, :2].T[..., None]
@@ -482,7 +482,7 @@ def _near_any(points: FloatArray, low: FloatArray, high: FloatArray) -> IntArray
     """Return the ascending indices of the points in coarse cells that a box's window touches."""
     is_finite = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
     if not is_finite.any():
-        return np.zeros(0, dtype=np.int64)
+        return NO_INDICES
     low = low[is_finite, :2]
     high = high[is_finite, :2]
     origin = low.min(axis=0)
@@ -496,7 +496,7 @@ def _near_any(points: FloatArray, low: FloatArray, high: FloatArray) -> IntArray
     windows = np.hstack([first_cells, last_cells]).tolist()
     for first_column, first_row, last_column, last_row in windows:
         touched[first_column : last_column + 1, first_row : last_row + 1] = True
-    candidates = [np.zeros(0, dtype=np.int64)]
+    candidates = [NO_INDICES]
     for start in range(0, len(points), POINTS_AT_ONCE):
         x, y = np.ascontiguousarray(points[start : start + POINTS_AT_ONCE, :2].T)
         is_inside = (x >= origin[0]) & (x <= end[0])

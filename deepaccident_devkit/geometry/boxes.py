@@ -21,6 +21,7 @@ from deepaccident_devkit.geometry.box_arrays import BOX_COLUMNS
 from deepaccident_devkit.geometry.conventions import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.support.arrays import (
+    NO_INDICES,
     AnyArray,
     BoolArray,
     FloatArray,
@@ -37,6 +38,7 @@ from deepaccident_devkit.support.nuscenes_names import (
     without_names,
 )
 from deepaccident_devkit.support.text import PictureRepr, counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import ACTOR, CAMERAS, CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 
 if TYPE_CHECKING:
@@ -161,7 +163,7 @@ class Boxes(FrozenArrays, PictureRepr):
         count = len(heading)
         if category is None:
             category = np.zeros(count, dtype=np.int8)
-        all_columns: dict[str, Any] = {
+        all_columns: NamedValues = {
             "category": category,
             "velocity": np.full((count, 3), np.nan),
             "actor_id": np.full(count, -1),
@@ -286,7 +288,7 @@ class Boxes(FrozenArrays, PictureRepr):
                 f"expected a mask ({len(self)},) or an array of rows, found {rows!r}"
             )
         if not selection.size:
-            selection = np.zeros(0, dtype=np.int64)
+            selection = NO_INDICES
         try:
             return self._select(selection)
         except IndexError as error:

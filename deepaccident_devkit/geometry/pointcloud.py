@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +13,7 @@ from deepaccident_devkit.geometry.bev_grid import BevGrid
 from deepaccident_devkit.geometry.conventions import checked_frame
 from deepaccident_devkit.geometry.se3 import SE3, checked_transform
 from deepaccident_devkit.support.arrays import (
+    NO_INDICES,
     AnyArray,
     BoolArray,
     FloatArray,
@@ -24,6 +24,7 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.support.nuscenes_names import CLOUD, with_keywords_named, without_names
 from deepaccident_devkit.support.text import PictureRepr
+from deepaccident_devkit.support.values import NamedValues
 
 CoordinateRange = tuple[float, float]
 # Columns that only some clouds have, and their dtypes.
@@ -102,7 +103,7 @@ class LidarPointCloud(FrozenArrays, PictureRepr):
         """
         selection = np.asarray(rows)
         if not selection.size:
-            selection = np.zeros(0, dtype=np.int64)
+            selection = NO_INDICES
         try:
             columns = {name: column[selection] for name, column in self._columns().items()}
             return replace(self, **columns)
@@ -174,7 +175,7 @@ class LidarPointCloud(FrozenArrays, PictureRepr):
         dx, dy = (self.xyz[:, :2] - position[:2]).T
         return self.select(np.hypot(dx, dy) >= distance)
 
-    def _columns(self) -> dict[str, Any]:
+    def _columns(self) -> NamedValues:
         """Return the cloud's arrays of N rows by attribute name, without the ones that are None."""
         columns = {"xyz": self.xyz, "intensity": self.intensity}
         for name in _OPTIONAL_COLUMNS:

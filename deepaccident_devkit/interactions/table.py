@@ -23,6 +23,7 @@ from deepaccident_devkit.support.arrays import (
     IntArray,
     checked_number,
 )
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.tables.columns import Key, Number, TableSpec, Vector
 from deepaccident_devkit.tables.records import spec_of
 from deepaccident_devkit.tables.tokens import frame_token, instance_token
@@ -386,7 +387,7 @@ def array_names(kind: type) -> list[str]:
     return [field.name for field in fields(kind) if field.name not in other_fields]
 
 
-def _make_arrow_table(name: str, arrays: Any, tokens: Mapping[str, Any]) -> Any:
+def _make_arrow_table(name: str, arrays: Any, tokens: ReadOnlyValues) -> Any:
     """Build a table from the arrays of an object of this module, and tokens as its keys."""
     import pyarrow as pa
 

@@ -11,7 +11,7 @@ import io
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from deepaccident_devkit.support.files import place_in
 from deepaccident_devkit.support.parallel import Places, Store, run_unordered
 from deepaccident_devkit.support.reading import byte_limit, open_zip, read_array
 from deepaccident_devkit.support.text import choice, counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.tables import rows_of_scenarios
 from deepaccident_devkit.taxonomy import BEV_CAMERA
 
@@ -183,7 +184,7 @@ def _unpack_map(
     if content is None:
         return None
     with open_zip(content) as archive:
-        arrays: dict[str, Any] = {
+        arrays: NamedValues = {
             name: read_array(archive, name, "index") for name in (*_ARRAY_FIELDS, "numbers")
         }
     numbers = dict(zip(_NUMBER_FIELDS, arrays.pop("numbers").tolist(), strict=True))

@@ -32,6 +32,7 @@ from deepaccident_devkit.geometry.conventions import flip_six_vector
 from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.support.arrays import AnyArray, checked
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 
 BatchNames = Literal["fiery", "beverse", "deepaccident"]
 MAPS: Final = ("segmentation", "instance", "centerness", "offset", "flow")
@@ -72,7 +73,7 @@ _CONVERTER_SETTINGS = {
     "only_vehicle": ("only_vehicle",),
     "filter_invisible": ("filter_invisible",),
 }
-_SETTINGS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+_SETTINGS = {
     "fiery": {
         "receptive_field": ("TIME_RECEPTIVE_FIELD",),
         "future_frames": ("N_FUTURE_FRAMES",),
@@ -155,7 +156,7 @@ def to_batch(
 
 
 def from_batch(
-    batch: Mapping[str, Any], config: MotionLabelConfig, names: BatchNames
+    batch: ReadOnlyValues, config: MotionLabelConfig, names: BatchNames
 ) -> dict[str, AnyArray]:
     """Convert a sample of another code base to maps, `future_egomotion` and `valid`.
 
@@ -225,7 +226,7 @@ def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionL
         ConfigError: A value is not valid.
     """
     names = choice("names", names, get_args(BatchNames))
-    changes: dict[str, Any] = {}
+    changes: NamedValues = {}
     for name, path in _SETTINGS[names].items():
         value = _find_setting(settings, path)
         if value is not None:
@@ -245,7 +246,7 @@ def config_from_names(settings: Mapping[str, Any], names: BatchNames) -> MotionL
     return MotionLabelConfig.preset(names, **changes)
 
 
-def _find_setting(settings: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+def _find_setting(settings: ReadOnlyValues, path: tuple[str, ...]) -> Any:
     """Return a nested setting; None if it is missing."""
     value: Any = settings
     for name in path:

@@ -24,6 +24,7 @@ from deepaccident_devkit.motion.config import MotionLabelConfig
 from deepaccident_devkit.motion.reference_arithmetic import single_precision
 from deepaccident_devkit.motion.reference_arithmetic.polygon_fill import topmost
 from deepaccident_devkit.support.arrays import (
+    NO_INDICES,
     AnyArray,
     BoolArray,
     Float32Array,
@@ -141,8 +142,8 @@ class Polygons(NamedTuple):
     def of(cls, frames: Sequence[FramePolygons | None]) -> Polygons:
         """Return the polygons of all frames, one frame after another."""
         corners = [np.zeros((0, 4, 2), dtype=np.float32)]
-        keys = [np.zeros(0, dtype=np.int64)]
-        frame_numbers = [np.zeros(0, dtype=np.int64)]
+        keys = [NO_INDICES]
+        frame_numbers = [NO_INDICES]
         for number, frame in enumerate(frames):
             if frame is not None:
                 corners.append(frame.corners)
@@ -322,8 +323,8 @@ _NO_BOXES = FrameBoxes(
     center=np.zeros((0, 3)),
     size=np.zeros((0, 3)),
     yaw=np.zeros(0),
-    actor_id=np.zeros(0, dtype=np.int64),
-    category=np.zeros(0, dtype=np.int64),
+    actor_id=NO_INDICES,
+    category=NO_INDICES,
     visible=np.zeros(0, dtype=bool),
     ego_from_lidar=np.eye(4),
 )

@@ -26,7 +26,7 @@ WarpRule = Literal["stretched", "exact", "fiery"]
 DrawnWhen = Literal["present", "since", "now"]
 SightRule = Literal["released", "camera"]
 PoseRule = Literal["whole", "yaw"]
-_CHOICES: Mapping[str, tuple[str, ...]] = {
+_CHOICES = {
     "warp": get_args(WarpRule),
     "drawn_when": get_args(DrawnWhen),
     "native": ORIENTATIONS,

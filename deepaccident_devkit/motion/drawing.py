@@ -36,6 +36,7 @@ from deepaccident_devkit.motion.warping import (
     sampling_matrix,
 )
 from deepaccident_devkit.support.arrays import (
+    NO_INDICES,
     AnyArray,
     BoolArray,
     Float32Array,
@@ -521,7 +522,7 @@ def _find_sampled_cells(
         Footprint, row and column of each such cell, each of shape (P,).
     """
     maps = footprints.top.reshape(-1, grid.cells)[1:]
-    sampled = [np.zeros(0, dtype=np.int64)]
+    sampled = [NO_INDICES]
     for matrix, top in zip(matrices, maps, strict=True):
         padded = np.append(top, np.int32(0))
         sampled.append(padded.take(nearest_indices(matrix, grid, rules)))

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -45,6 +45,7 @@ from deepaccident_devkit.support.files import place_in, replacing
 from deepaccident_devkit.support.parallel import Places
 from deepaccident_devkit.support.reading import DAMAGED_ARCHIVE, open_zip, read_array
 from deepaccident_devkit.support.text import PathType, choice, counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.tokens import parse_number
 from deepaccident_devkit.taxonomy import AGENTS, CHANNELS, LIDAR
 from deepaccident_devkit.v2x import cooperating_agents
@@ -204,7 +205,7 @@ class LabelFiles(Mapping[str, MotionLabels]):
         self._open: OrderedDict[str, zipfile.ZipFile] = OrderedDict()
         self._process = os.getpid()
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> NamedValues:
         """Return the state without open files."""
         return {**self.__dict__, "_open": OrderedDict()}
 

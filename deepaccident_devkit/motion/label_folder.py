@@ -7,11 +7,10 @@ import json
 import os
 import re
 import zipfile
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Final, get_args
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.parallel import Store
 from deepaccident_devkit.support.reading import check_size, fault_text, read_array, read_bytes
 from deepaccident_devkit.support.text import PathType, path_of
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import AGENTS
 
 LABEL_FORMAT: Final = "DeepAccident motion labels"
@@ -401,7 +401,7 @@ def _check_version(path: Path, file_format: object, version: object) -> None:
         )
 
 
-def _check_samples(samples: Mapping[str, Any]) -> dict[str, list[int]]:
+def _check_samples(samples: ReadOnlyValues) -> dict[str, list[int]]:
     """Return scenario and agent → frame numbers; raise ValueError if a value is not such a list."""
     for recording, frames in samples.items():
         is_valid = _RECORDING_PATTERN.fullmatch(recording) and isinstance(frames, list)
@@ -412,7 +412,7 @@ def _check_samples(samples: Mapping[str, Any]) -> dict[str, list[int]]:
     return dict(samples)
 
 
-def _list_settings(config: MotionLabelConfig, names: BatchNames | None) -> dict[str, Any]:
+def _list_settings(config: MotionLabelConfig, names: BatchNames | None) -> NamedValues:
     """Return a configuration's settings, including its protocol's, and the code base's name."""
     settings = config.as_dict()
     settings.update(settings["protocol"])

@@ -31,6 +31,7 @@ from deepaccident_devkit.motion.warping import (
 )
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, FrozenArrays
 from deepaccident_devkit.support.text import PictureRepr
+from deepaccident_devkit.support.values import NamedValues
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,7 +135,7 @@ class MotionLabels(FrozenArrays, PictureRepr):
             )
         maps = {name: getattr(self, name) for name in MAPS}
         missing = ~self.label_valid
-        warped: dict[str, Any] = maps_to_present(
+        warped: NamedValues = maps_to_present(
             maps, self.label_egomotion, missing, self.config, centerness
         )
         return replace(self, **warped, at_present=True)
@@ -189,7 +190,7 @@ class MotionLabels(FrozenArrays, PictureRepr):
             GeometryError: An array's shape does not match the configuration.
         """
         label_config = resolved_label_config(config)
-        arrays: dict[str, Any] = from_batch(batch, label_config, names)
+        arrays: NamedValues = from_batch(batch, label_config, names)
         return cls(config=label_config, id_map={}, at_present=at_present, **arrays)
 
 

@@ -13,7 +13,7 @@ import codecs
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from deepaccident_devkit.support.cores import usable_cores
 from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.reading import LIMITS_VARIABLE, byte_limit
 from deepaccident_devkit.support.text import integer_of, number_of
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 # The 13 fields of a box line, in order.
@@ -332,7 +333,7 @@ def _parse_joined(contents: Sequence[bytes]) -> _Columns | None:
         return None
 
 
-def _split_columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | None:
+def _split_columns(content: bytes, names: Sequence[str]) -> NamedValues | None:
     """Return column name → words; None unless each line has one word per name.
 
     Words must be separated by single blanks. Arrow's CSV reader is not used: up to version 19 it
@@ -360,7 +361,7 @@ def _split_columns(content: bytes, names: Sequence[str]) -> dict[str, Any] | Non
     return columns
 
 
-def _parse_columns(words: dict[str, Any], header: dict[str, Any], num_boxes: IntArray) -> _Columns:
+def _parse_columns(words: NamedValues, header: NamedValues, num_boxes: IntArray) -> _Columns:
     """Convert the words of all columns; an unknown class becomes −1.
 
     pyarrow.ArrowInvalid is raised if a word does not have the column's type.
@@ -368,7 +369,7 @@ def _parse_columns(words: dict[str, Any], header: dict[str, Any], num_boxes: Int
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    def parse_numbers(columns: dict[str, Any], names: Sequence[str]) -> FloatArray:
+    def parse_numbers(columns: NamedValues, names: Sequence[str]) -> FloatArray:
         arrays = [columns[name].cast(pa.float64()) for name in names]
         return np.column_stack([array.to_numpy() for array in arrays])
 

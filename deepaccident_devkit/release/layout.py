@@ -534,7 +534,7 @@ class MissingFiles:
 
 def _find_split_files(root: ReleasePath) -> dict[str, ReleasePath]:
     """Return split name → split file, for all split files that exist."""
-    paths: dict[str, ReleasePath] = {}
+    paths = {}
     for name in SPLIT_FILES:
         for folder in (root, root / SPLIT_FILE_FOLDER):
             path = folder / name

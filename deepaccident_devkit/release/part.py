@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from deepaccident_devkit.errors import DatarootError
 from deepaccident_devkit.release.store import ReleasePath, read_content
 from deepaccident_devkit.support.json_text import parsed_record
+from deepaccident_devkit.support.values import ReadOnlyValues
 
 # Name of the file in the folder of a part that says what the part should have.
 _MANIFEST_NAME = "release.manifest.json"
@@ -26,7 +26,7 @@ class PartManifest:
             empty, or of frames without labels and calib, do not count.
     """
 
-    release: Mapping[str, Any] | None = None
+    release: ReadOnlyValues | None = None
     contents: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
 

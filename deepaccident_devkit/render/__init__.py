@@ -19,11 +19,7 @@ from deepaccident_devkit.render.motion import (
     draw_motion_trail,
     render_motion_labels,
 )
-from deepaccident_devkit.render.outcomes import (
-    draw_accident_outcome,
-    draw_detection_outcome,
-    render_evaluation,
-)
+from deepaccident_devkit.render.outcomes import render_evaluation
 from deepaccident_devkit.render.replay import render_replay
 from deepaccident_devkit.render.samples import render_calibration, render_frame, render_sample
 from deepaccident_devkit.render.styles import style
@@ -37,9 +33,7 @@ __all__ = [
     "LAYERS",
     "Layer",
     "detached_figure",
-    "draw_accident_outcome",
     "draw_box",
-    "draw_detection_outcome",
     "draw_motion_labels",
     "draw_motion_map",
     "draw_motion_output",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError
 from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.render.bev import draw_road
+from deepaccident_devkit.render.bev import draw_agents, draw_road
 from deepaccident_devkit.render.boxes import (
     actor_tags,
     bounds_in_image,
@@ -30,7 +31,7 @@ from deepaccident_devkit.render.camera import (
     crop_about,
     draw_camera,
 )
-from deepaccident_devkit.render.captions import has_sensor_file, set_scene_title
+from deepaccident_devkit.render.captions import has_sensor_file, set_scene_title, set_title
 from deepaccident_devkit.render.chips import keep_free, place_chips
 from deepaccident_devkit.render.figures import (
     Layer,
@@ -38,7 +39,6 @@ from deepaccident_devkit.render.figures import (
     figure_or_new,
     lay_out_figure,
     layers_of,
-    show_square,
     with_light_grid,
 )
 from deepaccident_devkit.render.styles import (
@@ -50,7 +50,7 @@ from deepaccident_devkit.render.styles import (
     in_own_settings,
     text_size,
 )
-from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, short_name
 from deepaccident_devkit.v2x import Agents, Contact, collision, cooperating_agents
@@ -68,8 +68,7 @@ _DEFAULT_LAYERS: Layers = ("image", "bev", "boxes", "trajectories", "grid")
 # Frames for which the last camera that saw the pair stays selected.
 _CAMERA_MEMORY_FRAMES = 10
 # Minimum and maximum number of metres shown around the point of contact.
-_MIN_VIEW_RANGE_M = 9.0
-_MAX_VIEW_RANGE_M = 24.0
+_VIEW_RANGES_M = (9.0, 24.0)
 # Metres shown around the pair.
 _PAIR_MARGIN_M = 2.5
 # How many seconds of the pair's paths are shown.
@@ -80,8 +79,10 @@ _MIN_CROP_SHARE = 0.4
 _CROSS_SIZE_PT = 9.0
 # Distance of tags from a panel's edges, as a share of its width and height.
 _EDGE_SHARE = 0.01
-# Height of the strip at the top of an image, in points, where tags may cover a box that fills it.
-_TAG_HEIGHT_PT = 22.0
+# Distance of tags from the centres of boxes, away from the point of contact, metres.
+_TAG_OFFSET_M = 2.0
+# Weight of an actor's area in pixels; the number of visible actors takes precedence.
+_AREA_WEIGHT = 1e-9
 _HIDDEN_LINE_STYLE = (0, (3, 2))
 # The default moments, in seconds before the impact.
 COUNTDOWN: Final = (2.0, 1.0, 0.5, 0.0)
@@ -89,11 +90,9 @@ _COLUMN_COUNTDOWN = (1.0, 0.0)
 _PANEL_WIDTH_IN = 3.3
 # Minimum width of a camera's panel in inches; agents are left out until panels are this wide.
 _MIN_PANEL_WIDTH_IN = 1.6
-# Number of letters in a line that fits above a panel of a small picture.
-_MAX_TITLE_LETTERS = 16
 # Height of the words above a row in inches, per point of letter size.
 _ROW_WORDS_HEIGHT_IN = 0.03
-# Minimum share of a small picture that panels should cover, as estimated by `_panel_width`.
+# Minimum share of a small picture that panels should cover, as estimated from their width.
 _MIN_COVERED_SHARE = 0.6
 # Approximate height of titles, in inches, and of the two lines in a paper's column.
 _TITLE_HEIGHT_IN = 1.0
@@ -352,6 +351,31 @@ class CollidingPair:
                 return channel, None, frame
         return cameras[0], None, None
 
+    def camera_qualities(
+        self, agents: Sequence[str], frames: Sequence[int]
+    ) -> dict[tuple[str, str], float]:
+        """Return how well images show the pair in some frames, by agent and channel.
+
+        The number of actors that an image shows counts, then their area. Actors that an agent's
+        cameras do not see do not count.
+        """
+        qualities: dict[tuple[str, str], float] = {}
+        for agent, frame in product(agents, frames):
+            boxes = self.at(frame, agent)
+            is_visible = np.isin(boxes.actor_id, self.visible_ids(agent, frame))
+            sample = sample_token(self.scenario, agent, frame)
+            view = best_view(self.dataset, [sample], boxes.select(is_visible))
+            if view is not None and has_sensor_file(self.dataset, view.camera):
+                key = (agent, view.camera.rsplit("/", 1)[1])
+                quality = round(view.total_share) + _AREA_WEIGHT * view.area
+                qualities[key] = qualities.get(key, 0.0) + quality
+        return qualities
+
+    def visible_ids(self, agent: str, index: int) -> IntArray:
+        """Return the label ids that the agent's cameras see in a frame (numbered from 1)."""
+        sample = sample_token(self.scenario, agent, index)
+        return self.dataset.boxes(sample, visible="camera").actor_id
+
 
 def draw_pair_in_camera(
     pair: CollidingPair,
@@ -388,68 +412,89 @@ def draw_pair_in_camera(
         return name
     optical_from_world = dataset.world_from(sample, channel).inverse()
     boxes = pair.at(index, agent).transform(optical_from_world, channel)
-    visible_ids = dataset.boxes(sample, visible="camera").actor_id
-    hidden_boxes = boxes.select(~np.isin(boxes.actor_id, visible_ids))
+    hidden_boxes = boxes.select(~np.isin(boxes.actor_id, pair.visible_ids(agent, index)))
     colors = [COLLIDER_COLOR] * len(hidden_boxes)
     draw_boxes_in_image(hidden_boxes, lens, ax, colors, linestyle=_HIDDEN_LINE_STYLE)
-    tags = [pair.tags[actor] for actor in boxes.actor_id.tolist()]
-    _write_tags_in_image(tags, bounds_in_image(boxes, lens), ax)
+    bounds = bounds_in_image(boxes, lens).clip((left, top) * 2, (right, bottom) * 2)
+    box_left, box_top, box_right, box_bottom = bounds.T
+    is_shown = (box_right > box_left) & (box_bottom > box_top)
+    tops = np.column_stack([(box_left + box_right) / 2, box_top])
+    _write_tags(pair, boxes.select(is_shown), tops[is_shown], ax)
     return name
 
 
 def draw_pair_from_above(
-    pair: CollidingPair, index: int, layers: Collection[Layer], ax: Axes
+    pair: CollidingPair,
+    index: int,
+    layers: Collection[Layer],
+    ax: Axes,
+    *,
+    ratio: float = 1.0,
+    view_ranges: tuple[float, float] = _VIEW_RANGES_M,
+    named_agents: Sequence[str] = (),
 ) -> None:
     """Render a frame (numbered from 1) around the point of contact, in the world frame.
 
     The view is as close-up as it can be with both actors in it. The layers are `bev` (the road),
-    `boxes`, `velocities`, `ids`, `trajectories` (the pair's, up to the contact) and `grid`. The
-    title gives the pair's speeds.
+    `boxes`, `velocities`, `ids`, `trajectories` (up to the contact) and `grid`. The title gives the
+    pair's speeds.
+
+    Args:
+        pair: The pair.
+        index: Number of the frame.
+        layers: Layers to draw.
+        ax: Axes to draw on.
+        ratio: Width over height of the view.
+        view_ranges: Minimum and maximum number of metres shown above and below the point.
+        named_agents: Agents to name instead of the pair; then the paths of all actors are drawn.
     """
     dataset = pair.dataset
     point = pair.contact.point[:2]
     first_agent = agents_of(dataset, pair.scenario)[0]
-    sample = dataset.get("sample", sample_token(pair.scenario, first_agent, index))
+    sample: Any = dataset.get("sample", sample_token(pair.scenario, first_agent, index))
     boxes = pair.tracks.at(index)
     pair_boxes = pair.at(index)
-    distances = np.abs(pair_boxes.bottom_corners()[..., :2] - point)
-    view_range = _PAIR_MARGIN_M + float(distances.max(initial=0.0))
-    view_range = min(max(view_range, _MIN_VIEW_RANGE_M), _MAX_VIEW_RANGE_M)
-    x, y = point.tolist()
-    show_square(ax, (x, y), view_range)
+    distances = np.abs(pair_boxes.bottom_corners()[..., :2] - point) / (ratio, 1)
+    view_range = float(np.clip(_PAIR_MARGIN_M + distances.max(initial=0.0), *view_ranges))
+    low, high = point + np.outer((-view_range, view_range), (ratio, 1))
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     if "bev" in layers:
         draw_road(dataset, sample["frame_token"], [ax], target_from_world=SE3.identity())
     if "trajectories" in layers:
+        trail_boxes = boxes if named_agents else pair_boxes
         draw_trails(
             dataset,
             sample,
-            pair_boxes,
-            [COLLIDER_COLOR] * len(pair_boxes),
+            trail_boxes,
+            role_colors(dataset, sample, trail_boxes),
             target_from_world=SE3.identity(),
             seconds=(_PAST_S, sample["time_to_impact"] or 0.0),
             ax=ax,
         )
-    _write_tags_from_above(pair, pair_boxes, ax)  # before the ids, which use the remaining space
+    if named_agents:
+        draw_agents(dataset, sample, "world", named_agents, ax)
+    else:  # before the ids, which use the remaining space
+        keep_free(ax, pair_boxes.bottom_corners()[..., :2])
+        offsets = pair_boxes.center[:, :2] - point
+        lengths = np.linalg.norm(offsets, axis=1, keepdims=True).clip(1e-9)
+        ends = point + offsets * (1 + _TAG_OFFSET_M / lengths)
+        _write_tags(pair, pair_boxes, ends, ax)
     draw_actors_from_above(boxes, ax, role_colors(dataset, sample, boxes), layers)
-    ax.plot(x, y, "x", color="black", markersize=_CROSS_SIZE_PT, markeredgewidth=1.8, zorder=5)
+    ax.plot(*point, "x", color="black", markersize=_CROSS_SIZE_PT, markeredgewidth=1.8, zorder=5)
     half = _CROSS_SIZE_PT / 2
     keep_free(ax, [[point]], margin=(-half, -half, half, half))
-    draw_scale_bar(view_range, ax, grid="grid" in layers)
-    ax.set_title(_speeds_title(pair, pair_boxes), fontsize=text_size())
+    _draw_scale_bar(view_range, ax, grid="grid" in layers)
+    set_title(ax, _speeds_title(pair, pair_boxes), fontsize=text_size(), y=None)
 
 
 def _speeds_title(pair: CollidingPair, boxes: Boxes) -> str:
-    """Return the pair's speeds as a title, on two lines if one is too long for a panel."""
+    """Return the pair's speeds as a title."""
     speeds = []
     for actor, velocity in zip(boxes.actor_id.tolist(), boxes.velocity, strict=True):
         speed = float(np.linalg.norm(velocity))
         speeds.append(f"{pair.tags[actor]} {number_words(speed)}")
     line = ", ".join(speeds)
-    if not current_style().shows_few_panels:
-        return f"{line} m/s"
-    if len(line) > _MAX_TITLE_LETTERS:
-        return "\n".join(speeds)
-    return line
+    return line if current_style().shows_few_panels else f"{line} m/s"
 
 
 def number_words(value: float) -> str:
@@ -459,11 +504,11 @@ def number_words(value: float) -> str:
     return "unknown"
 
 
-def draw_scale_bar(view_range: float, ax: Axes, *, grid: bool) -> None:
+def _draw_scale_bar(view_range: float, ax: Axes, *, grid: bool) -> None:
     """Render a scale bar of 5 or 10 m, and a grid of that spacing, instead of axis labels."""
     from matplotlib.ticker import MultipleLocator
 
-    metres = 5.0 if view_range < 1.25 * _MIN_VIEW_RANGE_M else 10.0
+    metres = 5.0 if view_range < 1.25 * _VIEW_RANGES_M[0] else 10.0
     if grid:
         ax.grid(color=GRID_COLOR, linewidth=0.4)
         ax.set_axisbelow(True)
@@ -486,59 +531,13 @@ def draw_scale_bar(view_range: float, ax: Axes, *, grid: bool) -> None:
     keep_free(ax, [[(left, low), (right, low)]], margin=(-2, -2, 2, 2 * text_size()))
 
 
-def _write_tags_in_image(tags: list[str], bounds: FloatArray, ax: Axes) -> None:
-    """Write tags above the visible parts of boxes in an image.
-
-    If two boxes are visible, each tag is at the box's outer side, away from the other box.
-
-    Args:
-        tags: One tag for each of the N boxes.
-        bounds: Left, top, right and bottom of the boxes, shape (N, 4), pixels.
-        ax: Axes of the image.
-    """
-    left, right = ax.get_xlim()
-    bottom, top = ax.get_ylim()
-    box_left, box_top, box_right, box_bottom = bounds.T
-    box_left, box_right = np.clip([box_left, box_right], left, right)
-    box_top, box_bottom = np.clip([box_top, box_bottom], top, bottom)
-    visible_rows = np.flatnonzero((box_right > box_left) & (box_bottom > box_top))
-    middle = (box_left + box_right) / 2
-    rows = visible_rows[np.argsort(middle[visible_rows])]
-    tag_u = middle[rows]
-    if len(rows) > 1:
-        tag_u = np.array([box_left[rows[0]], box_right[rows[1]]])
-    tag_share = min(0.5, _TAG_HEIGHT_PT * ax.figure.dpi / 72 / ax.bbox.height)
-    tag_bottom = top + (bottom - top) * tag_share
-    tag_v = box_top[rows]
-    tag_v[tag_v < tag_bottom] = top
-    _write_tags([tags[row] for row in rows.tolist()], np.column_stack([tag_u, tag_v]), ax)
-    low_corners = np.column_stack([box_left, box_top.clip(tag_bottom)])
-    high_corners = np.column_stack([box_right, box_bottom.clip(tag_bottom)])
-    keep_free(ax, np.stack([low_corners, high_corners], axis=1)[rows])
-
-
-def _write_tags_from_above(pair: CollidingPair, boxes: Boxes, ax: Axes) -> None:
-    """Write a tag next to each box of the pair, at the end farther from the other actor."""
-    centers = boxes.center[:, :2]
-    middle = pair.contact.point[:2]
-    if len(boxes) > 1:
-        middle = centers.mean(axis=0)
-    offsets = centers - middle
-    distances = np.linalg.norm(offsets, axis=1, keepdims=True)
-    directions = offsets / np.maximum(distances, 1e-9)
-    corners = boxes.bottom_corners()[..., :2] - centers[:, None]
-    lengths = (corners @ directions[..., None]).max(axis=1)
-    positions = centers + directions * lengths
-    tags = [pair.tags[actor] for actor in boxes.actor_id.tolist()]
-    _write_tags(tags, positions, ax)
-
-
-def _write_tags(tags: list[str], positions: FloatArray, ax: Axes) -> None:
-    """Write tags near positions (N, 2) in data coordinates, but always within the panel."""
+def _write_tags(pair: CollidingPair, boxes: Boxes, positions: FloatArray, ax: Axes) -> None:
+    """Write a tag near the position (N, 2) of each box of the pair, but always within the panel."""
     low = np.array(ax.viewLim.min)
     high = np.array(ax.viewLim.max)
     edge = _EDGE_SHARE * (high - low)
     positions = positions.clip(low + edge, high - edge)
+    tags = [pair.tags[actor] for actor in boxes.actor_id.tolist()]
     chips = zip(tags, positions, strict=True)
     place_chips(ax, chips, colors=[COLLIDER_COLOR] * len(tags))
 
@@ -609,52 +608,37 @@ def _panels(fig: Figure, agents: int, moments: int) -> tuple[Any, bool]:
     """Make axes, shape (agents + 1, moments); also return whether agents are the columns."""
     _, is_wide = _panel_width(fig, agents, moments)
     if is_wide:
-        width_ratios = (*[16 / 9] * agents, 1)
-        axes = fig.subplots(moments, agents + 1, squeeze=False, width_ratios=width_ratios)
-        return axes.T, True
-    height_ratios = (*[9 / 16] * agents, 1)
-    axes = fig.subplots(agents + 1, moments, squeeze=False, height_ratios=height_ratios)
-    return axes, False
+        ratios = (*[16 / 9] * agents, 1)
+        return fig.subplots(moments, agents + 1, squeeze=False, width_ratios=ratios).T, True
+    ratios = (*[9 / 16] * agents, 1)
+    return fig.subplots(agents + 1, moments, squeeze=False, height_ratios=ratios), False
 
 
 def _fitting_agents(fig: Figure, agents: int, moments: int) -> int:
-    """Return how many agents fit with panels large enough to show what happens.
+    """Return how many agents fit, one at least, with panels that show what happens.
 
-    If no number of agents fits, return the number whose panels cover most of the figure.
+    In a style with few panels, they cover most of the figure.
     """
-    panels = {number: _panel_width(fig, number, moments) for number in range(1, agents + 1)}
-    widest = max(width for width, _ in panels.values())
-    min_width = min(_MIN_PANEL_WIDTH_IN, 0.9 * widest)
-    areas = {}
-    for number, (width, is_wide) in panels.items():
-        if width >= min_width:
-            above_ratio = 81 / 256 if is_wide else 1
-            areas[number] = moments * width**2 * (number * 9 / 16 + above_ratio)
     min_area = 0.0
     if current_style().shows_few_panels:
         min_area = _MIN_COVERED_SHARE * fig.bbox.width * fig.bbox.height / fig.dpi**2
-    sufficient = [number for number, area in areas.items() if area > min_area]
-    return max(sufficient, default=max(areas, key=areas.__getitem__))
+    for number in range(agents, 1, -1):
+        width, is_wide = _panel_width(fig, number, moments)
+        above_ratio = 81 / 256 if is_wide else 1
+        area = moments * width**2 * (number * 9 / 16 + above_ratio)
+        if width >= _MIN_PANEL_WIDTH_IN and area > min_area:
+            return number
+    return 1
 
 
 def _best_agents(
     pair: CollidingPair, agents: Sequence[str], frames: Sequence[int], number: int
 ) -> list[str]:
-    """Return the ego and the agents whose images show most of the pair, `number` in all.
-
-    Among equal agents, the ones with the largest view of the pair come first.
-    """
-    priorities = {}
-    for agent in agents:
-        shares_and_areas = [(0.0, 0.0)]
-        for frame in frames:
-            _, view, _ = pair.view(agent, frame)
-            if view is not None:
-                shares_and_areas.append((view.total_share, view.area))
-        totals = np.sum(shares_and_areas, axis=0).tolist()
-        is_ego = agent == AGENTS[0]
-        priorities[agent] = (is_ego, totals)
-    ranked = sorted(agents, key=priorities.__getitem__, reverse=True)
+    """Return the ego and the agents whose images show the pair best, `number` in all."""
+    priorities = dict.fromkeys(agents, 0.0)
+    for (agent, _), quality in pair.camera_qualities(agents, frames).items():
+        priorities[agent] += quality
+    ranked = sorted(agents, key=lambda agent: (agent != AGENTS[0], -priorities[agent]))
     return in_drawing_order(ranked[:number])
 
 
@@ -693,29 +677,33 @@ def write_camera_name(words: str, ax: Axes) -> None:
 
 
 def _draw_speeds(pair: CollidingPair, index: int, ax: Axes) -> None:
-    """Render the pair's speeds over the seconds before the impact.
-
-    Lines are strong up to the current frame and pale after it.
-    """
+    """Render the pair's speeds over the seconds before the impact."""
     tracks = pair.tracks
     impact = int(tracks.index.max())
+    now = (index - impact) * FRAME_PERIOD
     for actor, line_style in zip(pair.contact.actor_ids, _LINE_STYLES, strict=True):
         rows = np.flatnonzero(tracks.actor_id == actor)
         seconds = (tracks.index[rows] - impact) * FRAME_PERIOD
-        speed = np.linalg.norm(tracks.boxes.velocity[rows], axis=1)
-        is_past = tracks.index[rows] <= index
+        speed = np.sqrt(np.square(tracks.boxes.velocity[rows]).sum(axis=1))
         style: dict[str, Any] = {"color": COLLIDER_COLOR, "linestyle": line_style}
-        ax.plot(seconds, speed, linewidth=1.2, alpha=0.25, **style)
-        past_seconds = seconds[is_past]
-        ax.plot(past_seconds, speed[is_past], linewidth=2.0, label=pair.tags[actor], **style)
-    present = (index - impact) * FRAME_PERIOD
-    ax.axvline(present, color="black", linewidth=1.2)
-    ax.axvline(0, color=COLLIDER_COLOR, linewidth=1.2, linestyle=":")
-    ax.set(
-        xlabel="time relative to the impact (s)",
-        ylabel="speed (m/s)",
-        xlim=(-(impact - 1) * FRAME_PERIOD, 0.1),
-        ylim=(0, None),
-    )
+        draw_until(ax, seconds, speed, now, pair.tags[actor], **style)
+    ax.set(ylabel="speed (m/s)", xlim=(-(impact - 1) * FRAME_PERIOD, 0.1), ylim=(0, None))
+    finish_time_axis(ax, now, "impact")
     ax.legend(loc="lower left", fontsize=text_size(), ncols=2, framealpha=0.7)
+
+
+def draw_until(
+    ax: Axes, seconds: AnyArray, values: AnyArray, now: float, label: str, **style: Any
+) -> None:
+    """Draw values over seconds, shape (N,) each, strong up to the present and pale after it."""
+    ax.plot(seconds, values, linewidth=1.2, alpha=0.25, **style)
+    is_past = seconds < now + FRAME_PERIOD / 2
+    ax.plot(seconds[is_past], values[is_past], linewidth=2.0, label=label, **style)
+
+
+def finish_time_axis(ax: Axes, now: float, event: str) -> None:
+    """Mark the present and an event, from which the axis counts the seconds."""
+    ax.axvline(now, color="black", linewidth=1.2)
+    ax.axvline(0, color=COLLIDER_COLOR, linewidth=1.2, linestyle=":")
+    ax.set_xlabel(f"time relative to the {event} (s)", fontsize=text_size())
     with_light_grid(ax, "both")

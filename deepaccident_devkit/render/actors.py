@@ -56,6 +56,7 @@ from deepaccident_devkit.support.arrays import (
     as_floats,
 )
 from deepaccident_devkit.support.text import fixed_text
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.tokens import instance_token, sample_token
 from deepaccident_devkit.taxonomy import (
     BEV_CAMERA,
@@ -82,7 +83,7 @@ _LETTERS_PER_INCH = 104
 _CROP_PANELS = ("first", "second", "third", "fourth")
 _WIDE_MOSAIC: list[Any] = [["path", "first", "second"], ["path", "speed", "seen"]]
 # The panels of an actor over time, for each `room` of a style.
-_ACTOR_MOSAICS: Mapping[str, dict[str, Any]] = {
+_ACTOR_MOSAICS: Mapping[str, NamedValues] = {
     "all": {
         "mosaic": [
             ["path", "first", "second"],
@@ -99,7 +100,7 @@ _ACTOR_MOSAICS: Mapping[str, dict[str, Any]] = {
     },
 }
 # The panels of one box, for each `room` of a style.
-_BOX_MOSAICS: Mapping[str, dict[str, Any]] = {
+_BOX_MOSAICS: Mapping[str, NamedValues] = {
     "all": {
         "mosaic": [["camera", "above"], ["words", "words"]],
         "width_ratios": (16, 10),
@@ -175,7 +176,7 @@ def render_annotation(
     return fig
 
 
-def _write_facts(dataset: Dataset, record: dict[str, Any], ego_box: Boxes, ax: Axes) -> None:
+def _write_facts(dataset: Dataset, record: NamedValues, ego_box: Boxes, ax: Axes) -> None:
     """Write the facts about a box in columns; `ego_box` is the box in the ego frame."""
     ax.set_axis_off()
     columns = _facts(dataset, record, ego_box)
@@ -212,7 +213,7 @@ def draw_view(
     ax.set(xlim=(left, right), ylim=(bottom, top))
 
 
-def _facts(dataset: Dataset, record: dict[str, Any], ego_box: Boxes) -> list[list[str]]:
+def _facts(dataset: Dataset, record: NamedValues, ego_box: Boxes) -> list[list[str]]:
     """Return the facts about a box as columns of lines; `ego_box` is the box in the ego frame."""
     length, width, height = record["size"]
     speed = float(np.linalg.norm(record["velocity"]))
@@ -383,7 +384,7 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
     show_square(ax, center, view_range)
     ax.set_anchor("N")
     if "bev" in layers:
-        _draw_road(dataset, actor, center, view_range, ax)
+        _draw_road(dataset, actor, ax)
     if "trajectories" in layers:
         draw_trail(path[::-1], ax, actor.color, linewidths=2.5)
     seconds = actor.seconds(actor.index)
@@ -408,9 +409,7 @@ def _draw_path(dataset: Dataset, actor: _Actor, layers: frozenset[Layer], ax: Ax
         ax.grid(color=GRID_COLOR, linewidth=0.4)
 
 
-def _draw_road(
-    dataset: Dataset, actor: _Actor, center: FloatArray, view_range: float, ax: Axes
-) -> None:
+def _draw_road(dataset: Dataset, actor: _Actor, ax: Axes) -> None:
     """Draw the recorder's BEV camera picture from half-way along the path, if it is present."""
     middle = len(actor.index) // 2
     frame = int(actor.index[middle])
@@ -418,13 +417,10 @@ def _draw_road(
     if not dataset.sensor_path(f"{sample}/{BEV_CAMERA}").is_file():
         return
     world_from_ego = dataset.world_from(sample, "ego")
-    recorder_position = world_from_ego.translation[:2]
-    distance = float(np.abs(center - recorder_position).max())
     draw_underlay(
         dataset.load_bev(sample),
         ax,
         target_from_ego=world_from_ego,
-        view_range=view_range + distance,
         colors=EMPTY_ROAD_COLORS,
     )
 
@@ -574,7 +570,7 @@ def sightings(dataset: Dataset, scenario: str, agent: str, actor_id: int) -> Sig
 
     Rows in which an agent annotated itself are left out.
     """
-    rows: list[tuple[int, int, bool, bool]] = []
+    rows = []
     frame_count = dataset.get("scenario", scenario)["num_frames"]
     for frame in range(1, frame_count + 1):
         sample = sample_token(scenario, agent, frame)

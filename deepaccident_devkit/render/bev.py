@@ -231,7 +231,7 @@ def draw_bev(
     left, low = center - view.half
     right, high = center + view.half
     ax.set(xlim=(left, right), ylim=(low, high), aspect="equal", anchor="N")
-    has_ground = _draw_ground(dataset, record, view, target_from_world, center, layers, ax)
+    has_ground = _draw_ground(dataset, record, target_from_world, layers, ax)
     clouds: dict[AgentName, LidarPointCloud | None] = {}
     if "points" in layers:
         clouds = _draw_clouds(dataset, record, view, names, center, ax)
@@ -248,7 +248,7 @@ def draw_bev(
         absent_words.append(
             _missing_ground_text(dataset, record, layers, has_surroundings=has_surroundings)
         )
-    _draw_marks(dataset, record, view.frame, names, ax)
+    draw_agents(dataset, record, view.frame, names, ax)
     label_axes(ax, view.frame)
     ax.set_axisbelow(True)
     if "grid" in layers:
@@ -262,9 +262,7 @@ def draw_bev(
 def _draw_ground(
     dataset: Dataset,
     record: SampleRecord,
-    view: BevView,
     target_from_world: SE3,
-    center: FloatArray,
     layers: frozenset[Layer],
     ax: Axes,
 ) -> bool:
@@ -277,13 +275,7 @@ def _draw_ground(
         draw_town_map(town, ax, target_from_world=target_from_world)
     if has_picture:
         target_from_ego = target_from_world @ dataset.world_from(record, "ego")
-        distance = float(np.abs(center - target_from_ego.translation[:2]).max())
-        draw_underlay(
-            dataset.load_bev(record),
-            ax,
-            target_from_ego=target_from_ego,
-            view_range=float(view.half.max()) + distance,
-        )
+        draw_underlay(dataset.load_bev(record), ax, target_from_ego=target_from_ego)
     return has_picture or town is not None
 
 
@@ -327,9 +319,7 @@ def draw_road(
     image = dataset.load_bev(nearest_sample)
     pose = poses[nearest_sample]
     for ax in axes:
-        edges = ax.viewLim.get_points() - pose.translation[:2]
-        view_range = float(np.abs(edges).max())
-        draw_underlay(image, ax, target_from_ego=pose, view_range=view_range, colors=colors)
+        draw_underlay(image, ax, target_from_ego=pose, colors=colors)
 
 
 def _missing_ground_text(
@@ -443,8 +433,8 @@ def _load_cloud(
     )
 
 
-def _draw_marks(
-    dataset: Dataset, record: SampleRecord, frame: str, names: Sequence[AgentName], ax: Axes
+def draw_agents(
+    dataset: Dataset, record: SampleRecord, frame: str, names: Sequence[str], ax: Axes
 ) -> None:
     """Draw an arrow head at the true pose of each agent, with names if there are several agents."""
     from matplotlib.collections import PolyCollection

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -25,6 +25,7 @@ from deepaccident_devkit.render.styles import (
     text_size,
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import (
     AGENTS,
@@ -64,7 +65,7 @@ _MARK_RADIUS_M = 1.0
 # Minimum radius of a mark, points, so that it is visible in a view of a whole town.
 _MIN_MARK_RADIUS_PT = 2.0
 # Arrows in data coordinates.
-ARROW_STYLE: Final[Mapping[str, Any]] = {
+ARROW_STYLE: Final[ReadOnlyValues] = {
     "angles": "xy",
     "scale_units": "xy",
     "scale": 1,
@@ -72,7 +73,7 @@ ARROW_STYLE: Final[Mapping[str, Any]] = {
     "zorder": 4,
 }
 # Number of corners of each mark, by matplotlib marker name.
-_MARK_CORNERS: Mapping[str, int] = {"o": 16, "D": 4, "^": 3}
+_MARK_CORNERS = {"o": 16, "D": 4, "^": 3}
 # Length of the arrow in a corner that shows the scale of the arrows, in metres per second.
 _KEY_SPEED_MPS = 10
 # Width of an edge in an image, and how much wider its casing is, in points.
@@ -308,7 +309,7 @@ def _draw_footprints(
     ax: Axes,
     colors: Sequence[str],
     fill: float,
-    style: Mapping[str, Any],
+    style: ReadOnlyValues,
 ) -> None:
     """Draw outlines of boxes, and lines from their centres to their fronts.
 
@@ -353,7 +354,7 @@ def _draw_small_actors(boxes: Boxes, ax: Axes, colors: Sequence[str], *, filled:
         mark_colors.append(colors[row])
     if not marks:
         return
-    style: dict[str, Any] = {"facecolors": "none", "edgecolors": mark_colors}
+    style: NamedValues = {"facecolors": "none", "edgecolors": mark_colors}
     if filled:
         style = {"facecolors": mark_colors, "edgecolors": CASING_COLOR}
     ax.add_collection(PolyCollection(marks, linewidths=0.7, zorder=3.5, **style))
@@ -441,7 +442,7 @@ def _track_rows(tracks: ScenarioTracks, actor: int | None, start: int, end: int)
 
 
 def _draw_trails(
-    paths: Sequence[FloatArray], ax: Axes, colors: Sequence[str], style: dict[str, Any]
+    paths: Sequence[FloatArray], ax: Axes, colors: Sequence[str], style: NamedValues
 ) -> LineCollection:
     """Draw paths (T, 2) as one collection of short lines, each fainter than the one before it."""
     from matplotlib.collections import LineCollection
@@ -579,7 +580,7 @@ def in_drawing_order(agents: Collection[str]) -> list[str]:
     return sorted(agents, key=AGENTS.index)
 
 
-def simultaneous_sample(sample: Mapping[str, Any], agent: str) -> str:
+def simultaneous_sample(sample: ReadOnlyValues, agent: str) -> str:
     """Return the token of an agent's sample in the same frame as another agent's sample record."""
     scenario, _, number = sample["token"].rsplit("/", 2)
     return sample_token(scenario, agent, int(number))

@@ -24,6 +24,7 @@ from deepaccident_devkit.render.styles import (
     current_style,
     text_size,
 )
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import CATEGORIES, LIDAR, short_name
 
 if TYPE_CHECKING:
@@ -52,8 +53,8 @@ _SEPARATOR = " · "
 _CAPITALS = re.compile(r"(?<=[a-z])(?=[A-Z])")
 # Style of a legend inside the axes, where it takes no space around them, and of one below the
 # label of their x axis.
-INSIDE: Final[Mapping[str, Any]] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
-BELOW: Final[Mapping[str, Any]] = {
+INSIDE: Final[ReadOnlyValues] = {"loc": "upper right", "frameon": True, "framealpha": 0.85}
+BELOW: Final[ReadOnlyValues] = {
     "loc": "upper center",
     "bbox_to_anchor": (0.5, 0),
     "borderaxespad": 4.5,
@@ -62,14 +63,14 @@ BELOW: Final[Mapping[str, Any]] = {
 _HANDLE_WIDTH_IN = 0.044
 # Share of a panel's width that a legend below it may take.
 _LEGEND_SHARE = 0.86
-_LEGEND_SPACING: Mapping[str, Any] = {"handlelength": 1.2, "columnspacing": 1.0}
+_LEGEND_SPACING: ReadOnlyValues = {"handlelength": 1.2, "columnspacing": 1.0}
 # Labels of the words in a grey panel, and of words for a title; `missing_words` looks for them.
 _MISSING_GID = "missing"
 _LACKS_GID = "lacks"
 _NO_CLOUD_PREFIX = "no LiDAR file of "
 
 
-def scene_words(record: Mapping[str, Any]) -> str:
+def scene_words(record: ReadOnlyValues) -> str:
     """Name a scenario's town and weather, if meta states them: `Town10HD, wet night`."""
     weather = _CAPITALS.sub(" ", record["weather"] or "").lower()
     separator = " at " if weather.endswith("rain") else " "
@@ -77,7 +78,7 @@ def scene_words(record: Mapping[str, Any]) -> str:
     return _join_parts([record["town"], conditions.lower()])
 
 
-def scenario_words(record: Mapping[str, Any]) -> str:
+def scenario_words(record: ReadOnlyValues) -> str:
     """Describe a scenario to readers by its town, its weather and how it ends.
 
     For example `Town02, wet night: car hits pedestrian` (cars come first), or `…: no collision`.

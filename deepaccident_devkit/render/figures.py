@@ -22,6 +22,7 @@ from deepaccident_devkit.render.styles import (
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.text import PathType, choice, path_of
+from deepaccident_devkit.support.values import NamedValues
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,10 +46,12 @@ Layer = Literal[
 Layers = tuple[Layer, ...]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 # Metadata without a date, by suffix.
-_UNDATED_METADATA: Mapping[str, dict[str, Any]] = {
+_UNDATED_METADATA: Mapping[str, NamedValues] = {
     "pdf": {"CreationDate": None},
     "svg": {"Date": None},
 }
+# zlib's level. The default level takes up to twice as long, for files that are up to 6 % smaller.
+_PNG_OPTIONS: Mapping[str, Any] = {"compress_level": 4}
 # Whether new figures are for a file of a report, so that pyplot need not know them.
 _draws_report: ContextVar[bool] = ContextVar("report", default=False)
 # Width over height of a map on a slide and over a page's columns, and of a figure over a page's
@@ -278,7 +281,7 @@ def save_picture(picture: Axes | Figure, path: PathType, *, dpi: float | None = 
 
 
 def write_figure(
-    figure: Figure, path: Path, *, dpi: float, words: dict[str, Any] | None = None
+    figure: Figure, path: Path, *, dpi: float, words: NamedValues | None = None
 ) -> Path:
     """Write a figure in the format of the path's suffix, atomically.
 
@@ -288,8 +291,11 @@ def write_figure(
     """
     suffix = path.suffix[1:].lower()
     metadata = _UNDATED_METADATA.get(suffix, words)
+    options: dict[str, Any] = {}
+    if suffix == "png":
+        options["pil_kwargs"] = _PNG_OPTIONS
     with replacing(path) as temporary, laid_out(figure, dpi):
-        figure.savefig(temporary, format=suffix, dpi=dpi, metadata=metadata)
+        figure.savefig(temporary, format=suffix, dpi=dpi, metadata=metadata, **options)
     return path
 
 
@@ -298,7 +304,7 @@ def write_report_figure(
     path: Path,
     *,
     dpi: float = 150,
-    words: dict[str, Any] | None = None,
+    words: NamedValues | None = None,
     needs_pdf: bool = False,
 ) -> Path:
     """Write a figure of a report into a PNG file in the size of a page on the screen.
@@ -335,5 +341,5 @@ def figure_png(figure: Figure, *, dpi: float) -> bytes:
     """Encode a figure from `detached_figure` as the bytes of a PNG file."""
     content = io.BytesIO()
     with laid_out(figure, dpi):
-        figure.savefig(content, format="png", dpi=dpi)
+        figure.savefig(content, format="png", dpi=dpi, pil_kwargs=_PNG_OPTIONS)
     return content.getvalue()

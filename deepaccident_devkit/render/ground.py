@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 # Approximate number of pixels along a side of a BEV picture; more take time, and panels of a video
 # have fewer.
 _MAX_SIDE_PX = 400
+# Number of possible class numbers of cells.
+_NUM_CLASSES = 256
 
 
 def draw_underlay(
@@ -26,36 +28,38 @@ def draw_underlay(
     ax: Axes,
     *,
     target_from_ego: SE3,
-    view_range: float,
     colors: Mapping[str, str] = BEV_COLORS,
 ) -> None:
-    """Render a BEV camera's semantic tags in the frame of the axes, in metres.
+    """Render the visible part of a BEV camera's semantic tags, in the frame of the axes, in metres.
 
     Args:
         image: Picture of an agent.
         ax: Axes to render on; its limits stay as they are.
         target_from_ego: Pose of the agent's ego frame in the frame of the axes; its tilt is
             ignored.
-        view_range: Metres shown to each side of the agent. If the picture is rotated, a larger
-            square is drawn, so that it fills the corners.
         colors: Colour by name of a tag.
     """
-    yaw = target_from_ego.yaw
-    turned_range = view_range * (abs(np.cos(yaw)) + abs(np.sin(yaw)))
-    middle = len(image.semantic) // 2
-    half = min(middle, int(np.ceil(turned_range / image.resolution)))
-    shown = slice(middle - half, middle + half)
     # Rows of cells are along y, left, and columns along x, forward.
-    tags = image.semantic[::-1, ::-1].T[shown, shown]
-    step = max(1, len(tags) // _MAX_SIDE_PX)
-    start = step // 2
-    cells = tags[start::step, start::step]
-    reach = half * image.resolution
+    tags = image.semantic[::-1, ::-1].T
+    middle = len(tags) // 2
+    flat_pose = SE3.from_yaw(target_from_ego.yaw, target_from_ego.translation)
+    view_corners = np.column_stack([ax.viewLim.corners(), np.zeros(4)])
+    corners = flat_pose.inverse().apply(view_corners)[:, :2] / image.resolution + middle
+    first = np.floor(corners.min(axis=0)).clip(0, len(tags)).astype(int)
+    end = np.ceil(corners.max(axis=0)).clip(0, len(tags)).astype(int)
+    step = max(1, int((end - first).max()) // _MAX_SIDE_PX)
+    # Each block of cells is drawn as the one in its middle.
+    x_slice, y_slice = map(slice, first + step // 2, end + step, (step, step))
+    cells = tags[y_slice, x_slice]
+    if not cells.size:
+        return
+    left, bottom = (first - middle) * image.resolution
+    height, width = step * image.resolution * np.array(cells.shape)
     draw_ground(
         cells,
         TAGS,
         ax,
-        extent=(-reach, reach, -reach, reach),
+        extent=(left, left + width, bottom, bottom + height),
         target_from_cells=target_from_ego,
         zorder=-0.5,  # beneath the cells of labels, above a town map
         colors=colors,
@@ -85,23 +89,26 @@ def draw_ground(
         zorder: Drawing order of the cells, as in matplotlib.
         colors: Colour by class name; pale ones by default.
     """
-    from matplotlib.colors import to_rgb
+    from matplotlib.colors import ListedColormap
     from matplotlib.transforms import Affine2D
 
-    rgb_of_numbers = np.full((256, 3), 255, dtype=np.uint8)
+    palette = ["white"] * _NUM_CLASSES
     for name in numbers.keys() & colors.keys():
-        rgb = np.array(to_rgb(colors[name]))
-        rgb_of_numbers[numbers[name]] = np.rint(rgb * 255)
+        palette[numbers[name]] = colors[name]
     x_limits = ax.get_xlim()
     y_limits = ax.get_ylim()
     x, y, _ = target_from_cells.translation
     pose = Affine2D().rotate(target_from_cells.yaw).translate(x, y)
     ax.imshow(
-        rgb_of_numbers[cells],
+        cells,
+        cmap=ListedColormap(palette),
+        vmin=-0.5,
+        vmax=_NUM_CLASSES - 0.5,
         extent=extent,
         transform=pose + ax.transData,
         origin="lower",
         interpolation="nearest",
+        interpolation_stage="data",  # an image of colours takes three times as long
         zorder=zorder,
     )
     ax.set(xlim=x_limits, ylim=y_limits)

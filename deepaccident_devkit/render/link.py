@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -46,6 +46,7 @@ from deepaccident_devkit.render.styles import (
     in_own_settings,
 )
 from deepaccident_devkit.support.arrays import FloatArray
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import UNTRACKED_ID, short_name
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents, cooperative_boxes, transform
 from deepaccident_devkit.v2x.messages import messages
@@ -76,7 +77,7 @@ _MAGNIFIED_MARGIN_M = 3.5
 _TRUE_LINE_STYLE = (0, (2, 1))
 # Arrows are equally wide in the panel and in its magnified part.
 _ARROW_STYLE = {**ARROW_STYLE, "units": "inches", "width": 0.014}
-_RECEIVER_STYLE: Mapping[str, Any] = {
+_RECEIVER_STYLE: ReadOnlyValues = {
     "linestyle": "none",
     "marker": "*",
     "color": OWN_COLOR,
@@ -165,6 +166,7 @@ def render_link(
     half_width = width_ratio * view_range
     box_ax.set(xlim=(-half_width, half_width), ylim=(-view_range, view_range), aspect="equal")
     label_axes(box_ax, "ego")
+    box_ax.locator_params(nbins=6)  # each tick costs time
     box_ax.set_title(_error_words(shared))
     _draw_shared(shared, shown_layers, box_ax)
     insets = _magnify_largest_errors(shared, box_ax) if "boxes" in shown_layers else []
@@ -295,7 +297,7 @@ def _magnify_largest_errors(shared: Sequence[SharedBoxes], ax: Axes) -> list[Axe
     corners = low + (high - low - side) * np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
     is_covered = np.abs(shifts.reshape(-1, 2) - corners[:, None] - side / 2) < side / 2
     num_covered = is_covered.all(axis=2).sum(axis=1)
-    insets: list[Axes] = []
+    insets = []
     for letter in _INSET_LETTERS:
         distances = np.linalg.norm(shifts[:, 1] - shifts[:, 0], axis=1)
         if distances.max(initial=0.0) < _MIN_MAGNIFIED_ERROR_M:
@@ -337,7 +339,7 @@ def _magnify(
     side = _INSET_SHARE * (high[1] - low[1])
     inset = ax.inset_axes((*(corner - low) / (high - low), *side / (high - low)))
     show_square(inset, center, half)
-    inset.set(xticks=[], yticks=[])
+    inset.set(xticks=[], yticks=[], in_layout=False)  # it is within its panel
     _draw_shared(shared, frozenset({"boxes"}), inset)
     ax.indicate_inset((*(center - half), 2 * half, 2 * half), edgecolor=MUTED_COLOR, alpha=1.0)
     keep_free(ax, [[corner, corner + side], [center - half, center + half]])

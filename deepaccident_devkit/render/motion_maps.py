@@ -279,27 +279,29 @@ def draw_trail_of(maps: MotionMaps, layers: frozenset[Layer], ax: Axes) -> Axes:
     label_axes(ax, "ego")
     if "labels" in layers:
         instance = maps.instance.max(axis=0)
-        picture = _above_road(trail_picture(maps), instance, layers)
-        _draw_cells(ax, picture, maps)
-        draw_edge(maps, maps.own, ax, OWN_COLOR)
+        picture = _above_road(trail_picture(maps.instance, maps.colors), instance, layers)
+        draw_cells(ax, picture, maps.grid)
+        _draw_edge(maps, maps.own, ax, OWN_COLOR)
     if "trajectories" in layers:
         _draw_paths(maps, ax)
     return _with_ids_and_grid(maps, 0, layers, ax)
 
 
-def trail_picture(maps: MotionMaps) -> FloatArray:
+def trail_picture(instance: AnyArray, colors: FloatArray) -> FloatArray:
     """Blend all frames into one picture, shape (H, W, 3), RGB from 0 to 1.
 
     Earlier frames are more opaque and on top.
+
+    Args:
+        instance: Ids of the cells, shape (T, H, W); 0 for free cells.
+        colors: RGB colour of each id, shape (1 + ids, 3).
     """
-    frames = np.flatnonzero(maps.valid).tolist()
-    opacity = np.linspace(1.0, MIN_TRAIL_OPACITY, max(len(maps.valid), 2))
-    picture = np.ones((*maps.instance.shape[1:], 3))
-    for frame in reversed(frames):
-        instance = maps.instance[frame]
-        is_occupied = instance > 0
-        colors = maps.colors[instance[is_occupied]]
-        picture[is_occupied] = 1 - opacity[frame] * (1 - colors)
+    opacity = np.linspace(1.0, MIN_TRAIL_OPACITY, max(len(instance), 2))
+    picture = np.ones((*instance.shape[1:], 3))
+    for frame in reversed(range(len(instance))):
+        is_occupied = instance[frame] > 0
+        cell_colors = colors[instance[frame][is_occupied]]
+        picture[is_occupied] = 1 - opacity[frame] * (1 - cell_colors)
     return picture
 
 
@@ -356,21 +358,23 @@ def _draw_picture(
     if name == "instance":
         instance = maps.instance[frame]
         picture = _above_road(maps.colors[instance], instance, layers)
-        _draw_cells(ax, picture, maps)
-        draw_edge(maps, maps.own, ax, OWN_COLOR, frame=frame)
+        draw_cells(ax, picture, maps.grid)
+        _draw_edge(maps, maps.own, ax, OWN_COLOR, frame=frame)
     elif name == "centerness":
         if maps.centerness is not None:
-            _draw_cells(ax, maps.centerness[frame], maps, cmap=CENTERNESS_COLORMAP, vmin=0, vmax=1)
+            draw_cells(
+                ax, maps.centerness[frame], maps.grid, cmap=CENTERNESS_COLORMAP, vmin=0, vmax=1
+            )
     else:
         vectors = maps.vectors(name)[frame]
         left, forward = np.nan_to_num(vectors)
         colors = direction_colors(left, forward, longest=maps.longest(name))
         colors[np.isnan(vectors[0])] = 1.0
-        _draw_cells(ax, colors, maps)
+        draw_cells(ax, colors, maps.grid)
 
 
-def draw_edge(maps: MotionMaps, instance_id: int, ax: Axes, color: str, *, frame: int = 0) -> None:
-    """Render the edge of an instance's cells."""
+def _draw_edge(maps: MotionMaps, instance_id: int, ax: Axes, color: str, *, frame: int = 0) -> None:
+    """Draw the edge of an instance's cells."""
     cells = maps.instance[frame] == instance_id
     if cells.any():
         x, y = _cell_centers(maps)
@@ -450,11 +454,12 @@ def _above_road(picture: AnyArray, instance: AnyArray, layers: frozenset[Layer])
     return np.dstack([picture, instance > 0])
 
 
-def _draw_cells(ax: Axes, picture: AnyArray, maps: MotionMaps, **style: Any) -> None:
+def draw_cells(ax: Axes, picture: AnyArray, grid: BevGrid, **style: Any) -> None:
+    """Render a picture (H, W), (H, W, 3) or (H, W, 4) of the cells of a grid."""
     ax.imshow(
         picture,
         origin="lower",
-        extent=(*maps.grid.x[:2], *maps.grid.y[:2]),
+        extent=(*grid.x[:2], *grid.y[:2]),
         interpolation="nearest",
         **style,
     )

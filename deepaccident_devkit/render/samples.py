@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -46,6 +46,7 @@ from deepaccident_devkit.render.styles import (
     in_own_settings,
     text_size,
 )
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import CAMERAS, short_name
 from deepaccident_devkit.v2x import (
     Agents,
@@ -383,7 +384,7 @@ def render_calibration(
 
 
 def _load_clouds(
-    dataset: Dataset, record: Mapping[str, Any], agents: Sequence[str]
+    dataset: Dataset, record: ReadOnlyValues, agents: Sequence[str]
 ) -> tuple[dict[str, LidarPointCloud], list[str]]:
     """Load the agents' clouds in a sample's frame; also return the agents without a file."""
     clouds = {}

@@ -19,6 +19,7 @@ from typing import Any, Final, Literal, TypeVar, cast, get_args
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.support.pages import part
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import AGENTS, SPLITS, StyleName
 
 # Blue, cyan, orange, dark yellow and purple; too pale for words on white, which are dark.
@@ -164,7 +165,7 @@ class _Style:
     tokens: bool = True
     titled: bool = True
     by_class: bool = False
-    rc: Mapping[str, Any]
+    rc: ReadOnlyValues
 
     @property
     def is_wide(self) -> bool:

@@ -14,14 +14,12 @@ from deepaccident_devkit.render.accident import (
     agents_in_countdown,
     contact_of,
     cut_words,
+    draw_pair_from_above,
     draw_pair_in_camera,
-    draw_scale_bar,
     recorded_moments,
     roles_and_sides,
     write_camera_name,
 )
-from deepaccident_devkit.render.bev import BevView, draw_bev
-from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.captions import (
     has_sensor_file,
     moment_words,
@@ -36,7 +34,6 @@ from deepaccident_devkit.render.figures import (
     layers_of,
     with_light_grid,
 )
-from deepaccident_devkit.render.moments import default_agent
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
     current_style,
@@ -45,7 +42,6 @@ from deepaccident_devkit.render.styles import (
 )
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import (
-    BEV_CAMERA,
     FRAME_PERIOD,
     INFRASTRUCTURE,
     short_name,
@@ -68,16 +64,8 @@ _ROW_WORDS_HEIGHT_IN = 0.3
 # Additional height of the words in a paper's column, over its width.
 _COLUMN_WORDS_SHARE = 0.3
 # Minimum and maximum number of metres that the map shows above and below the point of contact.
-_MIN_VIEW_RANGE_M = 14.0
-_MAX_VIEW_RANGE_M = 40.0
-# Metres shown around the pair.
-_MARGIN_M = 4.0
-_PAST_S = 3.0
+_VIEW_RANGES_M = (26.0, 40.0)
 _EDGE_WIDTH_PT = 2.0
-# Weight of an actor's area in pixels; the number of visible actors takes precedence.
-_AREA_WEIGHT = 1e-9
-# Size of the cross at the point of contact, in points.
-_CROSS_SIZE_PT = 6.0
 
 
 @in_own_settings
@@ -139,7 +127,16 @@ def render_teaser(
     for camera, ax in zip(images, axes, strict=False):
         _draw_image(pair, camera, shown_layers, ax)
     ratio = _PANEL_RATIO * 1.5 if lengths[-1] == 1 else _PANEL_RATIO
-    _draw_map(pair, names, min(frames), shown_layers, ratio, axes[-2])
+    draw_pair_from_above(
+        pair,
+        min(frames),
+        shown_layers,
+        axes[-2],
+        ratio=ratio,
+        view_ranges=_VIEW_RANGES_M,
+        named_agents=names,
+    )
+    axes[-2].set_title("paths to the impact", fontsize="medium")
     _draw_sight(pair, names, axes[-1])
     words = roles_and_sides(dataset, contact, with_ids=not current_style().shows_few_panels)
     warning_words = cut_words(contact, record["num_frames"])
@@ -156,36 +153,13 @@ def _images(pair: CollidingPair, names: Sequence[str], frames: Sequence[int]) ->
     poles = [name for name in names if name == INFRASTRUCTURE]
     images: list[str] = []
     for agents in (vehicles, poles):
-        camera = _best_camera(pair, agents, frames)
+        qualities = pair.camera_qualities(agents, frames)
         shown_frames = frames[-1:] if images else frames
-        if camera is not None:
-            agent, channel = camera
+        if qualities:
+            agent, channel = max(qualities, key=qualities.__getitem__)
             samples = [sample_token(pair.scenario, agent, frame) for frame in shown_frames]
             images += [f"{sample}/{channel}" for sample in samples]
     return [image for image in images if has_sensor_file(pair.dataset, image)]
-
-
-def _best_camera(
-    pair: CollidingPair, names: Sequence[str], frames: Sequence[int]
-) -> tuple[str, str] | None:
-    """Return the agent and channel whose images show the pair most often and then largest.
-
-    Without an image that shows the pair, the result is None. Actors that an agent's cameras do not
-    see do not count.
-    """
-    qualities: dict[tuple[str, str], float] = {}
-    for agent in names:
-        for frame in frames:
-            sample = sample_token(pair.scenario, agent, frame)
-            boxes = pair.at(frame, agent)
-            visible_ids = pair.dataset.boxes(sample, visible="camera").actor_id
-            boxes = boxes.select(np.isin(boxes.actor_id, visible_ids))
-            view = best_view(pair.dataset, [sample], boxes)
-            if view is not None and has_sensor_file(pair.dataset, view.camera):
-                key = (agent, view.camera.rsplit("/", 1)[1])
-                quality = round(view.total_share) + _AREA_WEIGHT * view.area
-                qualities[key] = qualities.get(key, 0.0) + quality
-    return max(qualities, key=qualities.__getitem__, default=None)
 
 
 def _draw_image(pair: CollidingPair, camera: str, layers: frozenset[Layer], ax: Axes) -> None:
@@ -197,37 +171,6 @@ def _draw_image(pair: CollidingPair, camera: str, layers: frozenset[Layer], ax: 
     set_title(ax, moment_words(pair.dataset, sample), fontsize="medium")
     for spine in ax.spines.values():
         spine.set(visible=True, edgecolor=AGENT_COLORS[agent], linewidth=_EDGE_WIDTH_PT)
-
-
-def _draw_map(
-    pair: CollidingPair,
-    names: Sequence[str],
-    frame: int,
-    layers: frozenset[Layer],
-    ratio: float,
-    ax: Axes,
-) -> None:
-    """Draw a frame from above, with the paths of all actors up to the end."""
-    point = pair.contact.point[:2]
-    distances = np.abs(pair.at(frame).center[:, :2] - point) / (ratio, 1)
-    farthest = _MARGIN_M + float(distances.max(initial=0.0))
-    view_range = min(max(farthest, _MIN_VIEW_RANGE_M), _MAX_VIEW_RANGE_M)
-    agent = default_agent(pair.dataset, pair.scenario, [frame], [BEV_CAMERA])
-    sample = sample_token(pair.scenario, agent, frame)
-    x, y = point.tolist()
-    view = BevView(
-        view_range=view_range,
-        frame="world",
-        agents=names or "single",
-        seconds=(_PAST_S, pair.dataset.get("sample", sample)["time_to_impact"]),
-        center=(x, y),
-        wide=ratio,
-    )
-    draw_bev(pair.dataset, sample, view, layers - {"points"}, ax)
-    ax.plot(x, y, "x", color="black", markersize=_CROSS_SIZE_PT, markeredgewidth=1.5, zorder=6)
-    draw_scale_bar(view_range, ax, grid="grid" in layers)
-    ax.set(xlabel="", ylabel="")
-    ax.set_title("paths to the impact", fontsize="medium")
 
 
 def _draw_sight(pair: CollidingPair, names: Sequence[str], ax: Axes) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ from deepaccident_devkit.render.styles import (
     text_size,
 )
 from deepaccident_devkit.support.human_names import human_name, metric_name
+from deepaccident_devkit.support.values import ReadOnlyValues
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,7 +84,7 @@ def _group_means(values: Sequence[float], count: int) -> list[Any]:
 
 @in_own_settings
 def render_training(
-    rows: Sequence[Mapping[str, Any]], title: str, *, fig: Figure | None = None
+    rows: Sequence[ReadOnlyValues], title: str, *, fig: Figure | None = None
 ) -> Figure:
     """Render the curves of a training run from the rows of its log.
 
@@ -109,12 +110,12 @@ def render_training(
     return fig
 
 
-def save_training(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+def save_training(rows: Sequence[ReadOnlyValues], title: str, path: Path) -> None:
     """Write `render_training` into a PNG file, as `write_report_figure` does. Raises OSError."""
     write_report_figure(partial(render_training, rows, title), path, dpi=_DPI)
 
 
-def _curves(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[tuple[int, float]]]:
+def _curves(rows: Sequence[ReadOnlyValues]) -> dict[str, list[tuple[int, float]]]:
     """Return the steps and values of each curve by its name.
 
     The total loss comes first, then its parts, then the validation scores. A loss of exactly 0

@@ -15,7 +15,7 @@ import numpy as np
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError
 from deepaccident_devkit.render.accident import PAIR_LAYERS, draw_countdown
-from deepaccident_devkit.render.beside import BesideTwin
+from deepaccident_devkit.render.beside import Beside, beside_models, beside_twin, draw_described
 from deepaccident_devkit.render.bev import BEV_LAYERS, render_bev
 from deepaccident_devkit.render.camera import CAMERA_DEFAULT, CAMERA_LAYERS, draw_camera
 from deepaccident_devkit.render.captions import has_sensor_file
@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
     from typing_extensions import Unpack
 
+    from deepaccident_devkit.evaluation.results import Results
     from deepaccident_devkit.tables.records import FrameRecord
 
 _WEBP_QUALITY = 70
@@ -361,35 +362,43 @@ class VideoScene:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _BesideScene:
-    """How every frame of a video of an accident beside its normal twin is rendered.
+    """How every frame of a video of two sides is rendered.
 
     Attributes:
-        scene: Size and style of the whole picture; its views show both sides.
-        twins: The accident and the twin.
+        scene: Size and style of the whole picture; its views show recordings.
+        beside: The two sides.
     """
 
     scene: VideoScene
-    twins: BesideTwin
+    beside: Beside
 
     def picture(self, number: int) -> ByteArray:
         """Render a frame number of both sides; (height, width, 3) uint8, RGB."""
+        width = self.scene.width
         verdict_height = round(self.scene.height * _VERDICT_SHARE)
         strip_height = round(self.scene.height * _STRIP_SHARE)
         view_height = self.scene.height - verdict_height - strip_height
-        left_width = self.scene.width // 2
-        sides = []
-        for side, width in zip(
-            self.twins.sides, (left_width, self.scene.width - left_width), strict=True
+        verdicts = []
+        pictures = []
+        for side, side_width in zip(
+            self.beside.sides, (width // 2, width - width // 2), strict=True
         ):
-            frame = frame_token(side.scenario, min(number, len(side.gap)))
-            scene = replace(self.scene, width=width, height=view_height)
-            sides.append(scene.picture(frame))
+            verdict = side.verdict(number)
+            scene = replace(self.scene, width=side_width, height=view_height)
+            described = side.described(scene.dataset, number)
+            if described is not None:
+                verdict = f"{side.name}: {described.words.partition(': ')[2]}"
+                view = _View(draw=partial(draw_described, described), is_own=True)
+                scene = replace(scene, views=((view, None),))
+            frame = frame_token(side.scenario, side.frame(number))
+            pictures.append(scene.picture(frame))
+            verdicts.append(verdict)
         with using_style(self.scene.style), own_settings():
-            verdicts = figure_of_pixels(self.scene.width, verdict_height, dpi=self.scene.dpi)
-            self.twins.write_verdicts(verdicts, number)
-            strip = figure_of_pixels(self.scene.width, strip_height, dpi=self.scene.dpi)
-            self.twins.draw_times(strip.add_subplot(), number)
-        return np.vstack([_picture_of(verdicts), np.hstack(sides), _picture_of(strip)])
+            words = figure_of_pixels(width, verdict_height, dpi=self.scene.dpi)
+            self.beside.write_verdicts(words, verdicts)
+            strip = figure_of_pixels(width, strip_height, dpi=self.scene.dpi)
+            self.beside.draw_times(strip.add_subplot(), number)
+        return np.vstack([_picture_of(words), np.hstack(pictures), _picture_of(strip)])
 
 
 def _picture_of(fig: Any) -> ByteArray:
@@ -437,12 +446,10 @@ def views_of(
             views.append(VIEWS[choice("what", item, VIEWS)])
     possible = [layer for layer in LAYERS if any(layer in view.layers for view in views)]
     requested = layers_of(layers, (), possible)
-    if layers is None:
-        return tuple((view, None) for view in views)
-    views_with_layers = []
+    views_with_layers: list[tuple[_View, Layers | None]] = []
     for view in views:
         view_layers = tuple(layer for layer in view.layers if layer in requested)
-        views_with_layers.append((view, view_layers))
+        views_with_layers.append((view, None if layers is None else view_layers))
     return tuple(views_with_layers)
 
 
@@ -452,7 +459,8 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     path: PathType,
     *,
     views: str | OwnView | Iterable[str | OwnView] = "frame",
-    beside: Literal["twin"] | None = None,
+    beside: Literal["twin"] | Mapping[str, Results] | None = None,
+    task: str | None = None,
     agents: Agents = None,
     layers: Iterable[Layer] | None = None,
     frames: Collection[int] | slice | None = None,
@@ -477,8 +485,11 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         views: A view by name, a function (dataset, frame record, figure) that renders one, or
             several side by side. A single camera with only the layer `image` fills the picture.
         beside: `twin` shows an accident and its normal twin side by side, with one clock that
-            starts with the recordings, verdicts and the pair's time to collision. `scenario` is
-            either of the two, and `views` are shown of both: `bev` and cameras fit well.
+            counts down to the impact, verdicts and the pair's time to collision. `scenario` is
+            either of the two, and `views` are shown of both: `bev` and cameras fit well. Results
+            by the name of the model show the model's last prediction from above: one model is
+            beside `views` of the recording, two models are side by side.
+        task: Task that draws the results; None for their own.
         agents: Agents in the views, or None for all present ones. Views of one agent (`sample`,
             `bev`, cameras, …) show the first of them or, with None, the agent with the most files
             of their sensors; from above, they show the boxes and points of all `agents`.
@@ -500,7 +511,7 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
         ChoiceError: No such view, layer, agent, frame or kind of file, or the file cannot have this
             size or rate.
         NotAvailableError: An agent is not in this release, the sample has no label, or the view is
-            `accident` and the scenario has no collision, or there is no twin.
+            `accident` and the scenario has no collision, or there is no twin or no prediction.
         MissingExtraError: The file is an `.mp4`, and the extra `video` is not installed.
         WorkerError: As in `parallel.Engine`.
     """
@@ -513,11 +524,17 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     scene_views = views_of(views, layers)
     record = dataset.get("scenario", scenario)
     last_frame = record["num_frames"]
-    twins = None
-    if beside is not None:
+    sides = None
+    reads = dataset.places
+    if isinstance(beside, Mapping):
+        reads = (*reads, *(results.path for results in beside.values()))
+        names = names_at(dataset, record["first_frame_token"], agents)
+        sides = beside_models(dataset, record, beside, task=task, agents=names)
+    elif beside is not None:
         choice("beside", beside, ("twin",))
-        twins = BesideTwin.of(dataset, record)
-        last_frame = twins.num_frames
+        sides = beside_twin(dataset, record)
+    if sides is not None:
+        last_frame = sides.num_frames
     numbers = _frame_numbers(frames, last_frame)
     recorded_numbers = [min(number, record["num_frames"]) for number in numbers]
     tokens = [frame_token(record["token"], number) for number in recorded_numbers]
@@ -539,14 +556,14 @@ def render_scenario_video(  # noqa: PLR0913 - each is a choice that stands on it
     options: Engine = {"progress": True, **engine, "workers": workers}
     render: Callable[[Any], ByteArray] = scene.picture
     items: Sequence[Any] = tokens
-    if twins is not None:
-        render = _BesideScene(scene=scene, twins=twins).picture
+    if sides is not None:
+        render = _BesideScene(scene=scene, beside=sides).picture
         items = numbers
     unordered = run_unordered(
         render,
         items,
         label="Rendering frames",
-        places=Places(reads=dataset.places),
+        places=Places(reads=reads),
         **options,
     )
     with closing(in_order(unordered)) as pictures:

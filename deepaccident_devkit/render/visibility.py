@@ -51,6 +51,7 @@ from deepaccident_devkit.render.styles import (
 )
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID, UNTRACKED_ID, Frame, short_name
 from deepaccident_devkit.v2x import (
@@ -313,8 +314,8 @@ def render_visibility(
 
 def _draw_boxes(visibility: Visibility, hidden: BoolArray, colors: list[str], ax: Axes) -> None:
     """Draw the boxes of all actors; the boxes of hidden actors are dashed."""
-    hidden_style: dict[str, Any] = {"fill": 0.0, "linestyle": (0, (2, 1)), "linewidths": 2.0}
-    visible_style: dict[str, Any] = {}
+    hidden_style: NamedValues = {"fill": 0.0, "linestyle": (0, (2, 1)), "linewidths": 2.0}
+    visible_style: NamedValues = {}
     for is_drawn, style in ((~hidden, visible_style), (hidden, hidden_style)):
         boxes = visibility.boxes.select(is_drawn)
         box_colors = [colors[row] for row in np.flatnonzero(is_drawn).tolist()]
@@ -534,7 +535,7 @@ def _draw_legend(
     handles = agent_handles(() if current_style().shows_few_panels else visibility.agents)
     if visibility.pair:
         handles.append(Patch(facecolor="none", edgecolor=COLLIDER_COLOR, label="colliding pair"))
-    mark: dict[str, Any] = {"linestyle": "none", "color": MUTED_COLOR}
+    mark: NamedValues = {"linestyle": "none", "color": MUTED_COLOR}
     handles.append(Line2D([], [], marker="*", markersize=8, label="recording agent", **mark))
     if visibility.ego in visibility.agents:
         handles.append(

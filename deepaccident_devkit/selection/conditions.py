@@ -115,7 +115,7 @@ def check_condition(query: Filter, field: Field, release_values: Iterable[FieldV
     release_words = sorted({str(value) for value in release_values if value is not None})
     possible = list(dict.fromkeys(map(str, [*field.known, *release_words])))
     named_field = replace(field, name=query.name)  # messages have the name that the user gave
-    singles: set[FieldValue] = set()
+    singles = set()
     ranges = []
     for item in query.values:
         value = item.item() if isinstance(item, np.generic) else item

@@ -37,7 +37,7 @@ _MOVING_PAIR_DOCS = {
 _SHORT_NAMES = {"type": "scenario_type", "length": "num_frames"}
 # Text columns with few enough values to group results by.
 _GROUPED_COLUMNS = ("scenario_type", "town")
-_KNOWN_VALUES: dict[str, Sequence[str | int]] = {
+_KNOWN_VALUES = {
     "town": taxonomy.TOWNS,
     "weather": taxonomy.WEATHERS,
     "road_type": taxonomy.ROAD_TYPES,

@@ -123,7 +123,7 @@ def _select_with_files(
     dataset: Dataset, tokens: Sequence[str], channels: Sequence[str]
 ) -> list[str]:
     """Return the samples with files of all channels; raise NotAvailableError if none has them."""
-    with_files: list[str] = []
+    with_files = []
     for scenario, scenario_samples in groupby(tokens, lambda token: token.rsplit("/", 2)[0]):
         frames = dataset.sensor_frames(scenario)
         for token in scenario_samples:

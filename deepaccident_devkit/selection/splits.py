@@ -347,9 +347,9 @@ def _group_by_junction(
     scenario_by_token: Mapping[str, ScenarioRecord], twins: Sequence[_Unit]
 ) -> list[list[_Unit]]:
     """Group twins by the accident's meta: three-way; four-way from opposite; all others."""
-    three_way: list[_Unit] = []
-    opposite: list[_Unit] = []
-    others: list[_Unit] = []
+    three_way = []
+    opposite = []
+    others = []
     for twin in twins:
         _, accident_token = twin
         accident = scenario_by_token[accident_token]

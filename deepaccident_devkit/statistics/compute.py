@@ -53,7 +53,7 @@ _ANGLE_EDGES_DEG = tuple(range(-_ANGLE_BIN_DEG // 2, 360, _ANGLE_BIN_DEG))
 # Edges of the bins of times to collision.
 _TTC_EDGES_S = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.5, 10.0)
 # Name of a table of counts → title, field, words that are always listed, what is counted.
-_SCENARIO_TABLES: Mapping[str, tuple[str, str, Sequence[str], str]] = {
+_SCENARIO_TABLES = {
     "scenario_types": ("Scenario types", "scenario_type", (), "scenarios"),
     "towns": ("Towns", "town", taxonomy.TOWNS, "scenarios"),
     "weathers": ("Weather", "weather", taxonomy.WEATHERS, "scenarios"),

@@ -32,7 +32,7 @@ _Z_95 = 1.96
 # Number of the most common words of a count that are listed.
 _MAX_WORDS = 20
 # Fact → phrase for the error message of a scenario that violates it.
-_PROBLEM_PHRASES: Mapping[str, str] = {
+_PROBLEM_PHRASES = {
     "fields": "expected 13 fields",
     "gapless": "missing frames: ",
 }

@@ -50,7 +50,7 @@ _FRAMES_PER_SECOND = 10
 _VELOCITY_FRAMES = 5
 _PEDESTRIAN = CATEGORIES.index("pedestrian")
 # Field of meta → its known words.
-_META_WORDS: Mapping[str, tuple[str, ...]] = {
+_META_WORDS = {
     "weather": WEATHERS,
     "road_type": ROAD_TYPES,
     "spawn_side": SPAWN_SIDES,

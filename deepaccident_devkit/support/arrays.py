@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from deepaccident_devkit.errors import ConfigError, DeepAccidentError, GeometryError
+from deepaccident_devkit.support.values import ReadOnlyValues
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -18,6 +19,8 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 ByteArray = NDArray[np.uint8]
 AnyArray = NDArray[Any]
+NO_INDICES: Final = np.zeros(0, dtype=np.int64)
+"""No rows, cells or ids: the start of a list of arrays to join, which may stay empty."""
 _FLOAT64 = np.dtype(np.float64)
 # Types of a single True or False.
 _BOOL_KINDS = (bool, np.bool_)
@@ -367,7 +370,7 @@ def _suggest_conversion(values: object) -> str:
     )
 
 
-def _restore_arrays(kind: type[FrozenArrays], values: Mapping[str, Any]) -> FrozenArrays:
+def _restore_arrays(kind: type[FrozenArrays], values: ReadOnlyValues) -> FrozenArrays:
     """Make the copy that `FrozenArrays.__reduce__` describes."""
     result = object.__new__(kind)
     for name, value in values.items():

@@ -266,7 +266,7 @@ def plain_names(names: Iterable[str], reserved: Iterable[str] = ()) -> dict[str,
     It consists of letters, digits, `_`, `-` and `.` only.
     """
     used = {name.lower() for name in reserved}
-    new_names: dict[str, str] = {}
+    new_names = {}
     for name in names:
         short_name = re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:_PLAIN_LENGTH]
         if not short_name.strip("."):

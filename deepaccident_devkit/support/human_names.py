@@ -8,7 +8,9 @@ import json
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+from deepaccident_devkit.support.values import NamedValues
 
 NameKind = Literal[
     "metrics",
@@ -30,12 +32,12 @@ _UNIT_NAMES = {"share": "", "1 - overlap": "1 − overlap", "1/min": "per minute
 
 
 @cache
-def name_tables() -> dict[str, dict[str, Any]]:
+def name_tables() -> dict[str, NamedValues]:
     """Return the content of human_names.json: kind → identifier → name.
 
     A metric has a list of its name and its meaning.
     """
-    tables: dict[str, dict[str, Any]] = json.loads(Path(__file__).with_suffix(".json").read_bytes())
+    tables: dict[str, NamedValues] = json.loads(Path(__file__).with_suffix(".json").read_bytes())
     return tables
 
 

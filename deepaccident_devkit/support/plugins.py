@@ -212,7 +212,7 @@ def need_plugin(name: str, purpose: str) -> None:
 
 def _load_plugins(loaders: Iterable[tuple[str, Callable[[], Any]]]) -> Installed:
     """Load plug-ins with their loaders, and record why others cannot be loaded."""
-    plugins: list[Plugin] = []
+    plugins = []
     refused: dict[str, str] = {}
     for name, load_plugin in loaders:
         try:

@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, TypeAlias, TypeVar
 
 from deepaccident_devkit.errors import ChoiceError, ConfigError, DeepAccidentError, shortened
+from deepaccident_devkit.support.values import ReadOnlyValues
 
 AnyText = TypeVar("AnyText", bound=str | None)
 PathType: TypeAlias = str | os.PathLike[str]
@@ -237,7 +238,7 @@ def match_spelling(value: Any, words: Iterable[str]) -> Any:
     return value
 
 
-def differing_text(actual: Mapping[str, Any], expected: Mapping[str, Any]) -> str:
+def differing_text(actual: ReadOnlyValues, expected: ReadOnlyValues) -> str:
     """Return which values differ, such as `training/steps: 2, asked for 3; …`; empty if none do."""
     expected_json = json.loads(json.dumps(expected))  # tuples are lists in a file
     actual_values = dict(_walk_leaves(actual))
@@ -257,7 +258,7 @@ def differing_text(actual: Mapping[str, Any], expected: Mapping[str, Any]) -> st
     return "; ".join(differences)
 
 
-def _walk_leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _walk_leaves(values: ReadOnlyValues, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the path and the value of each leaf of nested mappings."""
     for name, value in values.items():
         if isinstance(value, dict) and value:

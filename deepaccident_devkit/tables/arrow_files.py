@@ -18,6 +18,7 @@ from deepaccident_devkit.errors import IndexStoreError, shortened
 from deepaccident_devkit.support.arrays import AnyArray, BitView
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.reading import mapped_file
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.columns import (
     NULL_INTEGER,
     Choice,
@@ -208,7 +209,7 @@ def _decode_metadata(schema: Any) -> dict[str, str]:
     return {name.decode(): value.decode() for name, value in metadata.items()}
 
 
-def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[dict[str, Any]] | None:
+def read_streams(source: Any, specs: Sequence[TableSpec]) -> list[NamedValues] | None:
     """Read each table's stored column → values, as `streams` wrote them; None for other tables."""
     import pyarrow as pa
 
@@ -285,7 +286,7 @@ def record_batch(spec: TableSpec, columns: ColumnArrays) -> Any:
     return pa.RecordBatch.from_arrays(arrays, schema=arrow_schema(spec))
 
 
-def views(spec: TableSpec, batch: Any) -> dict[str, Any]:
+def views(spec: TableSpec, batch: Any) -> NamedValues:
     """Return stored column name → a view of the batch's memory.
 
     Views are numpy arrays, `BitView`s, or Arrow arrays for words.

@@ -15,6 +15,7 @@ from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.release import Labels
 from deepaccident_devkit.release.labels import turned_vectors
 from deepaccident_devkit.support.arrays import (
+    NO_INDICES,
     AnyArray,
     BoolArray,
     FloatArray,
@@ -230,7 +231,7 @@ def visible_ids(masks: Sequence[ArrayLike], actor_ids: Sequence[ArrayLike]) -> I
         masks: `visible_mask` of each agent.
         actor_ids: Label ids (N,) of each agent's boxes.
     """
-    visible = [np.zeros(0, dtype=np.int64)]
+    visible = [NO_INDICES]
     for mask, ids in zip(masks, actor_ids, strict=True):
         visible.append(np.asarray(ids)[np.asarray(mask, dtype=bool)])
     union = np.unique(np.concatenate(visible).astype(np.int64))

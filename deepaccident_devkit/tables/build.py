@@ -395,7 +395,7 @@ def _make_calibrated_sensor_rows(
         Rows of table `calibrated_sensor`, and the row of each file, shape (samples, channels).
     """
     row_of_file = np.zeros(values.shape[:2], dtype=np.int64)
-    distinct_setups: list[FloatArray] = []
+    distinct_setups = []
     keys: list[tuple[int, int, int]] = []
     for agent in range(agents):
         samples = slice(agent * frames, (agent + 1) * frames)

@@ -23,7 +23,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 from deepaccident_devkit.errors import (
     BrokenReleaseError,
@@ -52,6 +52,7 @@ from deepaccident_devkit.support.reading import (
     read_bytes,
 )
 from deepaccident_devkit.support.text import choice, counted
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.tables.arrow_files import table_path
 from deepaccident_devkit.tables.records import SCHEMA_VERSION, table_specs
 from deepaccident_devkit.tables.scan import content_hashes, folder_digest
@@ -449,7 +450,7 @@ def _find_unnamed(folder: Path, tables: str = "") -> list[str]:
     return unnamed
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
+def _read_manifest(folder: Path) -> NamedValues:
     """Read the JSON object of a folder's manifest; empty without a manifest."""
     try:
         # `json.loads` keeps lone surrogates, which file names may contain.
@@ -459,7 +460,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _hash_manifest(content: Mapping[str, Any]) -> str:
+def _hash_manifest(content: ReadOnlyValues) -> str:
     """Return the checksum of a manifest's content, leaving out the checksum field."""
     text = json.dumps(content, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

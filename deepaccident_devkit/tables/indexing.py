@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from deepaccident_devkit.release import ReleaseLayout, ScenarioFolder, read_meta
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.parallel import Store
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.tables.arrow_files import (
     HASHES,
     ColumnArrays,
@@ -250,7 +251,7 @@ def _list_stored_specs() -> list[TableSpec]:
     return specs
 
 
-def _read_rows(path: Path) -> dict[str, dict[str, Any]]:
+def _read_rows(path: Path) -> dict[str, NamedValues]:
     """Read table → stored column → values from a file that `rows_to_keep` encoded."""
     import pyarrow as pa
 
@@ -271,8 +272,8 @@ def _read_rows(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _shift_keys(
-    spec: TableSpec, rows: Mapping[str, Any], first_rows: Mapping[str, int]
-) -> dict[str, Any]:
+    spec: TableSpec, rows: ReadOnlyValues, first_rows: Mapping[str, int]
+) -> NamedValues:
     """Shift the keys of rows so that they count from the start of the joined tables.
 
     Nulls, and the keys of shared tables, stay as they are.

@@ -110,7 +110,7 @@ def scan_scenario(scenario: ScenarioFolder) -> ScenarioScan:
         problems.append(
             _make_error_finding(scenario.token, "odd-name", scenario.meta_path, message, remedy)
         )
-    frames: dict[tuple[AgentName, str], list[int]] = {}
+    frames = {}
     for agent in AGENTS:
         for kind, ending in SMALL_FILE_ENDINGS.items():
             frames[agent, kind] = _list_frames(scenario, agent, kind, ending, problems)

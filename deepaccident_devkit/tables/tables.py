@@ -34,6 +34,7 @@ from deepaccident_devkit.support.text import (
     members_of,
     path_of,
 )
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.tables.arrow_files import (
     DAMAGED_INDEX_REMEDY,
     HASHES,
@@ -61,7 +62,7 @@ _Record = TypeVar("_Record")
 _Getter = Callable[[int], Any]
 # Largest difference between a time and a frame, in frames.
 _FRAME_TOLERANCE = 1e-6
-RowArgument = str | Mapping[str, Any]
+RowArgument = str | ReadOnlyValues
 """A row as callers name it: by its token, or by its record."""
 
 
@@ -201,7 +202,7 @@ class OpenTables:
     @with_keywords_named
     def get(self, table: str, token: RowArgument) -> dict[str, Any]:
         """Return a record as a new dict; raise TableError or TokenError if the name is unknown."""
-        record: dict[str, Any] = self._tables.table(table).get(token_of(token))
+        record: NamedValues = self._tables.table(table).get(token_of(token))
         return record
 
     @with_keywords_named
@@ -601,7 +602,7 @@ def rows_of_scenarios(
     return [tables.getind("scenario", scenario) for scenario in members]
 
 
-def _reopen(kind: type[OpenTables], arguments: dict[str, Any]) -> OpenTables:
+def _reopen(kind: type[OpenTables], arguments: NamedValues) -> OpenTables:
     """Make the copy that `OpenTables.__reduce__` describes, without looking for changes on disk.
 
     A worker receives a dataset with each item. It opens the files only once, because opening them

@@ -13,6 +13,7 @@ import numpy as np
 
 from deepaccident_devkit.errors import TokenError
 from deepaccident_devkit.support.text import counted, meant_text
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.tables.arrow_files import damaged_value
 from deepaccident_devkit.taxonomy import ACTOR, AGENTS, CATEGORIES, CHANNEL_FORMAT, CHANNELS
 
@@ -31,7 +32,7 @@ FORMS = {
     "category": "<name>",
 }
 """Table → the form of its tokens; `<scenario>` stands for `<scenario_type>/<name>`."""
-ColumnViews = Mapping[str, Mapping[str, Any]]
+ColumnViews = Mapping[str, ReadOnlyValues]
 """Table → stored column → view of it."""
 _NUM_WORDS = {
     table: form.replace("<scenario>", "<scenario_type>/<name>").count("/") + 1

@@ -21,6 +21,7 @@ from deepaccident_devkit.support.arrays import (
     checked_whole,
 )
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR, AgentName, OnError
 from deepaccident_devkit.v2x.agents import Agents, cooperating_agents
@@ -425,7 +426,7 @@ def traffic_note(
     link: Link | None,
     payload: Payload | int,
     **more: Any,
-) -> dict[str, Any]:
+) -> NamedValues:
     """Return the results' metadata about the bytes that partners send.
 
     Args:

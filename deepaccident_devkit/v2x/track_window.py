@@ -26,6 +26,7 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.support.files import replacing
 from deepaccident_devkit.support.text import PathType, counted, path_of
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD
 
 # Kind of an array's type → its value where a padded batch has no actor; 0 for all others.
@@ -209,7 +210,7 @@ def argoverse_table(window: TrackWindow, focal: int | str | None = None) -> Any:
     track_ids = window.actor_id.astype(str)
     scenario_name = window.sample.split("/")[1]
     start, end = (window.index[[0, -1]] - 1) * _FRAME_PERIOD_NS
-    columns: dict[str, Any] = {
+    columns: NamedValues = {
         "observed": steps <= window.present,
         "track_id": track_ids[actors],
         "object_type": np.array(object_types)[window.category[actors]],

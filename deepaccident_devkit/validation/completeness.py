@@ -234,7 +234,7 @@ def files_of(scenario: ScenarioFolder) -> tuple[FileCount, ...]:
 
     The result is empty if neither calib nor label files show which frames exist.
     """
-    sizes_by_kind: dict[tuple[str, str], Mapping[int, int]] = {}
+    sizes_by_kind = {}
     num_frames = 0
     for agent in AGENTS:
         for kind, ending in {**SMALL_FILE_ENDINGS, **CHANNEL_FORMAT}.items():
@@ -289,7 +289,7 @@ def completeness(
     is_mini = layout.version == "v1-mini"
     counts_by_split: dict[str, dict[str, list[FileCount]]] = {}
     all_counts: list[FileCount] = []
-    lacking: dict[str, dict[str, int]] = {}
+    lacking = {}
     for token, scenario_counts in counts_by_token:
         if not scenario_counts:
             continue

@@ -106,7 +106,7 @@ _TEXT_FORMAT = "text/plain"
 _BINARY_FORMAT = "application/octet-stream"
 _LABEL_PATTERN = "type*/*/label/*/*.txt"
 # Kind of file → its path in a split's folder or in the dataroot, its format, its content.
-_FILE_SETS: Mapping[str, tuple[str, str, str]] = {
+_FILE_SETS = {
     "label": (
         _LABEL_PATTERN,
         _TEXT_FORMAT,

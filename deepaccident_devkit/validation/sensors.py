@@ -226,8 +226,8 @@ def _check_images(
     """
     import cv2
 
-    thumbnails: dict[int, FloatArray] = {}
-    sizes: dict[int, tuple[int, int]] = {}
+    thumbnails = {}
+    sizes = {}
     for frame, path in paths.items():
         try:
             content = read_image_bytes(path)

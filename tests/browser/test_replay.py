@@ -534,7 +534,7 @@ def test_the_player_bar_covers_no_control_with_the_focus(
 
 def test_the_latest_verdict_is_shown(browser: Browser, judged_page: Path) -> None:
     browser.open(judged_page, 1280)
-    verdict_of_20 = "TPego at frame 20: an accident comes in 1.5 s"
+    verdict_of_20 = "alarmego at frame 20: accident: "
     for frame, words in (
         (0, "No prediction yet (first at frame 20)."),
         (28, verdict_of_20),
@@ -546,8 +546,45 @@ def test_the_latest_verdict_is_shown(browser: Browser, judged_page: Path) -> Non
     browser.script("document.querySelectorAll('#samples button')[1].click()")
     assert (browser.frame(), browser.complaints()) == (29, [])
     assert not missing_parts(
-        read_text(browser, "foreseen"), "FP + FNego at frame 30", "position error 40.0 m"
+        read_text(browser, "foreseen"), "alarmego at frame 30", "position error 40.0 m"
     )
+
+    click(browser, "hold")
+    scrub(browser, 20)
+    assert "frame 30" in read_text(browser, "foreseen")
+    click(browser, "hold")
+    assert "frame 20" in read_text(browser, "foreseen")
+
+
+def test_a_prediction_lies_on_the_ground_in_the_agents_own_picture(
+    browser: Browser, da: DeepAccident, tmp_path: Path
+) -> None:
+    """The rings around the predicted positions are within a pixel of where the camera has these.
+
+    The page fits a plane to the ground, and in a picture the middle of a ring is not its centre.
+    """
+    token = f"{accident_scenario(da)}/ego_vehicle/003"
+    alarm = Accident(positions=np.array([[8.0, 1.0], [12.0, -2.0]]), time=0.3)
+    agents = ["ego_vehicle", "other_vehicle"]
+    path = da.render_replay(None, tmp_path / "a.html", prediction={token: [alarm]}, agents=agents)
+    browser.open(path, 1280)
+    scrub(browser, 2)
+    choose(browser, "figure[data-agent=ego_vehicle] select", "front")
+    camera_from_world = da.world_from(token, "Camera_Front").inverse()
+    camera_from_ego = camera_from_world @ da.world_from(token, "ego")
+    points = np.column_stack([alarm.positions, np.zeros(2)])
+    pixels, _ = da.camera(token, "Camera_Front").project(camera_from_ego.apply(points))
+
+    parts = "[...document.querySelectorAll('figure[data-agent={}] .boxes > path')]"
+    rings = browser.value(f"{parts.format(agents[0])}.map((path) => path.getAttribute('d'))")
+
+    centers = []
+    for ring in rings:
+        corners = np.array(re.findall(r"-?[\d.]+", ring), dtype=float).reshape(-1, 2)
+        centers.append((corners.min(axis=0) + corners.max(axis=0)) / 2)
+    distances = np.linalg.norm(pixels[:, None] - np.array(centers), axis=-1)
+    assert distances.min(axis=1).max() < 1.0
+    assert browser.value(f"{parts.format(agents[1])}.length") == 0
 
 
 CUT_OPTIONS_SCRIPT = """
@@ -653,3 +690,23 @@ def test_a_saved_picture_has_twice_the_size_of_the_screen(
         saved_map = Image.fromarray(saved_pixels[84 : 84 + 2 * height, 24 : 24 + 2 * width])
         shrunk = np.asarray(saved_map.resize(drawn_map.size, Image.Resampling.BOX), dtype=float)
         assert np.abs(shrunk - np.asarray(drawn_map, dtype=float)).mean() < 6
+
+
+FAILING_SCRIPT = """
+const draw = CanvasRenderingContext2D.prototype.drawImage;
+CanvasRenderingContext2D.prototype.drawImage = function (...words) {
+  if (!this.canvas.isConnected) throw new Error('no picture');
+  draw.apply(this, words);
+};
+"""
+
+
+def test_the_page_stays_as_it_is_if_a_picture_cannot_be_saved(
+    browser: Browser, judged_page: Path
+) -> None:
+    browser.open(judged_page, 1280)
+    browser.script(FAILING_SCRIPT)
+    browser.press("s")
+    wait_for(lambda: "no picture" in "".join(browser.complaints()))
+    ground = "document.getElementById('ground')"
+    assert browser.value(f"{ground}.width / {ground}.clientWidth") == 1

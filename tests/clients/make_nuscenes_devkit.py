@@ -1,7 +1,8 @@
 """Make the input of `nuscenes_devkit.py`: `python -m tests.clients.make_nuscenes_devkit FOLDER`.
 
 FOLDER gets a small release, its export, `expected.json`: our boxes in every sensor's frame at
-keyframes, and in the world at all frames, and `windows.json`: our windows of tracks at keyframes.
+keyframes, and in the world at all frames, `windows.json`: our windows of tracks at keyframes, and
+`plans.json`: a plan of the ego from each last frame, in the world and drawn in cameras.
 """
 
 import json
@@ -10,16 +11,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.collections import LineCollection
 
 from deepaccident_devkit import DeepAccident
+from deepaccident_devkit.evaluation import Plan
 from deepaccident_devkit.export.bulk import export_release
 from deepaccident_devkit.export.frames import keyframes
 from deepaccident_devkit.export.nuscenes import NuScenes
 from deepaccident_devkit.export.nuscenes.scenes import CHANNEL_NAMES
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
+from deepaccident_devkit.render import detached_figure
+from deepaccident_devkit.render.outcomes import render_outcome_in_cameras
 from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
 
 AGENTS = ("ego_vehicle", "infrastructure")
+# Cameras in the order of their panels.
+PANELS = (
+    "Camera_FrontLeft",
+    "Camera_Front",
+    "Camera_FrontRight",
+    "Camera_BackLeft",
+    "Camera_Back",
+    "Camera_BackRight",
+)
+# A plan around an agent, x forward and y left, metres.
+PATH = np.array([[12, 0], [9, 8], [0, 12], [-9, 8], [-12, 0], [-9, -8], [0, -12], [9, -8]])
 
 
 def main(folder: Path) -> None:
@@ -30,12 +46,16 @@ def main(folder: Path) -> None:
     export_release(dataset, folder / "export", NuScenes(agents=AGENTS))
     boxes = {}
     windows = {}
+    plans = {}
     for record in dataset.sample:
         if record["agent"] in AGENTS:
             boxes[record["token"]] = list_boxes(dataset, record["token"])
             windows[record["token"]] = list_states(dataset, record["token"])
+            if record["agent"] == "ego_vehicle" and not record["next"]:
+                plans[record["token"]] = draw_plan(dataset, record["token"])
     (folder / "expected.json").write_text(json.dumps(boxes))
     (folder / "windows.json").write_text(json.dumps(windows))
+    (folder / "plans.json").write_text(json.dumps(plans))
 
 
 def list_boxes(dataset: DeepAccident, sample: str) -> dict[str, Any]:
@@ -80,6 +100,25 @@ def list_states(dataset: DeepAccident, sample: str) -> dict[str, Any]:
             ]
             states_by_actor[actor] = np.column_stack(columns).tolist()
     return states_by_actor
+
+
+def draw_plan(dataset: DeepAccident, sample: str) -> dict[str, Any]:
+    """Return `PATH` in the world, and by camera the positions of drawn lines, as shares of the
+    image's width.
+    """
+    plan = Plan(times=0.5 * np.arange(1, 1 + len(PATH)), path=PATH)
+    figure = render_outcome_in_cameras(dataset, sample, [plan], fig=detached_figure((10, 6)))
+    positions = {}
+    for name, ax in zip(PANELS, figure.axes, strict=False):
+        lines = [np.zeros((0, 2))]
+        for collection in ax.collections:
+            if isinstance(collection, LineCollection):
+                lines += collection.get_segments()
+        width = dataset.camera(sample, name).width
+        positions[CHANNEL_NAMES[name]] = (np.concatenate(lines) / width).tolist()
+    points = np.column_stack([PATH, np.zeros(len(PATH))])
+    in_world = dataset.world_from(sample, "ego").apply(points)
+    return {"points": in_world.tolist(), "drawn": positions}
 
 
 if __name__ == "__main__":

@@ -25,10 +25,11 @@ from nuscenes.eval.tracking.evaluate import TrackingEval
 from nuscenes.eval.tracking.utils import category_to_tracking_name
 from nuscenes.prediction import PredictHelper
 from nuscenes.utils.data_classes import LidarPointCloud
-from nuscenes.utils.geometry_utils import BoxVisibility, points_in_box
+from nuscenes.utils.geometry_utils import BoxVisibility, points_in_box, view_points
 from pyquaternion import Quaternion
 
 VERSION, SPLIT = "v1.0-deepaccident", "deepaccident_train"
+FULL_WIDTH_PX = 1600
 META = {
     name: name == "use_lidar"
     for name in ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
@@ -52,12 +53,14 @@ def run_checks(folder: Path) -> str:
     sweep_error_m = check_sweeps(nusc, expected)
     check_points(nusc)
     check_rendering(nusc, folder)
+    num_pixels = check_plans(nusc, json.loads((folder / "plans.json").read_text()))
     num_states = check_windows(nusc, json.loads((folder / "windows.json").read_text()))
     detected_classes = check_detection(nusc, folder)
     tracked_classes = check_tracking(nusc, folder)
     return (
         f"nuscenes-devkit: {num_boxes} boxes in sensor frames within 1e-3 m, at sweeps "
-        f"within {sweep_error_m:.2f} m, rendered; {num_states} states of windows; "
+        f"within {sweep_error_m:.2f} m, rendered; "
+        f"{num_pixels} points of plans within half a pixel; {num_states} states of windows; "
         f"AP 1.0 of {detected_classes}, MOTA 1.0 of {tracked_classes}; "
         f"{memory_per_sample / 1000:.0f} kB of memory a sample: good"
     )
@@ -169,6 +172,40 @@ def check_rendering(nusc: NuScenes, folder: Path) -> None:
     nusc.render_annotation(visible_boxes[0].token, out_path=str(picture))
 
     assert picture.stat().st_size > 1000
+
+
+def check_plans(nusc: NuScenes, plans: dict) -> int:
+    """Check that plans are drawn in each camera where `view_points` has their points, within half
+    a pixel of a full image; return the number of these points.
+    """
+    num_points = 0
+    for scene in nusc.scene:
+        sample = nusc.get("sample", scene["last_sample_token"])
+        plan = plans.pop(sample["deepaccident_token"], {"drawn": {}})
+        for channel, drawn in plan["drawn"].items():
+            data = nusc.get("sample_data", sample["data"][channel])
+            ego_pose = nusc.get("ego_pose", data["ego_pose_token"])
+            sensor = nusc.get("calibrated_sensor", data["calibrated_sensor_token"])
+            points = np.array(plan["points"])
+            for pose in (ego_pose, sensor):
+                rotation = Quaternion(pose["rotation"]).rotation_matrix
+                points = (points - pose["translation"]) @ rotation
+            points = points[points[:, 2] > 1.0]
+            theirs = view_points(points.T, np.array(sensor["camera_intrinsic"]), normalize=True)
+            pixels = theirs[:2].T
+            is_inside = ((pixels > 0) & (pixels < [data["width"], data["height"]])).all(axis=1)
+            shares = pixels[is_inside] / data["width"]
+            distances = np.linalg.norm(shares[:, None] - np.array(drawn), axis=-1)
+            nearest = FULL_WIDTH_PX * distances.min(axis=1)
+
+            assert nearest.max(initial=0.0) < 0.5, (channel, nearest)
+
+            num_points += len(nearest)
+
+    assert not plans
+    assert num_points > 10
+
+    return num_points
 
 
 def check_windows(nusc: NuScenes, windows: dict) -> int:

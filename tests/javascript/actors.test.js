@@ -4,13 +4,13 @@ import {
   actorOf,
   agentByNumber,
   isSeen,
-  joinedAlarms,
+  joinedPlaces,
   lastBefore,
+  linesAt,
   nextActor,
   samplesByFrame,
   seenByText,
   speedText,
-  verdictColor,
 } from "../../deepaccident_devkit/support/templates/replay/actors.js";
 import { actor, state } from "./scene.js";
 
@@ -59,12 +59,6 @@ test("the next actor is the next one that is annotated, round and round", () => 
   assert.equal(nextActor([actor(1, null)], 0, null, 1), undefined);
 });
 
-test("verdicts have colours", () => {
-  const colors = { right: "R", missed: "M", grid: "G", false: "F" };
-  const verdicts = ["TP", "TN", "FN", "not judged", "FP", "FP + FN"];
-  assert.deepEqual(verdicts.map((verdict) => verdictColor(verdict, colors)), ["R", "R", "M", "G", "F", "F"]);
-});
-
 test("between evaluated frames the last one before counts", () => {
   assert.deepEqual([9, 10, 15, 20, 30].map((frame) => lastBefore([10, 20], frame)), [null, 10, 10, 20, 20]);
   assert.equal(lastBefore([], 3), null);
@@ -75,27 +69,23 @@ test("samples are grouped by frame", () => {
   assert.deepEqual([...samplesByFrame(samples)], [[3, samples.slice(0, 2)], [5, [samples[2]]]]);
 });
 
-function alarm(actors, time, x) {
-  return { actors, time, right: true, text: "", places: [[x, 0], [x + 200, 0]] };
+function place(note, x, y = 0) {
+  return { note, label: "predicted collision", color: "#000000", points: [[x, y], [x + 200, y]] };
 }
 
-test("agents that foresee the same have one alarm", () => {
+test("agents that mark the same place with the same words have one note", () => {
   const samples = [
-    { agent: 0, alarms: [alarm([1, 2], 1.5, 0)] },
-    { agent: 1, alarms: [alarm([1, 2], 1.5, 10), alarm([1, 3], 1.5, 0)] },
-    { agent: 2, alarms: [alarm([1, 2], 1.5, 1000), alarm([], 1.5, 0)] },
+    { agent: 0, places: [place("in 1.5 s", 0)] },
+    { agent: 1, places: [place("in 1.5 s", 10), place("in 2.0 s", 0)] },
+    { agent: 2, places: [place("in 1.5 s", 1000), place("in 1.5 s", 0, 1000)] },
   ];
-  const joined = joinedAlarms(samples, AGENTS, [1, 2]).map(({ by, names }) => [by.join(" "), names]);
-  assert.deepEqual(joined, [["E O I", ""], ["O", ": 1, 3"], ["I", ""]]);
+  const joined = joinedPlaces(samples, AGENTS).map(({ by, note }) => [by.join(" "), note]);
+  assert.deepEqual(joined, [["E O", "in 1.5 s"], ["O", "in 2.0 s"], ["I", "in 1.5 s"], ["I", "in 1.5 s"]]);
 });
 
-test("alarms at other places are not joined", () => {
-  const north = alarm([1, 2], 1.5, 0);
-  north.places = north.places.map(([x]) => [x, 1000]);
-  const samples = [{ agent: 0, alarms: [alarm([1, 2], 1.5, 0)] }, { agent: 1, alarms: [north] }];
-  assert.equal(joinedAlarms(samples, AGENTS, [1, 2]).length, 2);
-});
-
-test("without samples there is no alarm", () => {
-  assert.deepEqual(joinedAlarms([], AGENTS, []), []);
+test("a shape is plain while it is predicted, faint before, and gone afterwards", () => {
+  const lines = [{ filled: true, frames: [5, 9] }, { opacity: 1 }];
+  const looks = [4, 5, 9, 10].map((frame) => linesAt([{ lines }], frame).map((line) => Boolean(line.filled)));
+  assert.deepEqual(looks, [[false, false], [true, false], [true, false], [false]]);
+  assert.ok(linesAt([{ lines }], 4)[0].opacity < 0.5);
 });

@@ -89,4 +89,5 @@ test("the lines of the grid are at least 24 pixels apart", () => {
 
 test("the middle of two places", () => {
   assert.deepEqual(middleOf([[0, 10], [4, -20]]), [2, -5]);
+  assert.deepEqual(middleOf([[3, 4]]), [3, 4]);
 });

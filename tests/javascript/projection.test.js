@@ -1,6 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import {
+  areaInPicture,
   cameraAxes,
   cornersInCamera,
   edgesInPicture,
@@ -76,4 +77,10 @@ test("the frustum of a camera ends at the corners of its picture", () => {
 
 test("a path has one decimal", () => {
   assert.equal(pathOf([[1, 2.04], [-3.06, 4]]), "M1.0 2.0L-3.1 4.0");
+});
+
+test("an area is cut off 10 cm ahead of the camera, and is empty behind it", () => {
+  const triangle = [[0, 0, 1010], [0, 0, -990], [100, 0, 1010]];
+  assertClose(areaInPicture(camera, triangle).flat(), [100, 50, 100, 50, 600, 50, 100 + 10000 / 1010, 50]);
+  assert.deepEqual(areaInPicture(camera, triangle.map(([x, y, z]) => [x, y, z - 1010])), []);
 });

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from deepaccident_devkit.render import detached_figure
@@ -69,6 +69,12 @@ def read_words(ax: Axes) -> str:
 def first_image(ax: Axes) -> Any:
     """Return the array of the first image on the axes."""
     return np.asarray(ax.images[0].get_array())
+
+
+def ground_colors(image: Any) -> set[str]:
+    """Return the colours of the cells of a picture of the ground."""
+    numbers = np.unique(image.get_array())
+    return {to_hex(color) for color in image.to_rgba(numbers)}
 
 
 def collections_of_kind(ax: Axes, kind: type) -> list[Any]:

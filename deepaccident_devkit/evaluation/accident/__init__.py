@@ -1,7 +1,7 @@
 """Accuracy of predicted accidents under three protocols: the task `accident`."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
@@ -15,8 +15,9 @@ from deepaccident_devkit.evaluation.accident.scoring import (
     AccidentsWithin,
     ComparedAccidents,
     average_precision,
+    outcome_words,
 )
-from deepaccident_devkit.evaluation.alarms import drawing_of_alarms, foreseen_accident
+from deepaccident_devkit.evaluation.alarms import MIN_SCORE, drawing_of_alarms, foreseen_accident
 from deepaccident_devkit.evaluation.drawing import Drawing
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.evaluation.instances import prediction_accuracy
@@ -31,6 +32,7 @@ from deepaccident_devkit.evaluation.truth import (
     compared_facts,
 )
 from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.support.values import NamedValues
 
 __all__ = [
     "DISTANCES",
@@ -121,11 +123,15 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         counts = self.protocol.counts(prediction, label, context or AccidentContext())
         self.add(token, dict(counts))
 
-    def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
-        """Describe the accidents that the protocol compares."""
+    def drawing(self, dataset: Dataset, token: str, prediction: Any, /, *truth: Any) -> Drawing:
+        """Describe the accidents that the protocol compares, and the outcome of the sample."""
         label, context = truth
         compared = compared_accidents(prediction, label, context, self.protocol)
-        return drawing_of_alarms(compared.true, compared.predicted)
+        drawing = drawing_of_alarms(
+            dataset, token, compared.true, compared.predicted, context.truth, MIN_SCORE
+        )
+        outcome = self.result_of([self.protocol.counts(prediction, label, context)])
+        return replace(drawing, words=f"{outcome_words(outcome)}; {drawing.words}")
 
     def result_of(self, counts: Collection[Counts]) -> AccidentResult:
         """Compute the metrics from the counts of samples, in any order."""
@@ -137,7 +143,7 @@ class AccidentEvaluator(Evaluator[AccidentResult]):
         `truth` is the kind of pair that the truth names, one of `NAMED`.
         """
         result = self.compute([token])
-        row: dict[str, Any] = {"positive": bool(result.positives), "truth": None}
+        row: NamedValues = {"positive": bool(result.positives), "truth": None}
         for pair_kind, count in result.truths.items():
             if count:
                 row["truth"] = pair_kind

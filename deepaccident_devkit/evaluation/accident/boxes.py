@@ -8,7 +8,6 @@ is not judged.
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 
@@ -48,6 +47,7 @@ from deepaccident_devkit.evaluation.truth import (
     not_counted_notes,
 )
 from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.support.values import NamedValues
 
 # Keys of a sample's counts that say why the sample does not count at all.
 _SKIP_REASONS = ("at_impact", "unplaced")
@@ -209,7 +209,7 @@ class BoxAccidents:
         return [_sum_counts(counts)]
 
 
-def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
+def _sum_counts(counts: Collection[Counts]) -> NamedValues:
     """Sum the counts of samples, or sums that `pooled` returned.
 
     Returns:
@@ -222,7 +222,7 @@ def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
         # earlier versions rejected unplaced samples, so their runs lack this number
         complete = {"unplaced": 0, **sample}
         terms.append(complete if "tally" in complete else _sample_terms(complete))
-    sums: dict[str, Any] = {
+    sums: NamedValues = {
         "tally": add_tallies(term["tally"] for term in terms),
         "alarms": [alarm for term in terms for alarm in term["alarms"]],
         "lateness": exact_parts(term["lateness"] for term in terms),
@@ -237,9 +237,9 @@ def is_skipped(sample: Counts) -> bool:
     return any(sample.get(name) for name in _SKIP_REASONS)
 
 
-def _sample_terms(sample: Counts) -> dict[str, Any]:
+def _sample_terms(sample: Counts) -> NamedValues:
     """Return what one sample adds to the sums of `_sum_counts`."""
-    terms: dict[str, Any] = dict.fromkeys(("false_samples", *_UNCOUNTED), 0)
+    terms: NamedValues = dict.fromkeys(("false_samples", *_UNCOUNTED), 0)
     if is_skipped(sample):
         for name in _SKIP_REASONS:
             terms[name] = int(sample[name])
@@ -266,7 +266,7 @@ def _checked_truth(context: AccidentContext) -> BoxTruth:
     return context.truth
 
 
-def _alarm(accident: Accident, ids: Pair, truth: BoxTruth) -> dict[str, Any]:
+def _alarm(accident: Accident, ids: Pair, truth: BoxTruth) -> NamedValues:
     """Build an alarm, with its differences from the true accident if there is one."""
     true_accident = truth.accident
     if true_accident is None:

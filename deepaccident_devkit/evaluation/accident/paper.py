@@ -3,9 +3,9 @@
 Where the paper is silent, the rules in docs/protocols.md apply.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 from deepaccident_devkit.errors import EvaluationError
 from deepaccident_devkit.evaluation.accident.scoring import (
@@ -49,12 +49,13 @@ from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.motion import MotionHeads, MotionLabels
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.text import counted, settle_choices
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 SampleChoice = Literal["best", "mean_first"]
 _NO_LABEL = "label: the accident protocol 'paper' needs the sample's motion labels"
 # Kinds of predictions other than heads: key in the counts → words in the notes.
-_FORMS: Mapping[str, str] = {
+_FORMS = {
     "instance_maps": "instance maps",
     "explicit": "explicit accidents",
 }
@@ -209,12 +210,12 @@ class PaperAccidents:
         return instances_of_heads(label_heads)
 
 
-def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
+def _sum_counts(counts: Collection[Counts]) -> NamedValues:
     """Sum the tallies of each sample choice, and count the predictions of each kind."""
     terms = []
     for sample in counts:
         terms.append(sample["tallies"] if "tallies" in sample else _sample_terms(sample))
-    sums: dict[str, Any] = {}
+    sums: NamedValues = {}
     for sample_choice in _SAMPLE_CHOICES:
         sums[sample_choice] = add_tallies(term[sample_choice] for term in terms)
     for form in _FORMS:
@@ -222,9 +223,9 @@ def _sum_counts(counts: Collection[Counts]) -> dict[str, Any]:
     return sums
 
 
-def _sample_terms(sample: Counts) -> dict[str, Any]:
+def _sample_terms(sample: Counts) -> NamedValues:
     """Return what one sample adds to the sums of `_sum_counts`."""
-    terms: dict[str, Any] = {}
+    terms: NamedValues = {}
     for sample_choice in _SAMPLE_CHOICES:
         alarm = sample[sample_choice]
         terms[sample_choice] = alarms_tally(sample, [alarm] if alarm else [])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -53,6 +53,7 @@ from deepaccident_devkit.motion import MotionHeads, MotionLabels, predict_instan
 from deepaccident_devkit.motion.reference_arithmetic.contours import first_hulls, redrawn_cells
 from deepaccident_devkit.motion.reference_arithmetic.outlines import pair_gaps
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _Pair = tuple[int, int]
@@ -152,7 +153,7 @@ class ReleasedAccidents:
     def result(self, counts: Collection[Counts]) -> AccidentResult:
         """Compute the metrics from the counts of samples, in any order."""
         result = tally_result(_sum_counts(counts), DISTANCES[0])
-        mean_errors: dict[str, Any] = {}
+        mean_errors: NamedValues = {}
         for name in ACCIDENT_ERRORS:
             field = f"{name}_error"
             errors = []
@@ -193,7 +194,7 @@ def padded_paths(drawn_paths: DrawnPaths, length: int) -> DrawnPaths:
 
 def accident_counts(
     predictions: Sequence[DrawnPaths], truth: DrawnPaths, matches: Sequence[Collection[_Pair]]
-) -> tuple[dict[str, Any], _Pair | None]:
+) -> tuple[NamedValues, _Pair | None]:
     """Count one sample from padded paths.
 
     Args:
@@ -209,7 +210,7 @@ def accident_counts(
     last_frame = (longest(truth.paths) or len(truth.drawn)) - 1
     true_pair = drawn_collision(truth, last_frame, ReleasedAccidents.truth_gap)
     names = ("tp", "fp", "fn", *ACCIDENT_ERRORS)
-    counts: dict[str, Any] = {name: [0] * len(DISTANCES) for name in names}
+    counts: NamedValues = {name: [0] * len(DISTANCES) for name in names}
     counts["positive"] = true_pair is not None
     if not predictions[0].paths:
         counts["fn"] = [int(true_pair is not None)] * len(DISTANCES)
@@ -290,11 +291,11 @@ def _sum_counts(counts: Collection[Counts]) -> Counts:
     return add_tallies(tallies)
 
 
-def _cases_by_distance(counts: Counts) -> list[dict[str, Any]]:
+def _cases_by_distance(counts: Counts) -> list[NamedValues]:
     """Split the counts of one sample into cases and errors for each of `DISTANCES`."""
     cases_by_distance = []
     for index, tp in enumerate(counts["tp"]):
-        cases: dict[str, Any] = {"tp": tp, "fp": counts["fp"][index], "fn": counts["fn"][index]}
+        cases: NamedValues = {"tp": tp, "fp": counts["fp"][index], "fn": counts["fn"][index]}
         for name in ACCIDENT_ERRORS:
             cases[name] = [counts[name][index]] if tp else []
         cases_by_distance.append(cases)

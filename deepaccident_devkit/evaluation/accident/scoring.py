@@ -19,6 +19,7 @@ from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.evaluation.truth import AccidentContext
 from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabels
 from deepaccident_devkit.support.arrays import BoolArray, ShortRepr
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 
 DISTANCES: Final = (5.0, 10.0, 15.0)
 """Allowed position errors of a predicted accident, metres."""
@@ -115,6 +116,28 @@ class AccidentResult(TaskResult):
     beside: Mapping[str, AccidentResult] = field(default_factory=dict)
 
 
+def outcome_words(result: AccidentResult) -> str:
+    """Name a sample's outcomes with their allowed distances: `FP + FN within 5 m, TP within 10 m`.
+
+    Equal outcomes are joined. The outcome is `TN` if nothing is counted.
+    """
+    distances: dict[str, list[str]] = {}
+    for distance, within in result.within.items():
+        distances.setdefault(count_words(within), []).append(f"{distance:g}")
+    return ", ".join(f"{counts} within {'/'.join(at)} m" for counts, at in distances.items())
+
+
+def count_words(within: AccidentsWithin) -> str:
+    """Name a sample's outcome at one allowed distance: `FP + FN`; `TN` if nothing is counted."""
+    words = []
+    for name, count in (("TP", within.tp), ("FP", within.fp), ("FN", within.fn)):
+        if count > 1:
+            words.append(f"{count} {name}")
+        elif count:
+            words.append(name)
+    return " + ".join(words) or "TN"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedAccidents(ShortRepr):
     """The accidents of one sample, in the current ego frame; accidents read off maps have no `ids`.
@@ -131,7 +154,7 @@ class ComparedAccidents(ShortRepr):
     unplaced: float | None = None
 
 
-def sample_tally(sample: Counts, within: Sequence[Mapping[str, Any]]) -> _Tally:
+def sample_tally(sample: Counts, within: Sequence[ReadOnlyValues]) -> _Tally:
     """Build the tally of one sample.
 
     Args:
@@ -267,7 +290,7 @@ def make_alarm(
     time: float | None = None,
     id_error: int | None = None,
     **extra: float,
-) -> dict[str, Any]:
+) -> NamedValues:
     """Build an `Alarm`; its position error is rounded so that values within `TIE` compare equal.
 
     Args:
@@ -312,10 +335,10 @@ def alarms_tally(sample: Counts, alarms: Sequence[Alarm]) -> _Tally:
     return sample_tally(sample, within)
 
 
-def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float) -> dict[str, Any]:
+def _cases_within(sample: Counts, alarms: Sequence[Alarm], distance: float) -> NamedValues:
     """Return the cases and the known errors of one sample at one allowed distance."""
     hit = hit_of(alarms, distance) if sample["positive"] else None
-    cases: dict[str, Any] = {name: [] for name in ACCIDENT_ERRORS}
+    cases: NamedValues = {name: [] for name in ACCIDENT_ERRORS}
     if hit is None:
         return cases | {"tp": 0, "fp": len(alarms), "fn": int(sample["positive"])}
     for name in ACCIDENT_ERRORS:

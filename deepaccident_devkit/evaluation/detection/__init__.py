@@ -33,7 +33,7 @@ from deepaccident_devkit.evaluation.detection.result import (
     detection_result,
     drawn_results,
 )
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnBoxes
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnBoxes, drawn_pair
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
@@ -136,9 +136,12 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
                     f"{token}: {name} in frame {boxes.frame!r}, but the protocol evaluates in "
                     f"{frame!r}; transform them, or choose frame="
                 )
+        self.add(token, self._count(token, prediction, truth))
+
+    def _count(self, token: str, prediction: DetectedBoxes, truth: Boxes) -> Counts:
         detections = columns_of(prediction.boxes, prediction.scores)
         counts = frame_counts(detections, columns_of(truth), self.protocol)
-        self.add(token, {"token": token, **counts})
+        return {"token": token, **counts}
 
     def drawing(self, dataset: Dataset, token: str, prediction: Any, /, *truth: Any) -> Drawing:
         """Describe matched, false and missed boxes at the threshold of `detection_matches`.
@@ -163,12 +166,18 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
             role="false",
             label="false",
         )
-        found = DrawnBoxes(
-            boxes=true_boxes.select(matches.truth), role="truth", label="true box of a detection"
-        )
+        found = DrawnBoxes(boxes=true_boxes.select(matches.truth), role="truth", label="found")
         missed = DrawnBoxes(boxes=true_boxes.select(matches.missed), role="missed", label="missed")
-        words = f"{len(right.boxes)} detected, {len(false.boxes)} false, {len(missed.boxes)} missed"
-        return Drawing(boxes=(found, right, false, missed), words=words)
+        pair = drawn_pair(dataset, token, frame)
+        counts = self._count(token, prediction, true_boxes)
+        precision = self.result_of([counts]).mean_average_precision
+        limit = f"overlap {matches.threshold:g}"
+        if self.protocol.measure.startswith("distance"):
+            limit = f"{matches.threshold:g} m"
+        return Drawing(
+            boxes=(found, right, false, missed, *pair),
+            words=f"mAP of this sample {precision:.1f} %; boxes are matched at {limit}",
+        )
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:
         """Compute the metrics from the counts of samples, in any order."""
@@ -255,7 +264,7 @@ def detection_matches(
     all_detections = columns_of(prediction.boxes, prediction.scores)
     detections, rows = existing_detections(all_detections, rules)
     true_boxes, true_rows = existing_truth(columns_of(truth), rules)
-    matched_rows: list[tuple[int, int]] = []
+    matched_rows = []
     unmatched: set[int] = set()
     missed: set[int] = set()
     for position in range(len(rules.ranges)):

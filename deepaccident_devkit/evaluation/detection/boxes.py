@@ -27,6 +27,7 @@ from deepaccident_devkit.support.arrays import (
     checked,
 )
 from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, SMALL_CATEGORIES, UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, cooperative_boxes
 
@@ -346,7 +347,7 @@ class DetectedBoxes(FrozenArrays):
         Raises:
             GeometryError: If a shape or a value is invalid.
         """
-        columns: dict[str, Any] = {}
+        columns: NamedValues = {}
         if velocity is not None:
             vectors = as_numbers("velocity", velocity)
             if vectors.ndim == 2 and vectors.shape[1] == 2:

@@ -24,6 +24,7 @@ from deepaccident_devkit.support.arrays import (
     as_floats,
     readonly,
 )
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 # Candidate → (true box, rank) of each pair that is near enough.
@@ -141,7 +142,7 @@ def highest_score_by_truth(reach: Reach) -> dict[int, int]:
         for true_box, _ in pairs:
             candidates_by_truth.setdefault(true_box, []).append(candidate)
     matched_candidates: set[int] = set()
-    matches: dict[int, int] = {}
+    matches = {}
     for true_box, candidates in sorted(candidates_by_truth.items()):
         for candidate in candidates:
             if candidate not in matched_candidates:
@@ -344,7 +345,7 @@ class Ring:
 
 def frame_counts(
     detections: BoxColumns, truth: BoxColumns, protocol: DetectionProtocol
-) -> dict[str, Any]:
+) -> NamedValues:
     """Match one sample's detections with its true boxes, both in the protocol's frame, and count.
 
     A *group* is a class in a range (index: class · ranges + range). A *cell* is a group at a
@@ -376,7 +377,7 @@ def frame_counts(
     true_codes = class_codes(truth, protocol)
     cost = costs(detections, truth, protocol)
     range_count = len(protocol.ranges)
-    result: dict[str, Any] = {
+    result: NamedValues = {
         "truths": [0] * (len(protocol.classes) * range_count),
         "scores": detections.score.tolist(),
     }
@@ -464,7 +465,7 @@ def class_codes(boxes: BoxColumns, protocol: DetectionProtocol) -> IntArray:
 
 
 def _add_matches(
-    result: Mapping[str, Any],
+    result: ReadOnlyValues,
     ring: Ring,
     range_and_level: tuple[int, int],
     detections: BoxColumns,

@@ -16,6 +16,7 @@ from deepaccident_devkit.evaluation.detection.matching import COLUMNS, ERRORS
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.task import FrozenMappings, Row, TaskResult, plain
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
+from deepaccident_devkit.support.values import ReadOnlyValues
 
 # Largest number of values (rows × draws) in one array; it limits how many draws are computed
 # together.
@@ -212,7 +213,7 @@ class Ledger:
         detections: (S, groups) how many detections count.
     """
 
-    def __init__(self, counts: Sequence[Mapping[str, Any]], protocol: DetectionProtocol) -> None:
+    def __init__(self, counts: Sequence[ReadOnlyValues], protocol: DetectionProtocol) -> None:
         """Join the samples' counts; each has the `token` of its sample.
 
         Raises:

@@ -52,7 +52,7 @@ def drawing_of_plan(plan: Plan, scene: PlanningScene) -> Drawing:
         note=words,
         label="contact of the plan",
     )
-    boxes = DrawnBoxes(boxes=pair, role="collision", label="boxes at the contact")
+    boxes = DrawnBoxes(boxes=pair, role="collision", time=time, label="boxes at the contact")
     return Drawing(paths=paths, boxes=(boxes,), places=(place,), words=f"the plan has {words}")
 
 

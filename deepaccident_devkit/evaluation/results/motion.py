@@ -46,6 +46,7 @@ from deepaccident_devkit.support.reading import (
     read_member,
 )
 from deepaccident_devkit.support.text import settle_choices
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 # Template of an array's path in the archive, from the sample token and the name of the array.
@@ -153,7 +154,7 @@ class MotionContents:
 
     task: ResultsTask = "motion"
 
-    def __init__(self, path: Path, meta: Mapping[str, Any], document: MotionFile) -> None:
+    def __init__(self, path: Path, meta: ReadOnlyValues, document: MotionFile) -> None:
         """Check the manifest; raise ContentError if a shard is missing or has the wrong size."""
         self._path = path
         self._root = path.parent

@@ -46,6 +46,7 @@ from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import NO_NAME, fault_text, irregular_text, read_bytes
 from deepaccident_devkit.support.text import PathType, counted, path_of
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import CATEGORIES, UNTRACKED_ID
 
 if TYPE_CHECKING:
@@ -220,7 +221,7 @@ class EntryContents:
     """
 
     task: ResultsTask
-    meta: Mapping[str, Any]
+    meta: ReadOnlyValues
     tokens: Collection[str]
     prediction: Callable[[str], Prediction]
     form: MotionForm | None = None
@@ -323,7 +324,7 @@ class Entries:
     def read(
         cls,
         results: Mapping[str, Sequence[Any]],
-        make_columns: Callable[[Mapping[str, Any]], Columns],
+        make_columns: Callable[[ReadOnlyValues], Columns],
     ) -> Entries:
         """Convert records to columns; raise a ContentError with token, entry and field on a fault.
 
@@ -444,7 +445,7 @@ def _check_unit_length(rotation: FloatArray, results: _BoxRecords) -> None:
 
 def boxes_at(entries: Entries, token: str) -> DetectedBoxes:
     """Return the boxes of a sample in the world frame; raise KeyError if the sample is unknown."""
-    columns: dict[str, Any] = entries.sample_columns(token)
+    columns: NamedValues = entries.sample_columns(token)
     scores = columns.pop("score")
     count = len(scores)
     boxes = Boxes(

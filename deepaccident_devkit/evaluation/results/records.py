@@ -20,6 +20,7 @@ from deepaccident_devkit.geometry.bev_grid import Axis, Orientation
 from deepaccident_devkit.motion import LABEL_PROTOCOLS
 from deepaccident_devkit.support import json_text
 from deepaccident_devkit.support.reading import fault_text
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 ResultsTask = Literal["motion", "accident", "detection", "planning", "forecasting"]
@@ -268,7 +269,7 @@ class MotionFile(_File, tag="motion"):
 ResultsFile: TypeAlias = MotionFile | AccidentFile | DetectionFile | PlanningFile | ForecastingFile
 
 
-def _schema(file_type: type[_File]) -> dict[str, Any]:
+def _schema(file_type: type[_File]) -> NamedValues:
     """Build the JSON schema of a type of file."""
     title = f"{FORMAT}: {file_type.__struct_config__.tag}"
     return {
@@ -444,7 +445,7 @@ def _single_types(joined: inspect.Type) -> list[inspect.Type]:
     return members
 
 
-def json_meta(meta: object) -> dict[str, Any]:
+def json_meta(meta: object) -> NamedValues:
     """Copy the notes `meta` as JSON values; raise ContentError if they cannot be stored as JSON."""
     if not isinstance(meta, Mapping):
         raise ContentError(
@@ -455,7 +456,7 @@ def json_meta(meta: object) -> dict[str, Any]:
     except (TypeError, ValueError, RecursionError) as error:
         raise ContentError(f"meta: cannot be written as JSON ({error})") from error
     with locate_errors("meta"):
-        copied: dict[str, Any] = parsed_json(text.encode(), _MAX_META_LEVELS)
+        copied: NamedValues = parsed_json(text.encode(), _MAX_META_LEVELS)
     return copied
 
 
@@ -479,7 +480,7 @@ class _Texts(msgspec.Struct):
     results: dict[str, msgspec.Raw]
 
 
-def read_document(content: bytes, path: Path) -> tuple[ResultsFile, dict[str, Any]]:
+def read_document(content: bytes, path: Path) -> tuple[ResultsFile, NamedValues]:
     """Decode a results file to its records and its notes `meta`.
 
     If the content is invalid, raise a ContentError that names token and field, or a ResultsError.

@@ -44,6 +44,7 @@ from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing, replacing_folder
 from deepaccident_devkit.support.reading import file_checksum, open_file, read_bytes
 from deepaccident_devkit.support.text import PathType, choice, counted, differing_text, path_of
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 # Text before the entries in a file. The notes before it do not contain line ends.
@@ -118,7 +119,7 @@ class ResultsWriter:
         form = MotionForm(
             stored=store, grid=grid or BevGrid(), predictions=1, frames=1, step=step, labels=labels
         )
-        self._motion: dict[str, Any] = {
+        self._motion: NamedValues = {
             "grid": grid,
             "step": form.step,
             "labels": form.labels,
@@ -282,7 +283,7 @@ def _write_error(path: Path, error: OSError) -> ResultsError:
 class EntryWriter:
     """Writer of a results file, from the header to the last sample; motion has `ShardWriter`."""
 
-    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, header: ReadOnlyValues) -> None:
         """Open a new file and write the header."""
         task = header["task"]
         self._make_entries = _ENTRIES[task]
@@ -332,7 +333,7 @@ class EntryWriter:
         self._file.close()
 
 
-def _accident_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+def _accident_entries(token: str, prediction: object) -> list[NamedValues]:
     """Convert the accidents of a sample to entries; raise ResultsError if one is invalid."""
     del token
     try:
@@ -355,7 +356,7 @@ def _accident_entries(token: str, prediction: object) -> list[dict[str, Any]]:
     ]
 
 
-def _box_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+def _box_entries(token: str, prediction: object) -> list[NamedValues]:
     """Convert the boxes of a sample to entries; raise ResultsError if they are invalid."""
     if not isinstance(prediction, DetectedBoxes):
         raise ResultsError(
@@ -371,7 +372,7 @@ def _box_entries(token: str, prediction: object) -> list[dict[str, Any]]:
     return detection_entries(token, prediction)
 
 
-def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any]]:
+def detection_entries(token: str, detected: DetectedBoxes) -> list[NamedValues]:
     """Convert a sample's boxes, which are in the world frame, to entries of a results file."""
     boxes = detected.boxes
     rows = zip(
@@ -397,12 +398,12 @@ def detection_entries(token: str, detected: DetectedBoxes) -> list[dict[str, Any
     ]
 
 
-def _plan_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+def _plan_entries(token: str, prediction: object) -> list[NamedValues]:
     """Convert the plans of a sample to entries; raise ResultsError if an item is not a Plan."""
     del token
     entries = []
     for plan in _check_items(Plan, prediction):
-        entry: dict[str, Any] = {
+        entry: NamedValues = {
             "times": plan.times.tolist(),
             "path": plan.path.tolist(),
             "score": plan.score,
@@ -413,7 +414,7 @@ def _plan_entries(token: str, prediction: object) -> list[dict[str, Any]]:
     return entries
 
 
-def _forecast_entries(token: str, prediction: object) -> list[dict[str, Any]]:
+def _forecast_entries(token: str, prediction: object) -> list[NamedValues]:
     """Convert the forecasts of a sample to entries; raise ResultsError if one is not a Forecast."""
     del token
     return [
@@ -441,7 +442,7 @@ def _check_items(item_type: type[Kind], prediction: object) -> list[Kind]:
 
 
 # Task → function that converts a sample's token and prediction to entries.
-_ENTRIES: Mapping[str, Callable[[str, object], list[dict[str, Any]]]] = {
+_ENTRIES: Mapping[str, Callable[[str, object], list[NamedValues]]] = {
     "accident": _accident_entries,
     "detection": _box_entries,
     "planning": _plan_entries,
@@ -455,7 +456,7 @@ class ShardWriter:
     def __init__(
         self,
         folder: Path,
-        header: Mapping[str, Any],
+        header: ReadOnlyValues,
         *,
         grid: BevGrid | None,
         step: float,

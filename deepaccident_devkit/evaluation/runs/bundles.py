@@ -43,6 +43,7 @@ from deepaccident_devkit.support.reading import (
     read_bytes,
 )
 from deepaccident_devkit.support.text import PathType, differing_text, path_of
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import SPLIT_CHOICES
 
 SUMMARY_FILE: Final = "metrics_summary.json"
@@ -80,7 +81,7 @@ class _Results(msgspec.Struct):
     """Part of a summary that describes the results."""
 
     path: Line
-    form: dict[str, Any] | None
+    form: NamedValues | None
 
 
 class _Counts(msgspec.Struct):
@@ -98,7 +99,7 @@ class _Partial(msgspec.Struct):
 class _Breakdown(msgspec.Struct):
     """Part of a summary that contains a breakdown."""
 
-    resampling: dict[str, Any]
+    resampling: NamedValues
 
 
 class _Summary(msgspec.Struct):
@@ -106,7 +107,7 @@ class _Summary(msgspec.Struct):
 
     task: Line
     protocol: Line
-    switches: dict[str, Any]
+    switches: NamedValues
     horizon: float
     split: Line
     samples: Line
@@ -304,7 +305,7 @@ def read_bundle(folder: Path) -> Bundle:
     return Bundle(folder=folder, summary=summary, selection=selection)
 
 
-def _read_setup(path: Path, summary: Mapping[str, Any]) -> EvaluationSetup:
+def _read_setup(path: Path, summary: ReadOnlyValues) -> EvaluationSetup:
     """Build the setup that a summary states; raise ResultsError if it is invalid."""
     names = ("task", "protocol", "switches", "horizon")
     with _naming_summary(path):
@@ -373,7 +374,7 @@ def _stored_threshold(bundle: Bundle, folder: Path, by: Chooser) -> Any:
         key = "quiet_braking"
         fault = "no prevented accidents; evaluate again with --prevented"
     try:
-        groups: Mapping[str, Any] = bundle.summary[part]["groups"]
+        groups: ReadOnlyValues = bundle.summary[part]["groups"]
         for group in GROUPS:
             if group in groups:
                 return groups[group][key]
@@ -397,7 +398,7 @@ def own_file(path: Path) -> Path:
     return path
 
 
-def read_json(path: Path, expected: str | None) -> dict[str, Any]:
+def read_json(path: Path, expected: str | None) -> NamedValues:
     """Read a bundle's JSON file; raise ResultsError if it is missing or invalid.
 
     Args:
@@ -420,7 +421,7 @@ def read_json(path: Path, expected: str | None) -> dict[str, Any]:
     return content
 
 
-def _check_format(path: Path, content: Mapping[str, Any], expected: str) -> None:
+def _check_format(path: Path, content: ReadOnlyValues, expected: str) -> None:
     """Raise ResultsError unless a file has the expected format and a version that we can read."""
     stored_format = content.get("format")
     if stored_format != expected:
@@ -616,9 +617,7 @@ def _write_files(run: EvaluationRun, folder: Path, *, include_results: bool) -> 
         _copy_results(Path(run.results.path), folder / RESULTS_FOLDER)
 
 
-def _write_json(
-    path: Path, format_name: str, run: EvaluationRun, content: Mapping[str, Any]
-) -> None:
+def _write_json(path: Path, format_name: str, run: EvaluationRun, content: ReadOnlyValues) -> None:
     """Write a JSON file that contains the format's name, the run's stamp and `content`."""
     payload = {"format": format_name, "version": SUMMARY_VERSION, **run.stamp, **content}
     path.write_text(json.dumps(payload, indent=1, default=asdict), encoding="utf-8")

@@ -45,6 +45,7 @@ from deepaccident_devkit.support.text import (
     number_text,
     path_of,
 )
+from deepaccident_devkit.support.values import NamedValues
 
 # How a number is tested: by itself, together with the other headlines, or not at all.
 Family = Literal["main", "headlines", "other"]
@@ -217,7 +218,7 @@ class Comparison(Report):
         values["a"] = os.fspath(self.a)
         values["b"] = os.fspath(self.b)
         values["notes"] = self.notes()
-        payload: dict[str, Any] = plain(values)
+        payload: NamedValues = plain(values)
         return payload
 
     def named_tables(self) -> dict[str, list[Row]]:
@@ -441,12 +442,12 @@ def _check_rules(bundle: Bundle, other: Bundle) -> None:
     )
 
 
-def _read_rules(bundle: Bundle) -> dict[str, Any]:
+def _read_rules(bundle: Bundle) -> NamedValues:
     """Return the rules of an evaluation, under the keys that they have in the summary."""
     return {name: bundle.summary.get(name) for name in _SETUP_KEYS}
 
 
-def _read_cells(bundle: Bundle) -> dict[str, Any]:
+def _read_cells(bundle: Bundle) -> NamedValues:
     """Return a description of the cells of motion results; empty for other results.
 
     The orientation of the maps is left out, since it does not affect the numbers.

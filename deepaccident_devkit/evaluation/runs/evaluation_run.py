@@ -44,6 +44,7 @@ from deepaccident_devkit.release.fingerprints import ScenarioHashes, fingerprint
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.parallel import keep_workers, run_batch
 from deepaccident_devkit.support.text import PathType, counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import SPLITS
 
@@ -272,7 +273,7 @@ class EvaluationRun:
             "sanity": self.sanity,
             **{name: _further_values(table) for name, table in self.further.items()},
         }
-        plain_form: dict[str, Any] = json.loads(json.dumps(plain(values)))
+        plain_form: NamedValues = json.loads(json.dumps(plain(values)))
         return plain_form
 
 
@@ -284,7 +285,7 @@ def _environment() -> dict[str, str]:
     return {"python": platform.python_version(), **versions}
 
 
-def _breakdown_values(table: Breakdown[Any]) -> dict[str, Any]:
+def _breakdown_values(table: Breakdown[Any]) -> NamedValues:
     """Convert a breakdown to the values that a summary contains."""
     return {
         "resampling": table.resampling,
@@ -293,7 +294,7 @@ def _breakdown_values(table: Breakdown[Any]) -> dict[str, Any]:
     }
 
 
-def _group_values(group: Group[Any]) -> dict[str, Any]:
+def _group_values(group: Group[Any]) -> NamedValues:
     """Convert a group of a breakdown to the values that a summary contains."""
     return {
         "value": group.value,
@@ -307,7 +308,7 @@ def _group_values(group: Group[Any]) -> dict[str, Any]:
     }
 
 
-def _further_values(table: Breakdown[Any]) -> dict[str, Any]:
+def _further_values(table: Breakdown[Any]) -> NamedValues:
     """Convert a further result to the values that a summary contains."""
     (group,) = table.groups
     return {

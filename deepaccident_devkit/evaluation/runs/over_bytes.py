@@ -26,6 +26,7 @@ from deepaccident_devkit.support.text import (
     interval_text,
     path_of,
 )
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 # Largest number of headlines that are compared.
@@ -56,7 +57,7 @@ class SentBytes(msgspec.Struct, kw_only=True, frozen=True):
         )
 
 
-def sent_bytes(summary: Mapping[str, Any]) -> SentBytes | None:
+def sent_bytes(summary: ReadOnlyValues) -> SentBytes | None:
     """Return the bytes that the notes of a summary's results state; None if they state none."""
     try:
         return msgspec.convert(summary["results"]["meta"]["bytes"], SentBytes)

@@ -1,7 +1,7 @@
 """`sample_rows`: the counts of a run's samples as flat rows, and Parquet files of such rows."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +11,7 @@ from deepaccident_devkit.evaluation.runs.evaluation_run import EvaluationRun
 from deepaccident_devkit.evaluation.task import plain
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import check_size, read_bytes, reason_text
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 
 Row = dict[str, Any]
 # Key in the file's metadata; its value is a JSON object.
@@ -60,7 +61,7 @@ def _identify_sample(run: EvaluationRun, token: str) -> Row:
     }
 
 
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str, Any]) -> None:
+def write_rows(path: Path, rows: Sequence[ReadOnlyValues], stamp: ReadOnlyValues) -> None:
     """Write rows to a Parquet file, with a stamp in the file's metadata."""
     from pyarrow import parquet
 
@@ -69,7 +70,7 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]], stamp: Mapping[str
     parquet.write_table(table, path)
 
 
-def rows_table(rows: Sequence[Mapping[str, Any]]) -> Any:
+def rows_table(rows: Sequence[ReadOnlyValues]) -> Any:
     """Convert rows with the same columns to an Arrow table.
 
     The values of a column must all be texts, all numbers, or all booleans; None is always allowed.
@@ -88,8 +89,8 @@ def read_rows(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
     try:
         table = _read_table(read_bytes(path, "bundle"))
-        stamp: dict[str, Any] = parsed_json((table.schema.metadata or {})[STAMP_KEY])
-        rows: list[dict[str, Any]] = table.to_pylist()
+        stamp: NamedValues = parsed_json((table.schema.metadata or {})[STAMP_KEY])
+        rows: list[NamedValues] = table.to_pylist()
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, MemoryError) as error:
         fault = shortened(reason_text(error), MAX_REASON_LENGTH)
         raise ResultsError(

@@ -42,6 +42,7 @@ from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.support.parallel import run_batch
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import CATEGORIES, FRAME_PERIOD, OWN_ACTOR_ID
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ LIST_COUNT: Final = 60
 _MIN_GAIN = 2.0
 # Group of mistakes → share of hits that must be reached once a mistake is undone, unless it is the
 # default. It is higher for times than for places, since predictions for slow actors hit some, too.
-_MIN_SHARES: Mapping[str, float] = {"place": 0.2, "time": 0.4}
+_MIN_SHARES = {"place": 0.2, "time": 0.4}
 _DEFAULT_MIN_SHARE = 0.5
 # Number of cells, accidents, boxes or path positions that must be hit.
 _MIN_HITS = {
@@ -134,7 +135,7 @@ _STEP_FRAMES = slice(5, 31, 5)
 FEW_FRAMES: Final = 3
 _SECONDS = "times are in seconds after the present"
 # Group of mistakes → mistake → its remedy.
-_REMEDIES: Mapping[str, Mapping[str, str]] = {
+_REMEDIES = {
     "place": {
         **dict.fromkeys(
             _AXES, "x is forward and y is to the left; for maps, state their orientation"
@@ -176,7 +177,7 @@ _REMEDIES: Mapping[str, Mapping[str, str]] = {
     "class": {_CLASSES: f"class numbers count from 0: {', '.join(CATEGORIES)}"},
 }
 # Group of mistakes → warning if most values of matched boxes are wrong, but no mistake explains it.
-_UNEXPLAINED: Mapping[str, str] = {
+_UNEXPLAINED = {
     "height": "heights do not fit: only {} of {} are right; z is the height of the box's "
     "centre, in the world frame",
     "size": "sizes do not fit: only {} of {} are right; a size is the full length, width and "
@@ -423,7 +424,7 @@ def tally_of(undone: ArrayLike, predicted: ArrayLike, total: ArrayLike) -> Float
 
 def tallies_of(
     group: str,
-    undone: Mapping[str, Any],
+    undone: ReadOnlyValues,
     predicted: Any,
     true: Any,
     tolerance: ArrayLike,

@@ -43,6 +43,7 @@ from deepaccident_devkit.support.text import (
     path_of,
     settle_choices,
 )
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, SPLIT_CHOICES, SPLITS, VEHICLE_AGENTS
 
@@ -310,7 +311,7 @@ def _options_text(options: Iterable[tuple[str, Any]]) -> str:
     return " ".join(texts)
 
 
-def release_note(dataset: Dataset, scenarios: Iterable[str]) -> dict[str, Any]:
+def release_note(dataset: Dataset, scenarios: Iterable[str]) -> NamedValues:
     """Build the note about the release that results store in their `meta` under `release`.
 
     Args:

@@ -25,6 +25,7 @@ from deepaccident_devkit.support.human_names import (
 )
 from deepaccident_devkit.support.reports import Table
 from deepaccident_devkit.support.text import columns_text, counted, interval_text, number_text
+from deepaccident_devkit.support.values import ReadOnlyValues
 
 SHOWN_BREAKDOWNS: Final = ("time_to_impact", "accident_visibility")
 # Text that replaces a missing number.
@@ -64,7 +65,7 @@ _CLEAN_COLUMNS = (
     "operating/tta_hit",
 )
 _PRINTED_COLUMNS = ("average_precision", "mean_time", "time_at_r80")
-_FIELD_COLUMNS: Mapping[str, Sequence[str]] = {
+_FIELD_COLUMNS = {
     "ustring": _PRINTED_COLUMNS,
     "dsta": (*_PRINTED_COLUMNS, "precision_at_r80"),
     "drive": (*_PRINTED_COLUMNS, "precision_at_half", "recall_at_half", "time_at_half"),
@@ -177,14 +178,14 @@ def _headlines_text(summary: Json) -> str:
     If there are intervals, the note about missing ones uses the names in the table; otherwise the
     notes of the group say why there are none.
     """
-    intervals: Mapping[str, Any] = {}
+    intervals: ReadOnlyValues = {}
     group_notes: list[str] = []
     overall = summary["breakdowns"].get("all")
     if overall and overall["groups"]:
         group = overall["groups"][0]
         intervals = group["intervals"]
         group_notes = group["notes"]
-    alternatives: Mapping[str, Any] = summary["metrics"].get("beside") or {}
+    alternatives: ReadOnlyValues = summary["metrics"].get("beside") or {}
     titles = ["number", "value"]
     if intervals:
         titles.append(f"{100 * overall['resampling']['confidence']:.0f} % interval")
@@ -259,7 +260,7 @@ def _breakdown_text(summary: Json, name: str) -> str:
 def notes_of(metrics: Json) -> Iterator[str]:
     """Yield each different note of a result and of its alternatives once."""
     yield from dict.fromkeys(metrics.get("notes") or ())
-    alternatives: Mapping[str, Any] = metrics.get("beside") or {}
+    alternatives: ReadOnlyValues = metrics.get("beside") or {}
     for name, alternative in alternatives.items():
         for note in alternative.get("notes") or ():
             if note not in metrics["notes"]:

@@ -36,7 +36,7 @@ RANDOM_DRAWS: Final = 20
 LATENCIES: Final = (0.0, 0.1, 0.3)
 # Threshold at which every alarm with a score counts.
 _LOWEST_THRESHOLD = float(np.nextafter(0.0, 1.0))
-_TRIVIAL_THRESHOLDS: Mapping[str, float] = {
+_TRIVIAL_THRESHOLDS = {
     "always": 1.0,
     "never": 1.0,
     "random per frame": 0.5,

@@ -17,7 +17,10 @@ from deepaccident_devkit.evaluation.warning.recordings import PART, sample_count
 from deepaccident_devkit.evaluation.warning.result import WarningResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.support.arrays import IntArray
+from deepaccident_devkit.support.values import NamedValues
 
+# Pictures show an alarm from this score on, if the protocol has no threshold.
+_DRAWN_THRESHOLD = 0.5
 _Protocol = CleanWarnings | FieldWarnings
 _Result = AnticipationResult | FieldResult
 WARNING_PROTOCOLS: Final[Mapping[str, _Protocol]] = MappingProxyType(
@@ -87,14 +90,17 @@ class WarningEvaluator(Evaluator[Any]):
         checked_facts(label, context)
         self.add(token, sample_counts(token, prediction, label, context or AccidentContext()))
 
-    def drawing(self, _dataset: Dataset, _token: str, prediction: Any, /, *truth: Any) -> Drawing:
+    def drawing(self, dataset: Dataset, token: str, prediction: Any, /, *truth: Any) -> Drawing:
         """Describe the alarms up to the horizon, and the collision that follows at any time."""
         label, context = truth
         checked = checked_prediction(prediction)
         alarms = named_alarms(checked, label, context.truth, AccidentReading())
         shown_alarms = [alarm for alarm, _ in within_horizon(alarms, context.truth)]
         threshold = getattr(self.protocol, "threshold", None)
-        return drawing_of_alarms(context.truth.impact, shown_alarms, threshold)
+        if threshold is None:
+            threshold = _DRAWN_THRESHOLD
+        true = context.truth.impact
+        return drawing_of_alarms(dataset, token, true, shown_alarms, context.truth, threshold)
 
     def result_of(self, counts: Collection[Counts]) -> _Result:
         """Compute the metrics from the counts of samples, in any order; they can be `pooled`."""
@@ -112,7 +118,7 @@ class WarningEvaluator(Evaluator[Any]):
 
     def sample_row(self, token: str) -> dict[str, Any]:
         """Return the sample's counts; lists are replaced by their lengths."""
-        row: dict[str, Any] = {}
+        row: NamedValues = {}
         for name, value in self._counts[token].items():
             if isinstance(value, list | tuple | Mapping):
                 row[f"{name}_count"] = len(value)

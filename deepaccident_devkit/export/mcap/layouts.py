@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import LIDAR
 
 _RERUN_TEMPLATE = '''\
@@ -60,7 +61,7 @@ def write_layouts(path: Path, topics: Sequence[str]) -> None:
     ]
     curve_ends = ("/speed", "/time_to_impact", "/prediction/alarm")
     values = [topic for topic in topics if topic.endswith(curve_ends)]
-    scene_topics: dict[str, Any] = {
+    scene_topics: NamedValues = {
         "/road/points": {"visible": True, "colorMode": "rgba-fields", "pointSize": 4},
         "/actors": {"visible": True},
     }
@@ -70,7 +71,7 @@ def write_layouts(path: Path, topics: Sequence[str]) -> None:
         if f"{topic}/points" in predicted_points or topic.endswith("/motion/points"):
             scene_topics[topic] = {"visible": True}
     paths = [{"value": f"{topic}.value", "enabled": True} for topic in values]
-    panels: dict[str, Any] = {
+    panels: NamedValues = {
         "3D!scene": {"followMode": "follow-none", "followTf": "world", "topics": scene_topics},
         "Plot!values": {"paths": paths},
     }

@@ -39,6 +39,7 @@ from deepaccident_devkit.export.mcap import EPOCH
 from deepaccident_devkit.geometry import SE3, Boxes, quaternions
 from deepaccident_devkit.render.boxes import EDGES, recorders_of
 from deepaccident_devkit.support.arrays import AnyArray, ByteArray, FloatArray
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, LIDAR
@@ -276,7 +277,7 @@ def make_cloud(points: AnyArray, frame: str, frame_number: int) -> Any:
 
     The message has a field for each field of the array (x, y, z and others).
     """
-    columns: Mapping[str, Any] = points.dtype.fields or {}
+    columns: ReadOnlyValues = points.dtype.fields or {}
     fields = []
     for name in points.dtype.names or ():
         dtype, offset = columns[name][:2]

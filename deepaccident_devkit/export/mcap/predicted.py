@@ -48,7 +48,7 @@ from deepaccident_devkit.motion import (
     MotionLabels,
     motion_labels_of,
 )
-from deepaccident_devkit.render.outcomes.described import prediction_kind, task_drawing
+from deepaccident_devkit.render.outcomes.described import task_drawing
 from deepaccident_devkit.render.outcomes.drawings import ROLE_COLORS, path_opacity
 from deepaccident_devkit.render.styles import (
     AGENT_COLORS,
@@ -182,6 +182,8 @@ class PredictedScenes:
         self._dataset = dataset
         self._prediction = prediction
         self._task = task
+        if task is None and isinstance(prediction, Results):
+            self._task = prediction.task
 
     def has(self, sample: str) -> bool:
         """Return whether a sample has a prediction."""
@@ -190,8 +192,8 @@ class PredictedScenes:
     def write(self, moment: Moment, recording: McapRecording) -> None:
         """Write the predictions for the samples of a moment.
 
-        Raises ConfigError for a prediction of an unknown type, ChoiceError if the predictions are
-        for another task, and ResultsError if results cannot be read.
+        Raises ChoiceError for a prediction of an unknown type or for another task, and ResultsError
+        if results cannot be read.
         """
         for agent, sample in moment.samples.items():
             if self.has(sample):
@@ -202,17 +204,7 @@ class PredictedScenes:
                 messages = _PredictionMessages(agent, moment.frame_number, recording)
                 if isinstance(prediction, MotionOutput):
                     messages.write_cells(prediction)
-                messages.write(self._describe(sample, prediction))
-
-    def _describe(self, sample: str, prediction: object) -> Drawing:
-        """Return what is drawn of a prediction; raise ConfigError if it is of an unknown type."""
-        task = self._task or prediction_kind(prediction)
-        if not task:
-            raise ConfigError(
-                "prediction: expected a MotionOutput, DetectedBoxes, or a list of Accidents, Plans "
-                f"or Forecasts for each sample, found {type(prediction).__name__}"
-            )
-        return task_drawing(self._dataset, sample, prediction, task)
+                messages.write(task_drawing(self._dataset, sample, prediction, self._task))
 
 
 class _PredictionMessages:

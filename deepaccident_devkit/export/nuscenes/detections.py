@@ -33,6 +33,7 @@ from deepaccident_devkit.export.nuscenes.scenes import token
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import PathType, path_of
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import CATEGORIES
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def _convert_document(document: object, samples: Mapping[str, str]) -> NuScenesD
     return NuScenesDetections(boxes=boxes, left_out=dict(sorted(counts.items())), meta=meta)
 
 
-def _convert_classes(results: dict[str, Any]) -> dict[str, dict[int, str]]:
+def _convert_classes(results: NamedValues) -> dict[str, dict[int, str]]:
     """Convert boxes to DeepAccident's classes in place, and unknown velocities to null.
 
     Boxes of classes that DeepAccident does not have get an arbitrary class. Invalid entries stay

@@ -269,7 +269,7 @@ def make_box_rows(scene: AgentScene, van: Van, output: Output) -> _RowsByTable:
     does not annotate the ego. An untracked box is an instance by itself, as is a box with an id
     that its label already has.
     """
-    rows: list[NuScenesRow] = []
+    rows = []
     tracks: dict[str, list[NuScenesRow]] = {}
     for number in range(1, scene.last_frame + 1):
         sample = scene.dataset.sample.get(scene.sample(number))

@@ -19,6 +19,7 @@ from deepaccident_devkit.support.arrays import FloatArray, ShortRepr, checked_nu
 from deepaccident_devkit.support.json_text import Record, parsed_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import PathType, path_of
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.tokens import sample_token
 
@@ -120,7 +121,7 @@ def format_questions_readme(*, seconds: int, observe: float, seen: str, pictures
     ).encode()
 
 
-def make_answer_schema(seconds: int) -> dict[str, Any]:
+def make_answer_schema(seconds: int) -> NamedValues:
     """Return the JSON Schema of an answer about this number of seconds."""
     point = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
     name = {"type": ["string", "null"]}
@@ -254,7 +255,7 @@ def results_of_answers(
     out: PathType,
     *,
     threshold: float = _DEFAULT_THRESHOLD,
-    meta: Mapping[str, Any] | None = None,
+    meta: ReadOnlyValues | None = None,
 ) -> Answers:
     """Write answers as a results file, for `evaluate accident` and `evaluate warning`.
 

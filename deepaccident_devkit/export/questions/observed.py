@@ -26,6 +26,7 @@ from deepaccident_devkit.support.arrays import (
     checked_number,
     checked_whole,
 )
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.tables.tokens import agent_token, sample_token
 from deepaccident_devkit.taxonomy import (
     AGENTS,
@@ -373,7 +374,7 @@ def describe_window(
     paths: Sequence[AgentPath],
     names: Names,
     window: QuestionWindow,
-    scenario: Mapping[str, Any],
+    scenario: ReadOnlyValues,
 ) -> Facts:
     """Describe a window as the content of a question, without id, seconds and pictures.
 

@@ -38,6 +38,7 @@ from deepaccident_devkit.support.text import (
     match_spelling,
     settle_choices,
 )
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.tables.tokens import sample_token
 from deepaccident_devkit.taxonomy import AGENTS, CAMERAS, FRAME_PERIOD, VEHICLE_AGENTS
 from deepaccident_devkit.v2x.agents import AGENT_SETS, agents_of, cooperating_agents
@@ -189,7 +190,7 @@ class Questions(ShortRepr, Format):
         output.write(f"{_PUBLIC_FOLDER}/answer.schema.json", f"{schema}\n".encode())
 
 
-def _write_lines(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
+def _write_lines(path: Path, records: Sequence[ReadOnlyValues]) -> None:
     """Write records as JSON, one on each line."""
     lines = []
     for record in records:
@@ -199,7 +200,7 @@ def _write_lines(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
 def _sort_lines(paths: Sequence[Path]) -> Iterator[bytes]:
     """Yield the lines of files in the order of their ids; only their positions are in memory."""
-    positions: list[tuple[bytes, int, int, int]] = []
+    positions = []
     for number, path in enumerate(paths):
         start = 0
         for line in read_bytes(path, "results").splitlines(keepends=True):
@@ -266,7 +267,7 @@ def _make_pairs(
     observations: Observations,
     windows: Sequence[QuestionWindow],
     form: Questions,
-    accident: Mapping[str, Any] | None,
+    accident: ReadOnlyValues | None,
     output: Output,
 ) -> Iterator[_QuestionPair]:
     """Yield the question and the truth of each window of a recording."""
@@ -334,7 +335,7 @@ def _write_pictures(
     return pictures
 
 
-def explain_omission(dataset: Dataset, scenario: Mapping[str, Any]) -> str | None:
+def explain_omission(dataset: Dataset, scenario: ReadOnlyValues) -> str | None:
     """Name the kind of scenario, if it is one without questions; None for all others."""
     if scenario["weather"] is None:
         return "scenarios without meta, which says whether there is an accident"
@@ -358,14 +359,14 @@ def seconds_ahead(frames_to_impact: int | None, frames_to_end: int, ahead: int) 
         num_recorded = frames_to_end // _FRAMES_PER_SECOND
         return [False if number <= num_recorded else None for number in numbers]
     impact_second = math.ceil(frames_to_impact / _FRAMES_PER_SECOND)
-    seconds: Seconds = []
+    seconds = []
     for number in numbers:
         seconds.append(number == impact_second if number <= impact_second else None)
     return seconds
 
 
 def describe_truth(
-    dataset: Dataset, sample: str, names: Names, ahead: int, contact: Mapping[str, Any] | None
+    dataset: Dataset, sample: str, names: Names, ahead: int, contact: ReadOnlyValues | None
 ) -> Facts:
     """Return what is known about the answer to a question.
 
@@ -414,7 +415,7 @@ def describe_truth(
     }
 
 
-def describe_accident(dataset: Dataset, scenario: Mapping[str, Any]) -> Facts | None:
+def describe_accident(dataset: Dataset, scenario: ReadOnlyValues) -> Facts | None:
     """Describe an accident's design and how its actors collide; None without a collision.
 
     Values are in metres, seconds and radians.

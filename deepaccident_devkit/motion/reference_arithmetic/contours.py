@@ -156,7 +156,7 @@ def convex_hull(contour: list[Point]) -> list[Point]:
     jump: then it starts at the jump.
     """
     first: dict[Point, int] = {}
-    last: dict[Point, int] = {}
+    last = {}
     for position, point in enumerate(contour):
         first.setdefault(point, position)
         last[point] = position

@@ -21,6 +21,7 @@ from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.reports import Row
 from deepaccident_devkit.support.text import PathType, counted, number_of, path_of
+from deepaccident_devkit.support.values import NamedValues
 
 # Number of resamples for an interval.
 _RESAMPLES = 400
@@ -31,7 +32,7 @@ _MIN_CORRELATION_AMONG_ALIKE = 0.5
 # Attributes whose values are words.
 _WORD_ATTRIBUTES = ("town", "weather")
 # Attribute → text for scores that fall with it, or rise with it.
-_DETECTOR_TEXTS: Mapping[str, tuple[str, str]] = {
+_DETECTOR_TEXTS = {
     "length": ("a detector of short clips", "a detector of long clips"),
     "folder": ("a detector of the folder `normal`", "a detector of the folder `accident`"),
     "name": ("a detector of small numbers in names", "a detector of large numbers in names"),
@@ -114,7 +115,7 @@ def read_scores(path: PathType) -> dict[str, float]:
     return scores
 
 
-def _read_pairs(file: Path) -> dict[str, Any]:
+def _read_pairs(file: Path) -> NamedValues:
     """Read tokens and unchecked scores from a table or a JSON file; raise ResultsError."""
     try:
         content = read_bytes(file, "results")

@@ -34,6 +34,7 @@ from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.parallel import keep_workers
 from deepaccident_devkit.support.plugins import need_plugin
 from deepaccident_devkit.support.text import choice, counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import SHIPPED_WEIGHTS, VEHICLE_AGENTS
 from deepaccident_devkit.v2x import Link
 from deepaccident_devkit.v2x.messages import Payload
@@ -205,7 +206,7 @@ def _predict_with_network(
 
 
 def _samples(
-    dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: dict[str, Any]
+    dataset: DeepAccident, purpose: Any, rules: Any, horizon: float, options: NamedValues
 ) -> list[str]:
     """Return the samples to predict; raise NotAvailableError if there are none."""
     split = options["split"]
@@ -218,7 +219,7 @@ def _samples(
     return tokens
 
 
-def _pop_link(options: dict[str, Any], payload: Payload) -> Link | None:
+def _pop_link(options: NamedValues, payload: Payload) -> Link | None:
     """Remove the link's options from a subcommand's options, and return the link.
 
     Return None if nothing happens to the partners' data.

@@ -35,6 +35,7 @@ from deepaccident_devkit.plugins.baselines.predict import (
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.parallel import Places, Store, unfinished_folder
 from deepaccident_devkit.support.text import PathType, choice, path_of, settle_choices
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x import Agents, Link, cooperating_agents
@@ -78,14 +79,14 @@ class Baseline:
 
     def predict(self, dataset: Dataset, task: ResultsTask, token: str) -> Prediction:
         """Predict a sample for a task; errors are as in the functions of `predict`."""
-        cooperation: dict[str, Any] = {"agents": self.agents, "link": self.link}
+        cooperation: NamedValues = {"agents": self.agents, "link": self.link}
         if task == "detection":
             return predict_detections(dataset, token, **cooperation)
         if task == "motion":
             return predict_motion(
                 dataset, token, model=self.model, config=self.config, **cooperation
             )
-        extrapolation: dict[str, Any] = {"model": self.model, "horizon": self.horizon_of(task)}
+        extrapolation: NamedValues = {"model": self.model, "horizon": self.horizon_of(task)}
         if task == "accident":
             return predict_accidents(dataset, token, **extrapolation, **cooperation)
         if task == "planning":
@@ -232,7 +233,7 @@ class _Work:
         return link.payload or "boxes"
 
     @property
-    def meta(self) -> dict[str, Any]:
+    def meta(self) -> NamedValues:
         """The notes in the results, except the number of bytes that partners send.
 
         That number is determined by these notes and the samples.

@@ -12,17 +12,16 @@ from typing import Any
 import msgspec
 
 from deepaccident_devkit.errors import ResultsError
-from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin
+from deepaccident_devkit.evaluation.accident.scoring import AccidentsWithin, count_words
 from deepaccident_devkit.evaluation.breakdowns import ATTRIBUTES, EVERYTHING
 from deepaccident_devkit.evaluation.runs import Bundle
 from deepaccident_devkit.evaluation.runs.bundles import SUMMARY_FILE, Line
 from deepaccident_devkit.evaluation.runs.setups import evaluator_class
 from deepaccident_devkit.evaluation.task import LIMITS, value_text
 from deepaccident_devkit.plugins.explore.scenarios import UNKNOWN_VALUE
-from deepaccident_devkit.render.outcomes.above import count_words
 from deepaccident_devkit.support.human_names import column_name, human_name
 from deepaccident_devkit.support.json_text import as_record
-from deepaccident_devkit.support.pages import scalar
+from deepaccident_devkit.support.pages import result_text, scalar
 from deepaccident_devkit.support.text import counted
 
 # Fields of the results' metadata that are shown if present.
@@ -40,6 +39,8 @@ _SAMPLE_COLUMNS = (
     "accident_visibility",
     "recording",
 )
+# Number of values in the verdict of a task without words of its own.
+_NUM_VALUES = 6
 _NUMBER = r"[0-9]+(?:\.[0-9]+)?"
 _CASES = ("tp", "fp", "fn")
 # Text about the error in each column.
@@ -304,7 +305,8 @@ def verdict_text(task: str, row: _Row, *, in_full: bool = False) -> str:
     The row comes from a file, so its values are not trusted. With `in_full`, the verdict covers all
     distances, ranges and thresholds; otherwise only the widest ones and the middle threshold.
     """
-    return _VERDICT_FUNCTIONS[task](row, in_full=in_full)
+    describe = _VERDICT_FUNCTIONS.get(task, _format_values)
+    return describe(row, in_full=in_full)
 
 
 def list_other_values(row: _Row) -> dict[str, str]:
@@ -374,16 +376,20 @@ def _format_detection(row: _Row, *, in_full: bool) -> str:
 
 def _format_values(row: _Row, **_: bool) -> str:
     texts = []
-    for name, text in list_other_values(row).items():
-        texts.append(f"{name} {text}")
-    return ", ".join(texts)
+    for name, value in row.items():
+        if name in _SAMPLE_COLUMNS or value is None:
+            continue
+        number = read_finite(value)
+        text = scalar(value) if number is None else result_text(number)
+        texts.append(f"{column_name(name)} {text}")
+    return ", ".join(texts[:_NUM_VALUES]) or "no numbers"
 
 
+# Verdicts that are shorter than all values of a row.
 _VERDICT_FUNCTIONS: Mapping[str, Callable[..., str]] = {
     "accident": _format_accident,
     "motion": _format_motion,
     "detection": _format_detection,
-    **dict.fromkeys(("warning", "planning", "forecasting"), _format_values),
 }
 
 

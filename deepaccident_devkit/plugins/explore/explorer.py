@@ -158,10 +158,12 @@ class Explorer:
         """
 
         def make() -> dict[str, Any]:
-            prediction = None
-            if model is not None:
-                prediction = self.models[model].results
-            return served_replay(self.dataset, token, "", prediction=prediction)
+            if model is None:
+                return served_replay(self.dataset, token, "")
+            shown = self.models[model]
+            return served_replay(
+                self.dataset, token, "", prediction=shown.results, task=shown.setup.task
+            )
 
         return self.replays.get((token, model), make)
 

@@ -8,14 +8,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from deepaccident_devkit.errors import EvaluationError
+from deepaccident_devkit.errors import EvaluationError, ResultsError
 from deepaccident_devkit.evaluation.results import Results, read_results
 from deepaccident_devkit.evaluation.runs import Bundle, read_bundle
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, scenario_of
+from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, evaluator_class, scenario_of
 from deepaccident_devkit.evaluation.task import headlines, value_text
 from deepaccident_devkit.plugins.explore.background import Job, Jobs
 from deepaccident_devkit.plugins.explore.evaluations import read_finite
@@ -23,15 +23,6 @@ from deepaccident_devkit.support.arrays import FloatArray
 
 if TYPE_CHECKING:
     from deepaccident_devkit.plugins.explore.scenarios import Scenarios
-
-# Protocol that pages use without a bundle, by kind of results; `clean` for other kinds.
-_PROTOCOL_BY_TASK: Mapping[str, str] = {
-    "motion": "released",
-    "accident": "boxes",
-    "detection": "released",
-}
-# Kinds of results that a replay can show.
-FORESEEN: Final = ("motion", "accident")
 
 
 class Score(NamedTuple):
@@ -71,7 +62,7 @@ class Model:
     Attributes:
         name: Name in addresses and for readers, from the bundle's folder or the results' file.
         bundle: Bundle of the evaluation; None for results without one.
-        results: Results; None if the bundle has no copy of them and they were not passed either.
+        results: Results; None if those of the bundle were not found.
         jobs: Background work, which computes the scores.
     """
 
@@ -93,8 +84,21 @@ class Model:
         horizon = 2.0
         if form is not None:
             horizon = min(2.0, (form.frames - 1) * form.step)
-        protocol = _PROTOCOL_BY_TASK.get(task, "clean")
+        protocol = next(iter(evaluator_class(task).protocols), "")
+        if task == "accident":
+            protocol = "boxes"  # the first protocol compares only motion
         return EvaluationSetup(task=task, protocol=protocol, horizon=horizon or 0.5)
+
+    @property
+    def missing_results(self) -> str:
+        """A sentence with the remedy if the results of the bundle were not found; empty if not."""
+        if self.bundle is None or self.results is not None:
+            return ""
+        path = self.bundle.summary["results"]["path"]
+        return (
+            f"The predictions are not shown: the bundle has no copy of them, and {path} is missing "
+            "or has changed. Pass them with --results PATH, or evaluate with --include-results."
+        )
 
     @cached_property
     def rows(self) -> Mapping[str, Mapping[str, Any]]:
@@ -190,9 +194,9 @@ class Model:
 def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) -> dict[str, Model]:
     """Open the models of bundles and results; return them by name, in the order passed.
 
-    The results of a bundle are its own copy or, without one, the results among `results` with the
-    bundle's fingerprint. The path that a bundle names is never opened, since a bundle may come from
-    anywhere. Raises ResultsError if a bundle or results cannot be read.
+    The results of a bundle are its own copy or, without one, the results with its fingerprint among
+    `results` or at the path that it names. Raises ResultsError if a bundle or other results cannot
+    be read.
     """
     results_by_path = {str(path): read_results(path) for path in results}
     models: dict[str, Model] = {}
@@ -208,6 +212,8 @@ def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) ->
             if candidate.fingerprint == fingerprint:
                 paired_paths.add(path)
                 own_results = own_results or candidate
+        if own_results is None:
+            own_results = _find_named_results(bundle)
         # `resolve` would follow links.
         name = _choose_name(Path(os.path.abspath(folder)).name, models)  # noqa: PTH100
         models[name] = Model(name=name, bundle=bundle, results=own_results, jobs=jobs)
@@ -216,6 +222,19 @@ def open_models(bundles: Iterable[Path], results: Iterable[Path], jobs: Jobs) ->
             name = _choose_name(Path(os.path.abspath(path)).stem, models)  # noqa: PTH100
             models[name] = Model(name=name, bundle=None, results=unpaired, jobs=jobs)
     return models
+
+
+def _find_named_results(bundle: Bundle) -> Results | None:
+    """Return the results at the path that a bundle names, if they still have its fingerprint.
+
+    A bundle may come from anywhere, so nothing else at this path is shown, not even its fault.
+    """
+    named = bundle.summary["results"]
+    try:
+        results = read_results(named["path"])
+    except ResultsError:
+        return None
+    return results if results.fingerprint == named.get("fingerprint") else None
 
 
 def _choose_name(name: str, used_names: Mapping[str, object]) -> str:

@@ -25,7 +25,7 @@ from deepaccident_devkit.interactions.scenario import measures_of_moving_pairs
 from deepaccident_devkit.plugins.explore.background import Jobs
 from deepaccident_devkit.plugins.explore.choices import format_find_call, format_where_options
 from deepaccident_devkit.plugins.explore.explorer import thumbnail
-from deepaccident_devkit.plugins.explore.models import FORESEEN, Model, open_models
+from deepaccident_devkit.plugins.explore.models import Model, open_models
 from deepaccident_devkit.plugins.explore.pages.release import SLOW, make_entry, make_table_cell
 from deepaccident_devkit.plugins.explore.pages.responses import assets
 from deepaccident_devkit.plugins.explore.pages.scenario import PARTS, make_part_context
@@ -127,12 +127,12 @@ class _ExportedScenario:
     Attributes:
         token: Token of the scenario.
         folder: Folder of the scenario, relative to the folder of the export.
-        predictions: Names and results of the models that have predictions for it.
+        predictions: Name, results and task of the models that have predictions for it.
     """
 
     token: str
     folder: str
-    predictions: tuple[tuple[str, Results], ...]
+    predictions: tuple[tuple[str, Results, str], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,8 +180,8 @@ def _make_replay(dataset: Dataset, scenario: _ExportedScenario, path: Path) -> t
     If none can be shown, the replay has no predictions. Returns the name of the predictions' model
     (empty if there are none), and the reason if no replay could be written (otherwise empty).
     """
-    for name, prediction in scenario.predictions:
-        if tried_replay(dataset, scenario.token, path, prediction=prediction) is None:
+    for name, prediction, task in scenario.predictions:
+        if tried_replay(dataset, scenario.token, path, prediction=prediction, task=task) is None:
             return name, ""
     return "", tried_replay(dataset, scenario.token, path) or ""
 
@@ -329,15 +329,12 @@ class _Pages:
             self._write_scenario(index, content)
         self._write_index(filters, contents)
 
-    def _find_predictions(self, token: str) -> tuple[tuple[str, Results], ...]:
+    def _find_predictions(self, token: str) -> tuple[tuple[str, Results, str], ...]:
         """Return the predictions that a replay of the scenario can show."""
         predictions = []
         for name, model in self._models.items():
-            results = model.results
-            if results is None or results.task not in FORESEEN:
-                continue
-            if token in model.scenarios:
-                predictions.append((name, results))
+            if model.results is not None and token in model.scenarios:
+                predictions.append((name, model.results, model.setup.task))
         return tuple(predictions)
 
     def _write_index(self, filters: Sequence[str], contents: Sequence[ScenarioContent]) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from deepaccident_devkit.plugins.model.lift import CameraGeometry
 from deepaccident_devkit.plugins.model.warps import six_from_matrices
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, POLE_HEIGHT
 
 Handedness = Literal["left", "right"]
@@ -201,7 +202,7 @@ def mirrored_boxes(boxes: Tensor, handedness: Handedness) -> Tensor:
 
 
 def _select_cameras(
-    batch: Mapping[str, Any], source: Tensor, handedness: Handedness
+    batch: ReadOnlyValues, source: Tensor, handedness: Handedness
 ) -> CameraGeometry:
     """Return the cameras of the images; only the ego frame is mirrored, the pixels are not."""
     ego_from_camera = _select_frames(batch["ego_from_camera"], source)

@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader
 
 from deepaccident_devkit.errors import DeepAccidentError, WorkerError, shortened
 from deepaccident_devkit.support.parallel import FEWER_WORKERS, starting_workers
+from deepaccident_devkit.support.values import NamedValues
 
 # Torch's messages in this process when a worker failed, or when its data cannot be opened here.
 _WORKER_FAULTS = re.compile(r"DataLoader worker|</torch_|ancdata")
@@ -22,7 +23,7 @@ _WORKER_FAULTS = re.compile(r"DataLoader worker|</torch_|ancdata")
 
 def read_batches(
     data: Any, collate: Callable[..., Any], workers: int, **options: Any
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[NamedValues]:
     """Start to read batches in worker processes, or in this process (0 workers).
 
     Args:

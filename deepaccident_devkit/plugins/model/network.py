@@ -53,6 +53,7 @@ from deepaccident_devkit.plugins.model.motion import (
 from deepaccident_devkit.plugins.model.pillars import PillarConfig, PillarEncoder
 from deepaccident_devkit.plugins.model.temporal import TemporalConfig, temporal_model
 from deepaccident_devkit.plugins.model.warps import agents_mask, features_to_ego
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.training.torch import V2XConfig
 from deepaccident_devkit.v2x import Agents, Link
@@ -189,7 +190,7 @@ class ModelConfig:
             link: Degradation of the partners' data.
             **changes: Other fields of `V2XConfig`, such as fields of targets.
         """
-        options: dict[str, Any] = {
+        options: NamedValues = {
             "images": None,
             "points": self.pillars is not None,
             "boxes": None,

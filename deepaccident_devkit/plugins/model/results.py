@@ -36,6 +36,7 @@ from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.text import PathType
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import CAMERAS, FRAME_PERIOD, LIDAR
 from deepaccident_devkit.training.torch import V2XConfig, V2XDataset, collate
@@ -131,7 +132,7 @@ def _configure_inputs(model: V2XFormer, config: PredictConfig) -> V2XConfig:
     return model.config.inputs(config.agents, link=link, images_cache=config.images_cache)
 
 
-def _measure_message(model: V2XFormer) -> tuple[int, dict[str, Any]]:
+def _measure_message(model: V2XFormer) -> tuple[int, NamedValues]:
     """Return the bytes of a partner's message, and the shape and dtype of its map.
 
     The message consists of the partner's own map of the present (`V2XFormer.encoded`) and its pose.
@@ -168,9 +169,7 @@ def check_sensor_files(model: ModelConfig, dataset: Dataset, tokens: Sequence[st
             )
 
 
-def prediction_of(
-    model: V2XFormer, batch: dict[str, Any], config: PredictConfig
-) -> SamplePrediction:
+def prediction_of(model: V2XFormer, batch: NamedValues, config: PredictConfig) -> SamplePrediction:
     """Predict a batch of one item (`training.torch.collate`) with a model in evaluation mode."""
     [token] = batch["token"]
     model_config = model.config
@@ -306,7 +305,7 @@ def scores_text(model: V2XFormer, dataset: Dataset, tokens: Sequence[str], path:
 
 def _make_notes(
     model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig
-) -> dict[str, Any]:
+) -> NamedValues:
     """Return the notes that the results contain."""
     link_note = None if config.link is None else asdict(config.link)
     return {
@@ -323,7 +322,7 @@ def _make_notes(
 
 def _note_sent_bytes(
     model: V2XFormer, dataset: Dataset, tokens: Sequence[str], config: PredictConfig
-) -> dict[str, Any]:
+) -> NamedValues:
     """Note how many bytes partners send; a partner without sensor files sends none."""
     check_sensor_files(model.config, dataset, tokens[:1])
     message_bytes, map_note = _measure_message(model)

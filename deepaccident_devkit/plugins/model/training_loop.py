@@ -4,7 +4,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -60,6 +60,7 @@ from deepaccident_devkit.support.files import writable_folder, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import read_bytes, reason_text
 from deepaccident_devkit.support.text import PathType, differing_text
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.support.version import __version__
 
 logger = logging.getLogger(__name__)
@@ -185,7 +186,7 @@ def _make_notes(
     choice: ModelChoice,
     config: TrainConfig,
     weights: PathType | None,
-) -> dict[str, Any]:
+) -> NamedValues:
     """Return the notes that describe a run; a run is resumed only if they are equal."""
     return {
         **choice.as_dict(),
@@ -196,7 +197,7 @@ def _make_notes(
     }
 
 
-def _claim_folder(folder: Path, notes: Mapping[str, Any]) -> None:
+def _claim_folder(folder: Path, notes: ReadOnlyValues) -> None:
     """Write a run's notes; raise ConfigError if the folder has different ones."""
     path = folder / RUN_FILE
     if not path.is_file():
@@ -224,7 +225,7 @@ class _Run:
 
     # Files.
     folder: Path
-    notes: Mapping[str, Any]
+    notes: ReadOnlyValues
     # Data.
     dataset: Dataset
     moments: Moments | MixedMoments
@@ -279,7 +280,7 @@ class _Run:
 
     def _take_step(
         self, number: int, training_step: nn.Module, optimizer: AdamW, moment_batches: Any
-    ) -> dict[str, Any]:
+    ) -> NamedValues:
         """Take a step of the optimizer; return its row of the log.
 
         All random draws depend on the number of the step.
@@ -313,7 +314,7 @@ class _Run:
         }
 
     def _compute_losses(
-        self, training_step: nn.Module, batch: Mapping[str, Any], number: int
+        self, training_step: nn.Module, batch: ReadOnlyValues, number: int
     ) -> dict[str, Tensor]:
         """Return the losses of a batch by name."""
         # The 0 keeps the random draws of published runs.
@@ -331,7 +332,7 @@ class _Run:
     def _finish_step(
         self,
         step_count: int,
-        row: dict[str, Any],
+        row: NamedValues,
         model: V2XFormer,
         optimizer: AdamW,
         progress: TrainingProgress,

@@ -30,6 +30,7 @@ from deepaccident_devkit.support.files import write_bytes
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import members_of, settle_choices
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.v2x import Agents
 from deepaccident_devkit.v2x.agents import agents_note
 
@@ -261,7 +262,7 @@ class _Row(msgspec.Struct):
     validation: dict[str, float] | None = None
 
 
-def read_log(folder: Path) -> list[dict[str, Any]]:
+def read_log(folder: Path) -> list[NamedValues]:
     """Return the rows of a run's log in order; an empty list if it has no log.
 
     An incomplete last line is left out. Raise ConfigError if the log cannot be read, or if a line
@@ -289,17 +290,17 @@ def cut_log(folder: Path, step: int) -> None:
     write_bytes(folder / _LOG_FILE, text.encode())
 
 
-def add_to_log(folder: Path, row: Mapping[str, Any]) -> None:
+def add_to_log(folder: Path, row: ReadOnlyValues) -> None:
     """Append a row to the log on disk."""
     with (folder / _LOG_FILE).open("a", encoding="utf-8") as file:
         file.write(f"{json.dumps(row)}\n")
 
 
-def _parse_row(location: str, line: bytes) -> dict[str, Any]:
+def _parse_row(location: str, line: bytes) -> NamedValues:
     """Parse a line of the log; raise a ConfigError that names its location if it is not valid."""
     try:
         # A log may have a million lines, and msgspec is ten times as fast as other readers.
-        row: dict[str, Any] = msgspec.json.decode(line)
+        row: NamedValues = msgspec.json.decode(line)
         as_record(row, _Row)
     except (ValueError, msgspec.DecodeError, RecursionError) as error:
         raise ConfigError(
@@ -327,7 +328,7 @@ def save_state(
     model: nn.Module,
     optimizer: AdamW,
     progress: TrainingProgress,
-    meta: Mapping[str, Any],
+    meta: ReadOnlyValues,
 ) -> None:
     """Write the state of a run atomically."""
     tensors = dict(model.state_dict())

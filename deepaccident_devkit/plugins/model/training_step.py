@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -27,6 +27,7 @@ from deepaccident_devkit.plugins.model.network import ModelConfig, V2XFormer
 from deepaccident_devkit.plugins.model.results import PredictConfig, predictions
 from deepaccident_devkit.plugins.model.training_run import TrainConfig
 from deepaccident_devkit.selection.samples import samples
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.training.torch import (
     AllEgosDataset,
     RandomAugmentation,
@@ -39,7 +40,7 @@ SCORE = "score"
 _SCORE_RANGE = "100x100"
 
 
-class Moments(TorchDataset[dict[str, Any]]):
+class Moments(TorchDataset[NamedValues]):
     """A split's moments as in `AllEgosDataset`, numbered consecutively over all epochs."""
 
     def __init__(
@@ -70,7 +71,7 @@ class Moments(TorchDataset[dict[str, Any]]):
     def __len__(self) -> int:
         return len(self.data)
 
-    def __getitem__(self, number: int) -> dict[str, Any]:
+    def __getitem__(self, number: int) -> NamedValues:
         """Return the moment with the number epoch · moments + position."""
         epoch, position = divmod(number, len(self.data))
         return self.data.item(position, epoch)
@@ -80,7 +81,7 @@ class Moments(TorchDataset[dict[str, Any]]):
         return positions(len(self), config, **options)
 
 
-class MixedMoments(TorchDataset[dict[str, Any]]):
+class MixedMoments(TorchDataset[NamedValues]):
     """Moments from two sources in turn; a key is the source and the number of its moment."""
 
     def __init__(self, sources: tuple[Moments, Moments], mix: float) -> None:
@@ -90,7 +91,7 @@ class MixedMoments(TorchDataset[dict[str, Any]]):
         self.model = sources[0].model
         self.data = sources[0].data
 
-    def __getitem__(self, number: tuple[int, int]) -> dict[str, Any]:
+    def __getitem__(self, number: tuple[int, int]) -> NamedValues:
         """Return the moment with a number of one of the sources."""
         source, source_number = number
         return self.sources[source][source_number]
@@ -118,7 +119,7 @@ def batches(
     config: TrainConfig,
     *,
     workers: int = 0,
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[NamedValues]:
     """Read batches of moments in the order of their numbers, as `read_batches` does."""
     return read_batches(
         moments, collate_all_egos, workers, batch_size=config.moments, sampler=numbers
@@ -287,7 +288,7 @@ class Targets:
 
 
 def training_batch(
-    batch: Mapping[str, Any], model: ModelConfig, config: TrainConfig, generator: torch.Generator
+    batch: ReadOnlyValues, model: ModelConfig, config: TrainConfig, generator: torch.Generator
 ) -> tuple[ModelInputs, Targets]:
     """Return the inputs and targets of a batch of `collate_all_egos`.
 

@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from deepaccident_devkit.deepaccident import DeepAccident
 from deepaccident_devkit.errors import ConfigError, ResultsError
@@ -12,6 +12,7 @@ from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.plugins.nuscenes.classes import DETECTION_NAMES
 from deepaccident_devkit.plugins.nuscenes.source import NuScenesRelease
 from deepaccident_devkit.support.files import write_bytes
+from deepaccident_devkit.support.values import NamedValues
 
 NUSCENES_RESULTS_FILE: Final = "nuscenes_detections.json"
 # Largest number of boxes for a sample that nuScenes accepts.
@@ -52,7 +53,7 @@ def write_detections(release: DeepAccident, results: Path) -> Path:
         raise ResultsError(
             f"{results}: has results of {content.task}; nuScenes evaluates detections"
         )
-    detections: dict[str, Any] = {
+    detections: NamedValues = {
         release.nuscenes_token(token): content.prediction(token) for token in content.tokens
     }
     preset = content.meta.get("model", {}).get("preset", "tiny")
@@ -69,7 +70,7 @@ def write_detections(release: DeepAccident, results: Path) -> Path:
     return path
 
 
-def _make_entries(token: str, detections: DetectedBoxes) -> list[dict[str, Any]]:
+def _make_entries(token: str, detections: DetectedBoxes) -> list[NamedValues]:
     """Return a sample's highest-scoring boxes, with nuScenes' classes and attributes."""
     best_rows = (-detections.scores).argsort(kind="stable")[:_MAX_BOXES]
     best_boxes = DetectedBoxes(

@@ -19,6 +19,7 @@ from deepaccident_devkit.release import Labels, ScenarioFolder
 from deepaccident_devkit.release.calib import Calibs
 from deepaccident_devkit.release.labels import label_from_world_velocity
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.arrow_files import ColumnArrays
 from deepaccident_devkit.tables.build import scenario_rows
 from deepaccident_devkit.tables.scan import ScenarioFiles, ScenarioScan
@@ -85,7 +86,7 @@ class NuScenesScene:
             )
         return samples
 
-    def _find_files(self, sample: Any) -> dict[str, Any]:
+    def _find_files(self, sample: Any) -> NamedValues:
         """Return the row of each channel's file at a keyframe, by channel."""
         follow = self._source.follow
         files = {}
@@ -207,7 +208,7 @@ class NuScenesScene:
         }
         return {table: {**columns, **own_columns.get(table, {})} for table, columns in rows.items()}
 
-    def _read_image_sizes(self, sample_data: ColumnArrays) -> dict[str, Any]:
+    def _read_image_sizes(self, sample_data: ColumnArrays) -> NamedValues:
         """Return the width and height of the rows of `sample_data`, with the true sizes of images.
 
         The intrinsic matrix only shows where the middle of an image may be.
@@ -272,7 +273,7 @@ class NuScenesScene:
             )
         return matrix
 
-    def _make_box_columns(self) -> dict[str, Any]:
+    def _make_box_columns(self) -> NamedValues:
         """Return the columns of `Labels` for all boxes."""
         boxes = self._boxes
         follow = self._source.follow

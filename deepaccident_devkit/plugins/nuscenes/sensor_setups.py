@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from deepaccident_devkit.plugins.nuscenes.check import (
 from deepaccident_devkit.support.arrays import FloatArray, IntArray
 from deepaccident_devkit.support.human_names import human_name
 from deepaccident_devkit.support.reports import CheckReport, Row, record_rows
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import (
     CAMERAS,
     CATEGORIES,
@@ -201,7 +201,7 @@ def sensor_setup_facts(dataset: Dataset) -> SensorSetupFacts:
     )
 
 
-def _read_class_codes(boxes: Mapping[str, Any], rows: IntArray) -> IntArray:
+def _read_class_codes(boxes: ReadOnlyValues, rows: IntArray) -> IntArray:
     """Return the indices in `_CLASSES` of the boxes of some samples, without the ego."""
     is_in_samples = np.isin(boxes["sample_row"], rows)
     is_counted = is_in_samples & (boxes["actor_id"] != OWN_ACTOR_ID)
@@ -209,7 +209,7 @@ def _read_class_codes(boxes: Mapping[str, Any], rows: IntArray) -> IntArray:
     return np.where(is_ignored, len(CATEGORIES), boxes["category"][is_counted])
 
 
-def _measure_clouds(dataset: Dataset, tokens: Sequence[str]) -> dict[str, Any]:
+def _measure_clouds(dataset: Dataset, tokens: Sequence[str]) -> NamedValues:
     """Return the facts about the LiDAR's clouds of some samples; None without files."""
     recorded = [token for token in tokens if dataset.sensor_path(token, LIDAR).exists()]
     samples = spread_samples(recorded, _NUM_SAMPLES)

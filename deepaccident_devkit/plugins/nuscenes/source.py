@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
@@ -44,6 +43,7 @@ from deepaccident_devkit.release.store import ReleasePath, index_places
 from deepaccident_devkit.support.files import is_writable_folder, replacing_folder
 from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.support.text import PathType, path_of
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.tables.arrow_files import StoredTable, write_table
 from deepaccident_devkit.tables.columns import Number, TableSpec, Vector, Word
@@ -79,7 +79,7 @@ _FILES = TableSpec("files", "Files of keyframes.", record_columns(_File))
 class _KeyframeResolver(Resolver):
     """A resolver of tokens and paths that takes file names from nuScenes' tables."""
 
-    def __init__(self, views: ColumnViews, files: Mapping[str, Any]) -> None:
+    def __init__(self, views: ColumnViews, files: ReadOnlyValues) -> None:
         """Store the columns of `_FILES`."""
         super().__init__(views)
         self._files = files
@@ -92,7 +92,7 @@ class _KeyframeResolver(Resolver):
         return str(self._files["filename"][row])
 
 
-def _find_file_row(files: Mapping[str, Any], sample_data_row: int) -> int | None:
+def _find_file_row(files: ReadOnlyValues, sample_data_row: int) -> int | None:
     """Return the row of `_FILES` for a row of `sample_data`; None between keyframes."""
     rows = files["row"]
     row = int(rows.searchsorted(sample_data_row))

@@ -4,7 +4,6 @@ Only the fields that keyframes need are read, and no other tables.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -14,6 +13,7 @@ from msgspec import Meta
 from deepaccident_devkit.errors import DatarootError, shortened
 from deepaccident_devkit.support.json_text import as_record, parsed_json
 from deepaccident_devkit.support.reading import fault_text, read_bytes
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 
 NUSCENES_REMEDY: Final = "unpack the tables again, or correct what wrote them"
 _COORDINATE = Annotated[float, Meta(ge=-1e8, le=1e8)]
@@ -22,7 +22,7 @@ _QUATERNION_PART = Annotated[float, Meta(ge=-1.1, le=1.1)]
 _PIXELS = Annotated[int, Meta(ge=0, le=65535)]
 _NAME = Annotated[str, Meta(pattern=r"\A[^/\x00-\x1f\x7f]+\Z", max_length=200)]
 _VECTOR = tuple[_COORDINATE, _COORDINATE, _COORDINATE]
-_FIELD_TYPES: Mapping[str, Any] = {
+_FIELD_TYPES: ReadOnlyValues = {
     "name": _NAME,
     "location": _NAME,
     "timestamp": Annotated[float, Meta(ge=0, le=1 << 53)],
@@ -108,7 +108,7 @@ class NuScenesTables:
             f"{NUSCENES_REMEDY}"
         )
 
-    def _read_rows(self, table: str, fields: list[str]) -> dict[str, Any]:
+    def _read_rows(self, table: str, fields: list[str]) -> NamedValues:
         """Return the rows of a table by token."""
         field_types = [(field, _FIELD_TYPES.get(field, str)) for field in ("token", *fields)]
         row_type = msgspec.defstruct(table, field_types)

@@ -43,6 +43,7 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import columns_text, counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import AGENTS, AgentName, short_name
 
 if TYPE_CHECKING:
@@ -528,7 +529,7 @@ def _csv_row(times: LeadTimes) -> list[Any]:
     ]
 
 
-def _by_name(names: Sequence[str], values: Iterable[Any]) -> dict[str, Any]:
+def _by_name(names: Sequence[str], values: Iterable[Any]) -> NamedValues:
     """Return a dictionary from names to values for JSON."""
     return dict(zip(names, values, strict=True))
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
 from deepaccident_devkit.collisions.outcomes import OUTCOMES, Braking
@@ -31,6 +31,7 @@ from deepaccident_devkit.support.parallel import Engine, Places, run_batch
 from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.support.scripts import bundled
 from deepaccident_devkit.support.text import PathType, counted, number_text
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS, FRAME_PERIOD, short_name
 
@@ -241,7 +242,7 @@ def _message(report: SafetyReport) -> Iterator[str]:
         )
 
 
-def _share_tables(report: SafetyReport) -> Iterator[dict[str, Any]]:
+def _share_tables(report: SafetyReport) -> Iterator[NamedValues]:
     """Yield one table per group of accidents and choice of drivers: the share that braking avoids.
 
     The columns are warning times in seconds.

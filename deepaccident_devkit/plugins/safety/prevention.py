@@ -60,6 +60,7 @@ from deepaccident_devkit.support.human_names import heading_name, human_name
 from deepaccident_devkit.support.parallel import Places, in_order, run_unordered
 from deepaccident_devkit.support.reports import Table
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 if TYPE_CHECKING:
@@ -490,9 +491,9 @@ class PreventedEvaluator(Evaluator[PreventedResult]):
 def _mean_figures(draws: Sequence[PreventionFigures]) -> PreventionFigures:
     """Average figures over draws; counts are left empty."""
     figures: PreventionFigures = mean_of_records(draws)
-    without_counts: dict[str, Any] = {}
+    without_counts: NamedValues = {}
     for kind in (*_ALARM_KINDS, "lasting"):
-        by_latency: dict[float, dict[str, Any]] = {}
+        by_latency: dict[float, NamedValues] = {}
         for latency, by_setting in getattr(figures, kind).items():
             by_latency[latency] = {}
             for setting, outcome in by_setting.items():

@@ -376,7 +376,7 @@ class AlarmOutcomes:
         warned_by_reaction = (accident_weight[:, None] * has_alarm).sum(axis=0)
         warned = warned_by_reaction[_REACTION_INDEX]
         total = float(accident_weight.sum())
-        figures_by_latency: dict[float, dict[str, OutcomeFigures]] = {}
+        figures_by_latency = {}
         for index, latency in enumerate(self._latencies):
             sums, extrapolated = self._sum_outcomes(index, columns, accident_weight)
             figures = map(_make_figures, sums, extrapolated, warned, costs, repeat(total))

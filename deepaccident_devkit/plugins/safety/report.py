@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -41,6 +41,7 @@ from deepaccident_devkit.plugins.safety.twins import (
 )
 from deepaccident_devkit.support.arrays import ShortRepr, json_numbers
 from deepaccident_devkit.support.reports import Report, Row
+from deepaccident_devkit.support.values import ReadOnlyValues
 from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 if TYPE_CHECKING:
@@ -216,7 +217,7 @@ class AccidentRow(ShortRepr):
         }
 
 
-def actor_name(actor: Mapping[str, Any]) -> str:
+def actor_name(actor: ReadOnlyValues) -> str:
     """Name a story's actor: `ego (car)`, or `cyclist 1234` if it is not an agent."""
     category = actor["category"] or "road user"
     if actor["agent"]:

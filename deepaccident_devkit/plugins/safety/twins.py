@@ -16,24 +16,23 @@ import numpy as np
 
 from deepaccident_devkit.collisions.recorded import (
     Skipped,
-    accident_of,
     map_scenarios,
     reasons_text,
     select_results,
     skipped_rows,
 )
-from deepaccident_devkit.collisions.twins import TornTwins, torn_twins, twin_of
-from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
-from deepaccident_devkit.plugins.safety.twin_matching import (
+from deepaccident_devkit.collisions.twin_matching import (
     MatchedBy,
     TwinRecording,
     matched_rows,
     shift_of,
     shifted_recording,
-    twin_recording,
+    twin_recordings,
 )
+from deepaccident_devkit.collisions.twins import TornTwins, torn_twins
+from deepaccident_devkit.dataset import Dataset, RowArgument
+from deepaccident_devkit.errors import ConfigError
+from deepaccident_devkit.geometry.box_arrays import gaps_of_pairs
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.arrays import (
     BoolArray,
@@ -45,6 +44,7 @@ from deepaccident_devkit.support.arrays import (
 )
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import columns_text, number_text
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import (
     CATEGORIES,
     FRAME_PERIOD,
@@ -287,7 +287,7 @@ class TwinDiff(FrozenArrays):
             "actors": [self._actor_values(row) for row in self.order.tolist()],
         }
 
-    def _actor_values(self, row: int) -> dict[str, Any]:
+    def _actor_values(self, row: int) -> NamedValues:
         """Return the values of an actor for JSON; None for unknown values."""
         actor_id, twin_id = self.actor_ids[row].tolist()
         frame = int(self.parting_frames[row])
@@ -321,7 +321,7 @@ def _largest(values: FloatArray) -> float | None:
 def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None = None) -> TwinDiff:
     """Compare an accident with its twin, frame by frame.
 
-    `safety.twin_matching` matches the frames (`shift_of`) and the actors (`matched_rows`).
+    `collisions.twin_matching` matches the frames (`shift_of`) and the actors (`matched_rows`).
 
     Args:
         dataset: The release.
@@ -330,23 +330,9 @@ def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None =
             `Parting()`.
 
     Raises:
-        TokenError: If the release has no such scenario.
-        NotAvailableError: If the release does not contain the scenario's twin, neither of the two
-            ends in an accident, one of them has no labels, or `accident_of` raises it.
+        DeepAccidentError: As `collisions.twin_matching.twin_recordings` does.
     """
-    record = dataset.scenario[dataset.getind("scenario", scenario)]
-    twin = twin_of(dataset, record)
-    if twin is None:
-        raise NotAvailableError(
-            f"{record['token']}: this release has no twin of it, with the same name and subtype"
-        )
-    if record["collision"] is None and twin["collision"] is not None:
-        twin, record = record, twin
-    accident = accident_of(dataset, record)
-    if accident is None:
-        raise NotAvailableError(f"{record['token']}: neither it nor its twin ends in an accident")
-    recording = twin_recording(dataset, record["token"])
-    unshifted_twin = twin_recording(dataset, twin["token"])
+    accident, recording, unshifted_twin = twin_recordings(dataset, scenario)
     shift = shift_of(recording, unshifted_twin)
     recordings = (recording, shifted_recording(unshifted_twin, shift))
     matches = matched_rows(*recordings)
@@ -362,14 +348,14 @@ def twin_diff(dataset: Dataset, scenario: RowArgument, parting: Parting | None =
     actor_ids = ids[:, 0].tolist()
     first_id, second_id = accident.actor_ids
     return TwinDiff(
-        accident=record["token"],
-        twin=twin["token"],
+        accident=recording.scenario,
+        twin=unshifted_twin.scenario,
         parting=parting or Parting(),
         actor_ids=ids,
         categories=tuple(CATEGORIES[code] for code in categories),
         agents=tuple(agents),
         matched_by=(*matched_by, *unmatched),
-        num_frames=(record["num_frames"], twin["num_frames"]),
+        num_frames=(recording.poses.shape[1], unshifted_twin.poses.shape[1]),
         shift=shift,
         poses=_stack_values(recordings, "poses", rows),
         speeds=_stack_values(recordings, "speeds", rows),

@@ -45,6 +45,7 @@ from deepaccident_devkit.support.files import replacing_folder, write_bytes
 from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.parallel import Places, Store
 from deepaccident_devkit.support.reading import read_bytes
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -262,7 +263,7 @@ class RowEvaluation:
         counts[HIDDEN] = self._hidden_actor_counts(folder)
         return {"counts": counts}
 
-    def _hidden_actor_counts(self, folder: Path) -> dict[str, Any]:
+    def _hidden_actor_counts(self, folder: Path) -> NamedValues:
         """Count hidden actors; return sample token → counts."""
         hidden_actors = HiddenActors()
         motion_results = read_results(folder / RESULTS_NAMES["motion"])

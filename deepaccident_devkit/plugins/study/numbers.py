@@ -29,6 +29,7 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, agent_of
 from deepaccident_devkit.motion import MotionLabelConfig, motion_labels
 from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, json_numbers
 from deepaccident_devkit.support.human_names import metric_name
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import AGENTS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x import AVAILABLE
 from deepaccident_devkit.v2x.cooperation import seen_actors
@@ -38,7 +39,7 @@ DETECTION_RADIUS = 2.0
 # Boxes with a lower score are ignored when hidden actors are counted.
 MIN_BOX_SCORE = 0.1
 HIDDEN = "hidden"
-_SOURCES: Mapping[str, tuple[str, str]] = {
+_SOURCES = {
     "iou_30": ("motion", "ranges/30x30/iou"),
     "vpq_30": ("motion", "ranges/30x30/pq"),
     "iou_100": ("motion", "ranges/100x100/iou"),
@@ -99,7 +100,7 @@ class HiddenActors(Evaluator[dict[str, float]]):
     """
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> NamedValues:
         """The largest distance of a detection in metres, and the lowest score of a box."""
         return {"near": DETECTION_RADIUS, "least_score": MIN_BOX_SCORE}
 
@@ -177,7 +178,7 @@ def _have_neighbour(points: FloatArray, others: FloatArray) -> BoolArray:
 
 def numbers_of_rows(
     tokens: Collection[str], row: EvaluatorsBySeed, less: EvaluatorsBySeed | None = None
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, NamedValues]:
     """Compute the numbers of a row over some samples, or its differences from another row.
 
     Their names are those in `NUMBERS`. Each is the mean over all seeds; it is missing if any seed
@@ -188,7 +189,7 @@ def numbers_of_rows(
     Returns:
         Number → `value`, `low` and `high` (None if unknown), and `seeds`.
     """
-    numbers: dict[str, dict[str, Any]] = {}
+    numbers: dict[str, NamedValues] = {}
     cluster_by_token = {token: cluster_of(scenario_of(token)) for token in tokens}
     clusters = dict(sorted(cluster_by_token.items(), key=itemgetter(1, 0)))
     has_interval = len({*clusters.values()}) >= MIN_CLUSTERS
@@ -261,7 +262,7 @@ def _mean_draws(
     return mean_draws
 
 
-def verdict(difference: Mapping[str, Any]) -> str:
+def verdict(difference: ReadOnlyValues) -> str:
     """Return `wins`, `loses` or `not decided`, by the interval of a difference."""
     low = difference["low"]
     high = difference["high"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +25,7 @@ from deepaccident_devkit.plugins.baselines import (
 )
 from deepaccident_devkit.plugins.baselines.outlook import MotionModel
 from deepaccident_devkit.plugins.study.recipe import StudyRow
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 from deepaccident_devkit.v2x.cooperation import visible_actors
 
@@ -201,7 +202,7 @@ def strangers_of(tokens: Sequence[str]) -> list[str]:
     return strangers
 
 
-def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
+def blanked(item: ReadOnlyValues) -> NamedValues:
     """Return an item of `V2XDataset` with black images and empty point clouds."""
     blank = dict(item)
     if "images" in item:
@@ -211,7 +212,7 @@ def blanked(item: Mapping[str, Any]) -> dict[str, Any]:
     return blank
 
 
-def with_strangers(item: Mapping[str, Any], stranger: Mapping[str, Any]) -> dict[str, Any]:
+def with_strangers(item: ReadOnlyValues, stranger: ReadOnlyValues) -> NamedValues:
     """Return an item whose partners' sensors and poses come from the same agents in another."""
     changed = {}
     for name, value in item.items():

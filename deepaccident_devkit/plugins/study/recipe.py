@@ -31,6 +31,7 @@ from deepaccident_devkit.support.arrays import checked_flag
 from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import AGENTS
 from deepaccident_devkit.v2x import AGENT_SETS, Link
 
@@ -165,7 +166,7 @@ class StudyRow(_Part, frozen=True, kw_only=True):
     @property
     def link(self) -> Link | None:
         """The link's effects on partners' data, None without any; raise ConfigError if invalid."""
-        effects: dict[str, Any] = {}
+        effects: NamedValues = {}
         for name in _LINK_EFFECTS:
             value = getattr(self, name)
             if value:
@@ -289,8 +290,8 @@ class _Source(msgspec.Struct):
 class _File(msgspec.Struct):
     """The parts of the file that are checked before lists are expanded and paths resolved."""
 
-    rows: list[dict[str, Any]]
-    smoke: dict[str, Any] = {}
+    rows: list[NamedValues]
+    smoke: NamedValues = {}
     releases: dict[str, _Source] = {}
 
 

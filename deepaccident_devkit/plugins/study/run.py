@@ -57,6 +57,7 @@ from deepaccident_devkit.support.json_text import as_record
 from deepaccident_devkit.support.plugins import need_plugin
 from deepaccident_devkit.support.reading import file_checksum
 from deepaccident_devkit.support.text import PathType, choice, counted, natural_order
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 from deepaccident_devkit.taxonomy import AGENTS
 
@@ -295,7 +296,7 @@ def _weight_cells(
     release_cell, dataset = releases[plan.release]
     model_keys = [field.name for field in fields(ModelChoice)]
     training_keys = [field.name for field in fields(TrainConfig)]
-    decides: dict[str, Any] = {}
+    decides: NamedValues = {}
     second_source = None
     if plan.also is not None:
         other_cell, other_dataset = releases[plan.also]
@@ -442,7 +443,7 @@ def _collect_counts(
         "compare": [list(pair) for pair in recipe.pairs],
         "over": {row.name: row.over and list(row.over) for row in recipe.rows},
     }
-    counts: dict[str, dict[str, Any]] = {}
+    counts: dict[str, NamedValues] = {}
     for name, cells in rows.items():
         counts[name] = {seed: (cell.notes or {})["counts"] for seed, cell in cells.items()}
     counts_of_a_row = next(iter(counts.values()))

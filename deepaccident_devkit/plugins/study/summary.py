@@ -27,6 +27,7 @@ from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.reading import read_bytes, reason_text
 from deepaccident_devkit.support.reports import Report, Row
 from deepaccident_devkit.support.text import PathType, columns_text, fixed_text, path_of
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 
 # Numbers of a study or of a part of it, which can be written as JSON.
 Summary = Mapping[str, Any]
@@ -59,7 +60,7 @@ class Counted(ShortRepr):
 
 def write_counts(counted: Counted, path: PathType) -> None:
     """Write all counts to a compressed JSON file; equal counts yield identical files."""
-    rows: dict[str, dict[str, dict[str, Any]]] = {}
+    rows: dict[str, dict[str, NamedValues]] = {}
     for name, seeds in counted.rows.items():
         rows[name] = {}
         for seed, evaluators in seeds.items():
@@ -85,9 +86,9 @@ def read_counts(path: PathType) -> Counted:
 
 
 def counted_of(
-    counts: Mapping[str, Mapping[str, Any]],
+    counts: Mapping[str, ReadOnlyValues],
     groups: Mapping[str, Sequence[str]],
-    description: Mapping[str, Any],
+    description: ReadOnlyValues,
 ) -> Counted:
     """Build `Counted` from counts by row, seed, evaluator and token (nested in this order)."""
     rows: dict[str, dict[str, Evaluators]] = {}
@@ -141,7 +142,7 @@ def summarised(counted: Counted) -> dict[str, Any]:
     }
 
 
-def _summarise_headline(headline: Summary, comparisons: Iterable[Summary]) -> dict[str, Any]:
+def _summarise_headline(headline: Summary, comparisons: Iterable[Summary]) -> NamedValues:
     """Add the difference, verdict and text to the recipe's headline."""
     row = headline["row"]
     less = headline["less"]

@@ -13,7 +13,7 @@ import lzma
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from deepaccident_devkit.release.store import ReleasePath, read_lines
 from deepaccident_devkit.support.parallel import run_batch
 from deepaccident_devkit.support.sketches import Sketch, distance, sketch, whole_numbers
 from deepaccident_devkit.support.text import choice
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 from deepaccident_devkit.taxonomy import AGENTS, BEV_CAMERA, CHANNEL_FORMAT, LIDAR
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ _PIXEL_STEPS = {"images": 2, "BEV pictures": 8}
 _WAVES = 2 * np.sin(np.arange(32, dtype=np.float32).reshape(4, 8) ** 2)
 
 
-def described(scenario: ScenarioFolder) -> dict[str, Any]:
+def described(scenario: ScenarioFolder) -> NamedValues:
     """Describe a scenario for comparison, in JSON types.
 
     - `meta`, `calib`: hashes of their bytes; `boxes`: of the labels without `num_lidar_pts`.
@@ -79,7 +80,7 @@ def described(scenario: ScenarioFolder) -> dict[str, Any]:
     return {"boxes": hashes.boxes, "meta": hashes.meta, "calib": hashes.calib, **sketches}
 
 
-def described_release(root: Path, **engine: Unpack[Engine]) -> dict[str, Any]:
+def described_release(root: Path, **engine: Unpack[Engine]) -> NamedValues:
     """Describe a release for comparison.
 
     Args:
@@ -99,7 +100,7 @@ def described_release(root: Path, **engine: Unpack[Engine]) -> dict[str, Any]:
     return {"splits": digest_of(splits), "scenarios": scenarios}
 
 
-def published(name: str) -> dict[str, Any]:
+def published(name: str) -> NamedValues:
     """Return the published description of a benchmark, as `described_release` returns it.
 
     Raises:
@@ -111,7 +112,7 @@ def published(name: str) -> dict[str, Any]:
     return dict(json.loads(text))
 
 
-def differences(release: Mapping[str, Any], benchmark: Mapping[str, Any]) -> list[str]:
+def differences(release: ReadOnlyValues, benchmark: ReadOnlyValues) -> list[str]:
     """List the differences between a release and a published benchmark, one per line.
 
     Args:
@@ -152,7 +153,7 @@ def _find_distant(
     return None
 
 
-def compared_kinds(release: Mapping[str, Any]) -> list[str]:
+def compared_kinds(release: ReadOnlyValues) -> list[str]:
     """Return the kinds of a described release that are compared within a tolerance."""
     scenarios = release["scenarios"].values()
     return [kind for kind in TOLERANCES if any(scenario[kind] for scenario in scenarios)]

@@ -26,6 +26,7 @@ from deepaccident_devkit.plugins.synth.plan import IMAGE_SIZE, RELEASED_IMAGE_SI
 from deepaccident_devkit.plugins.synth.sensors.caster import has_embree
 from deepaccident_devkit.plugins.synth.spec import DESIGN_NUMBERS, design_text, read_spec
 from deepaccident_devkit.support.text import counted
+from deepaccident_devkit.support.values import NamedValues
 
 _EXAMPLES = """\b
 Examples:
@@ -54,7 +55,7 @@ def _read_number(context: click.Context, parameter: click.Parameter, text: str) 
 
 def _read_designs(
     context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
-) -> dict[str, Any]:
+) -> NamedValues:
     """Return the fields `designs` and `spec`: numbers of designs, or one scenario file."""
     files = [text for text in texts if not text.isdecimal()]
     if files and len(texts) > 1:
@@ -155,7 +156,7 @@ def synth(out: Path, *, designs: dict[str, Any], benchmark: str | None, **option
         click.echo(f"or:   deepaccident render accident {release}{layers} --out countdown.png")
 
 
-def _make_benchmark(out: Path, name: str, sensors: Sensors, engine: dict[str, Any]) -> None:
+def _make_benchmark(out: Path, name: str, sensors: Sensors, engine: NamedValues) -> None:
     """Make a benchmark's release unless it exists, and compare it with the published one.
 
     Args:

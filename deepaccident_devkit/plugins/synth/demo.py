@@ -249,7 +249,7 @@ def draw_model(release: DeepAccident, out: Path) -> bool:
             draw_motion_outcome(prediction.motion, label, frame=label_frame, ax=ax)
             limits = (-_VIEW_RANGE_M, _VIEW_RANGE_M)
             ax.set(xlim=limits, ylim=limits, title=f"{title}: {ax.get_title()}")
-            draw_underlay(road, ax, target_from_ego=SE3.identity(), view_range=_VIEW_RANGE_M)
+            draw_underlay(road, ax, target_from_ego=SE3.identity())
             _draw_pair(release, accident, token, index, ax)
     save_picture(fig, picture_path, dpi=80)
     return True

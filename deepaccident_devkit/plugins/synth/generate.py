@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from deepaccident_devkit.errors import ConfigError
 from deepaccident_devkit.plugins.synth.plan import (
@@ -44,6 +44,7 @@ from deepaccident_devkit.support.json_text import parsed_json
 from deepaccident_devkit.support.parallel import Places, Progress, Store
 from deepaccident_devkit.support.reading import fault_text, read_bytes
 from deepaccident_devkit.support.text import differing_text, path_of
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.support.version import __version__
 
 if TYPE_CHECKING:
@@ -176,7 +177,7 @@ def _write_or_compare(path: Path, config: SynthConfig) -> None:
         )
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
+def _read_settings(path: Path) -> NamedValues:
     """Read a JSON object; raise ConfigError if the file cannot be read.
 
     Returns:
@@ -200,7 +201,7 @@ def file_text(path: Path) -> str:
         raise ConfigError(f"{path}: {fault_text(error)}; make it readable, or remove it") from error
 
 
-def _list_settings(config: SynthConfig) -> dict[str, Any]:
+def _list_settings(config: SynthConfig) -> NamedValues:
     """Return all settings that the bytes of a release depend on, as they are read from JSON.
 
     They contain the scenario file's text instead of its path.
@@ -209,7 +210,7 @@ def _list_settings(config: SynthConfig) -> dict[str, Any]:
     if config.spec is not None:
         text = file_text(config.spec)
     fields = {"version": __version__, **asdict(config), "image_size": config.pixels, "spec": text}
-    settings: dict[str, Any] = json.loads(json.dumps(fields))
+    settings: NamedValues = json.loads(json.dumps(fields))
     return settings
 
 
@@ -278,7 +279,7 @@ def make_release(
         parts: dict[str, RecordingJob] = {}
         for plan in plans:
             parts.update(_list_parts(unfinished, config, plan))
-        engine: dict[str, Any] = {
+        engine: NamedValues = {
             "workers": workers or _worker_count(config, len(plans)),
             "executor": executor,
             "progress": progress,

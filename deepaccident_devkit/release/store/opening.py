@@ -171,7 +171,7 @@ def _find_archives(path: Path) -> list[Path]:
     for name in ("", *SPLIT_FOLDERS, MINI_FOLDER):
         if _has_scenarios(path / name):
             return []
-    archives: list[Path] = []
+    archives = []
     folders = [(path, 0)]
     while folders:
         folder, depth = folders.pop()

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.accident import AccidentEvaluator, compared_accidents
+from deepaccident_devkit.evaluation.accident import AccidentEvaluator
 from deepaccident_devkit.evaluation.breakdowns import EVERYTHING, WITHIN_RECORDINGS, Breakdown
-from deepaccident_devkit.evaluation.detection import DetectedBoxes, DetectionEvaluator
+from deepaccident_devkit.evaluation.detection import DetectionEvaluator
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.planning.evaluator import BY_LEAD
 from deepaccident_devkit.evaluation.predictions import (
@@ -30,6 +30,8 @@ from deepaccident_devkit.evaluation.task import Headline, headlines
 from deepaccident_devkit.evaluation.warning import AnticipationResult
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render.captions import (
+    INSIDE,
+    draw_legend,
     draw_legend_of_fills,
     set_scene_title,
     set_title,
@@ -42,7 +44,9 @@ from deepaccident_devkit.render.figures import (
     detached_figure,
     write_report_figure,
 )
-from deepaccident_devkit.render.outcomes import draw_accident_outcome, draw_detection_outcome
+from deepaccident_devkit.render.outcomes.described import described_sample
+from deepaccident_devkit.render.outcomes.drawings import draw_drawing_from_above
+from deepaccident_devkit.render.outcomes.evaluation import drawing_layers
 from deepaccident_devkit.render.styles import (
     MUTED_COLOR,
     OUTCOME_COLORS,
@@ -361,11 +365,8 @@ def listed(values: Iterable[tuple[str, float | None]]) -> str:
 def sample_figures(run: EvaluationRun, dataset: Dataset, results: Results) -> tuple[RunFigure, ...]:
     """Return figures of the worst and the best samples by the main number, the worst first.
 
-    Samples in which nothing is counted are left out. The tasks without a view from above have no
-    such figures; only motion, accident and detection have one.
+    Samples in which nothing is counted are left out.
     """
-    if not isinstance(run.evaluator, (MotionEvaluator, AccidentEvaluator, DetectionEvaluator)):
-        return ()
     ranked = _ranked(run)
     count = min(_SAMPLES_PER_KIND, len(ranked) // 2)
     # no sample is among the worst if all numbers are equal
@@ -442,22 +443,22 @@ def draw_motion_outcome(
 
 def _draw_sample(load: SampleLoader, token: str, text: str, *, ax: Axes) -> Axes:
     """Draw a sample's prediction over the truth, with `text` (its main number) in the title."""
-    prediction, truth, *contexts = load(token)
-    if isinstance(prediction, MotionOutput):
-        draw_motion_outcome(prediction, truth, ax=ax)
-    elif isinstance(prediction, DetectedBoxes):
-        draw_detection_outcome(prediction, truth, load.setup.rules, ax=ax)
-    else:
-        context = contexts[0]
-        compared = compared_accidents(prediction, truth, context, load.setup.rules)
-        draw_accident_outcome(compared, context.truth, ax=ax)
-    set_scene_title(ax, load.dataset, token, below=f"{text}: {ax.get_title()}")
+    described = described_sample(load, token)
+    layers = drawing_layers(None)
+    handles = draw_drawing_from_above(load.dataset, token, described.drawing, layers, ax)
+    draw_legend(ax, handles, columns=1, **INSIDE)
+    set_scene_title(ax, load.dataset, token, below=text)
     return ax
 
 
 def _ranked(run: EvaluationRun) -> list[tuple[str, str]]:
-    """Return (token, main number in words) for each sample, the worst first."""
-    numbers: list[tuple[float, str, str]] = []
+    """Return (token, main number in words) for each sample, the worst first.
+
+    It is empty for tasks without main numbers.
+    """
+    if not run.evaluator.main_numbers:
+        return []
+    numbers = []
     path = run.evaluator.main_numbers[0]
     for token in sorted(run.evaluator.tokens):
         result = run.evaluator.compute([token])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -48,9 +48,9 @@ _ROW_LINES = 2.2
 _TITLE_LINES = 1.5
 _AXIS_LINES = 3.2
 # Unit of differences → smallest half of the axis, so that tiny differences look tiny.
-_MIN_SPANS: Mapping[str, float] = {"share": 0.05, "%": 5, "m": 0.5, "s": 0.1}
-_DIRECTION_MARKS: Mapping[bool | None, str] = {True: " ↑", False: " ↓", None: ""}
-_DIRECTION_TEXTS: Mapping[bool | None, str] = {
+_MIN_SPANS = {"share": 0.05, "%": 5, "m": 0.5, "s": 0.1}
+_DIRECTION_MARKS = {True: " ↑", False: " ↓", None: ""}
+_DIRECTION_TEXTS = {
     True: "↑ higher is better",
     False: "↓ lower is better",
 }

@@ -28,6 +28,7 @@ from deepaccident_devkit.support.human_names import column_name, human_name, met
 from deepaccident_devkit.support.pages import document, result_text, scalar
 from deepaccident_devkit.support.reading import read_bytes
 from deepaccident_devkit.support.text import PathType, counted, interval_text
+from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
 
 # Word in the report for each value of a headline's `higher_is_better`.
 _BETTER_WORDS = {True: "higher", False: "lower", None: ""}
@@ -47,7 +48,7 @@ REPORT_FILE: Final = "report.html"
 FIGURES_FOLDER: Final = "figures"
 
 
-def report_context(run: EvaluationRun) -> dict[str, Any]:
+def report_context(run: EvaluationRun) -> NamedValues:
     """Collect a run's data for the template `evaluation_report.html`, without pictures."""
     fields = run.result.as_dict()
     summary = run.summary()
@@ -96,7 +97,7 @@ def _headline_rows(result: Any, group: Group[Any] | None) -> list[list[str]]:
     return rows
 
 
-def _further_tables(summary: Mapping[str, Any]) -> dict[str, tuple[Any, list[str]]]:
+def _further_tables(summary: ReadOnlyValues) -> dict[str, tuple[Any, list[str]]]:
     tables = {}
     for extra, part in further_results(summary):
         notes = [*part["notes"], *part["interval_notes"]]
@@ -105,7 +106,7 @@ def _further_tables(summary: Mapping[str, Any]) -> dict[str, tuple[Any, list[str
     return tables
 
 
-def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
+def _header(run: EvaluationRun, summary: ReadOnlyValues) -> dict[str, str]:
     """Return the rows of the header: what was evaluated, and how."""
     setup = run.setup
     results = run.results
@@ -135,7 +136,7 @@ def _header(run: EvaluationRun, summary: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _counts(result: object, fields: Mapping[str, Any]) -> dict[str, Any]:
+def _counts(result: object, fields: ReadOnlyValues) -> NamedValues:
     """Return the counts of a result by heading, formatted by `_columns`."""
     for name in _absent_classes(result):
         row = fields["classes"][name]
@@ -174,7 +175,7 @@ def _columns(value: Any, part: str) -> Any:
     return rows
 
 
-def _breakdown(broken: Breakdown[Any]) -> dict[str, Any]:
+def _breakdown(broken: Breakdown[Any]) -> NamedValues:
     """Make a table of an attribute's groups, and a table without the roadside if it differs."""
     groups = broken.groups
     vehicle_groups = broken.without_infrastructure
@@ -190,9 +191,7 @@ def _breakdown(broken: Breakdown[Any]) -> dict[str, Any]:
     }
 
 
-def _group_table(
-    broken: Breakdown[Any], groups: Sequence[Group[Any]], agents: str
-) -> dict[str, Any]:
+def _group_table(broken: Breakdown[Any], groups: Sequence[Group[Any]], agents: str) -> NamedValues:
     """Make a table, with a caption, of the headline numbers of a breakdown's groups."""
     names: dict[str, None] = {}
     cells_of_groups = []

@@ -14,7 +14,6 @@ from deepaccident_devkit.render.boxes import segments_in_image, write_beside
 from deepaccident_devkit.render.camera import draw_image
 from deepaccident_devkit.render.captions import has_sensor_file
 from deepaccident_devkit.render.chips import keep_free
-from deepaccident_devkit.render.outcomes.above import DASHED
 from deepaccident_devkit.render.styles import CASING_COLOR, OUTCOME_COLORS
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.taxonomy import INFRASTRUCTURE, POLE_HEIGHT
@@ -24,9 +23,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Height in metres of the posts that mark positions; without them, distant rings look flat.
-_POST_HEIGHT_M = 1.5
+POST_HEIGHT_M = 1.5
 # Margin in points around a post that words do not cover: left, below, right and above.
 _MARK_MARGIN_PT = (-6.0, -6.0, 6.0, 6.0)
+# Line style of missed boxes and instances.
+DASHED: Final = (0, (2, 1))
 # How much wider than a line its casing is, in points.
 _CASING_WIDTH_PT = 1.4
 # Casing colour by line colour, for pale lines; all other casings are white.
@@ -104,6 +105,8 @@ class CameraView:
         """Render lines (V, 2) in pixels, with a casing that sets them off from the image."""
         from matplotlib.collections import LineCollection
 
+        if not lines:
+            return
         casing_color = CASINGS.get(color, CASING_COLOR)
         casings = LineCollection(
             lines, colors=casing_color, linewidths=width + _CASING_WIDTH_PT, alpha=0.7 * opacity
@@ -115,13 +118,20 @@ class CameraView:
         self.ax.add_collection(casings, autolim=False)  # the image has set the limits
         self.ax.add_collection(collection, autolim=False)
 
+    def fill(self, areas: Sequence[FloatArray], color: str, *, opacity: float) -> None:
+        """Fill areas with the outlines (V, 2), pixels."""
+        from matplotlib.collections import PolyCollection
+
+        polygons = PolyCollection(areas, facecolors=color, alpha=opacity, edgecolors="none")
+        self.ax.add_collection(polygons, autolim=False)
+
     def posts(self, positions: FloatArray) -> FloatArray:
         """Return the feet and tops, shape (V, 2, 2), pixels, of posts at positions (N, 2).
 
         Positions are in the ego frame; posts behind the camera are left out.
         """
         feet = self.optical(positions)
-        tops = self.optical(positions, _POST_HEIGHT_M)
+        tops = self.optical(positions, POST_HEIGHT_M)
         segments = np.stack([feet, tops], axis=1)
         pixels, _ = segments_in_image(segments, self.lens)
         return pixels
@@ -153,14 +163,18 @@ def view_of(
     if not has_sensor_file(dataset, camera):
         keep_free(ax, [[(lens.width / 2, 0.0)]], margin=_MISSING_WORDS_MARGIN_PT)
     optical_from_world = dataset.world_from(*camera.rsplit("/", 1)).inverse()
-    ground = 0.0
-    if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE:
-        ground = -POLE_HEIGHT
     return CameraView(
         camera=camera,
         sample=sample,
         lens=lens,
         optical_from_ego=optical_from_world @ dataset.world_from(sample, "ego"),
-        ground=ground,
+        ground=ground_height(dataset, sample),
         ax=ax,
     )
+
+
+def ground_height(dataset: Dataset, sample: str) -> float:
+    """Return the height of the ground in a sample's ego frame, metres."""
+    if dataset.get("sample", sample)["agent"] == INFRASTRUCTURE:
+        return -POLE_HEIGHT
+    return 0.0

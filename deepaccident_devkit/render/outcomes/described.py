@@ -1,6 +1,6 @@
 """The drawing of a sample's prediction, from the task that evaluates it."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,6 @@ from deepaccident_devkit.evaluation.results.motion import MotionForm
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader, evaluator_class
 from deepaccident_devkit.evaluation.task import headlines, value_text
 from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
-from deepaccident_devkit.render.outcomes.verdicts import JUDGED_TASKS, num_motion_frames
 from deepaccident_devkit.support.arrays import ShortRepr
 from deepaccident_devkit.support.human_names import human_name, metric_name
 
@@ -31,6 +30,8 @@ _KINDS: Mapping[type, str] = {
     Plan: "planning",
     Forecast: "forecasting",
 }
+# Kinds of predictions that are lists.
+_LIST_KINDS = ("accident", "planning", "forecasting")
 # Number of headlines in the title of a sample without a main number.
 _OTHER_NUMBERS = 3
 
@@ -50,30 +51,19 @@ class SampleDrawing(ShortRepr):
     words: str
 
 
-def prediction_kind(prediction: object) -> str:
+def prediction_kind(prediction: object, possible: Collection[str] = ("accident",)) -> str:
     """Return the kind of results that a sample's prediction belongs to; empty if it has none.
 
-    An empty list predicts no accident.
+    Args:
+        prediction: A sample's prediction.
+        possible: Kinds that an empty list may be of.
     """
     item: object = prediction
     if isinstance(prediction, list | tuple):
         if not len(prediction):
-            return "accident"
+            return next((kind for kind in _LIST_KINDS if kind in possible), "accident")
         item = prediction[0]
     return _KINDS.get(type(item), "")
-
-
-def task_to_describe(prediction: object, task: str | None) -> str:
-    """Return the task that draws a prediction itself; empty if `sample_verdict` judges it.
-
-    Args:
-        prediction: A sample's prediction.
-        task: Name of a task; None for the one that the prediction is for.
-    """
-    name = task or prediction_kind(prediction)
-    if name in JUDGED_TASKS:
-        return ""
-    return name
 
 
 def sample_drawing(
@@ -81,7 +71,7 @@ def sample_drawing(
     sample: RowArgument,
     prediction: Any,
     *,
-    task: str,
+    task: str | None = None,
     protocol: Any = None,
 ) -> SampleDrawing:
     """Evaluate a sample's prediction, and let the task describe its picture.
@@ -90,12 +80,14 @@ def sample_drawing(
         dataset: The release.
         sample: Token or record of the sample.
         prediction: Prediction of a kind that the task is evaluated from; boxes may be in any frame.
-        task: Name of a task of the devkit or of a plug-in.
+        task: Name of a task of the devkit or of a plug-in; None for the one that the prediction is
+            for.
         protocol: Name of a protocol of the task, or your own; None for the first one.
 
     Raises:
         TokenError: No such sample.
-        ChoiceError: No such task or protocol, or the prediction is for another task.
+        ChoiceError: No such task or protocol, the prediction is for another task, or the object is
+            not a prediction.
         NotAvailableError: The release lacks the truth that the task needs.
     """
     evaluator = _evaluator_of(prediction, task, protocol)
@@ -119,7 +111,7 @@ def _describe(
     return SampleDrawing(sample=token, drawing=drawing, words=f"{heading}: {words}")
 
 
-def task_drawing(dataset: Dataset, token: str, prediction: Any, task: str) -> Drawing:
+def task_drawing(dataset: Dataset, token: str, prediction: Any, task: str | None = None) -> Drawing:
     """Return what a task draws of a sample, without computing numbers.
 
     If the release lacks the truth that the task needs, only the prediction is drawn. Arguments and
@@ -134,26 +126,35 @@ def task_drawing(dataset: Dataset, token: str, prediction: Any, task: str) -> Dr
     return evaluator.drawing(dataset, token, prediction, *truth)
 
 
-def _evaluator_of(prediction: Any, task: str, protocol: Any = None) -> Evaluator[Any]:
+def _evaluator_of(prediction: Any, task: str | None, protocol: Any = None) -> Evaluator[Any]:
     """Return an evaluator of a task; raise ChoiceError if the prediction is for another task."""
-    evaluator_type = evaluator_class(task)
-    kind = prediction_kind(prediction)
+    name = task or prediction_kind(prediction)
+    if not name:
+        raise ChoiceError(
+            "prediction: expected a MotionOutput, DetectedBoxes, or a list of Accidents, Plans or "
+            f"Forecasts for a sample, found {type(prediction).__name__}"
+        )
+    evaluator_type = evaluator_class(name)
+    kind = prediction_kind(prediction, evaluator_type.result_kinds)
     if kind not in evaluator_type.result_kinds:
         kinds = " or ".join(evaluator_type.result_kinds)
         raise ChoiceError(
             f"task {evaluator_type.task!r}: is evaluated from {kinds} results, found "
             f"{kind or type(prediction).__name__}; give such a prediction, or choose another task"
         )
-    if protocol is None and (task, kind) == ("accident", "accident"):
+    if protocol is None and (name, kind) == ("accident", "accident"):
         protocol = "boxes"  # the first protocol compares only motion
     return evaluator_type(protocol or next(iter(evaluator_type.protocols), ""))
 
 
 def _form_and_horizon(prediction: Any) -> tuple[MotionForm | None, float]:
     """Return how motion would be stored, None for other predictions, and seconds to look ahead."""
-    frames = num_motion_frames(prediction)
-    if frames is None:
+    if not isinstance(prediction, MotionOutput):
         return None, RELEASED_HORIZON
+    if prediction.instances is not None:
+        frames = int(prediction.instances.shape[1])
+    else:
+        frames = len((prediction.heads or ())[-1].segmentation)
     form = MotionForm(
         stored="instances", grid=prediction.grid, predictions=len(prediction), frames=frames
     )
@@ -174,4 +175,4 @@ def _number_words(evaluator: Evaluator[Any], token: str, prediction: Any, *truth
         else:
             other_words.append(words)
     shown_words = main_words or other_words[:_OTHER_NUMBERS]
-    return ", ".join(shown_words) or "no numbers for this sample"
+    return "; ".join(shown_words) or "no numbers for this sample"

@@ -2,41 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnAlarm, DrawnBoxes, DrawnPath, Role
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.evaluation.drawing import (
+    Drawing,
+    DrawnAlarm,
+    DrawnBoxes,
+    DrawnCells,
+    DrawnPath,
+    Role,
+)
+from deepaccident_devkit.geometry import BevGrid, Boxes, quaternions
+from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.render.bev import BevView, draw_bev
 from deepaccident_devkit.render.boxes import (
     draw_boxes_from_above,
     draw_boxes_in_image,
     write_beside,
 )
+from deepaccident_devkit.render.camera import best_view
 from deepaccident_devkit.render.captions import titled_from_above
-from deepaccident_devkit.render.chips import keep_line_free
+from deepaccident_devkit.render.chips import keep_free, keep_line_free, place_chips
 from deepaccident_devkit.render.figures import Layer, Layers, square_around
-from deepaccident_devkit.render.outcomes.above import DASHED
-from deepaccident_devkit.render.outcomes.camera_view import CameraView, view_of
+from deepaccident_devkit.render.motion_maps import draw_cells, trail_picture
+from deepaccident_devkit.render.outcomes.camera_view import (
+    DASHED,
+    POST_HEIGHT_M,
+    CameraView,
+    ground_height,
+    view_of,
+)
 from deepaccident_devkit.render.styles import (
     COLLIDER_COLOR,
+    INSTANCE_COLORS,
+    MUTED_COLOR,
     OUTCOME_COLORS,
     PREDICTED_COLOR,
     text_size,
 )
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
+from deepaccident_devkit.v2x import Agents
 from deepaccident_devkit.v2x.poses import camera_of
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-DRAWING_LAYERS: Final[Layers] = ("image", "bev", "boxes", "trajectories", "ids", "grid")
+DRAWING_LAYERS: Final[Layers] = (
+    "image",
+    "bev",
+    "boxes",
+    "trajectories",
+    "labels",
+    "ids",
+    "grid",
+)
 ROLE_COLORS: Final[Mapping[Role, str]] = {
     "truth": "black",
     "past": "#63717e",
@@ -53,6 +80,15 @@ _ROLE_ORDER = ("past", "predicted", "false", "missed", "right", "collision", "tr
 _RIBBON_OPACITY = 0.4
 _BOX_OPACITY = 0.25
 _FILLS: Mapping[Role, float] = {"truth": 0.0}
+# Colour of true cells; black areas would hide the paths on them.
+_TRUE_CELL_COLOR = INSTANCE_COLORS[0]
+# Opacity of cells in camera images and in legends.
+_CELL_OPACITY = 0.3
+_OUTLINE_WIDTH_PT = 1.6
+# Corners of a box's top, in `Boxes.corners` order.
+_TOP_CORNERS = (0, 1, 4, 5)
+# Largest number of scores that are written at boxes of one kind.
+_MAX_SCORES = 5
 # Opacity of the least probable path, and of what labelled boxes hide.
 _MIN_OPACITY = 0.2
 _HIDDEN_OPACITY = 0.25
@@ -68,6 +104,8 @@ _MIN_DEPTH_M = 5.0
 _MARK_MARGIN_PT = (-6.0, -6.0, 6.0, 6.0)
 # Left, lower edge, width and height of the bar of an alarm's score, as shares of the panel.
 _BAR = (0.02, 0.03, 0.3, 0.05)
+# Height of the bar and the words above it, in heights of the bar.
+_ALARM_LINES = 2.5
 _BORDER_WIDTH_PT = 4.0
 
 
@@ -93,21 +131,23 @@ def draw_drawing_from_above(
     center, half = square_around(_shown_positions(shown or drawing), _VIEW_MARGIN_M)
     x, y = center.tolist()
     view_range = float(np.clip(half, _MIN_VIEW_RANGE_M, _MAX_VIEW_RANGE_M))
-    view = BevView(agents=None, view_range=view_range, center=(x, y), surroundings_shown=True)
-    shown_layers = layers - {"trajectories", "image"}
-    if any(boxes.role != "collision" for boxes in drawing.boxes):
-        shown_layers -= {"boxes"}  # the drawing has boxes of its own
+    shown_layers = layers - {"trajectories", "image", "labels"}
+    agents: Agents = None
+    if drawing.cells or any(boxes.role != "collision" for boxes in drawing.boxes):
+        shown_layers -= {"boxes"}  # the drawing has shapes of its own
+        agents = "single"
+    view = BevView(agents=agents, view_range=view_range, center=(x, y), surroundings_shown=True)
     draw_bev(dataset, sample, view, shown_layers, ax)
+    if "labels" in layers:
+        _draw_cells_from_above(drawing.cells, ax)
     if "trajectories" in layers:
-        for path in _in_drawing_order(drawing):
-            _draw_path_from_above(path, ax)
+        _draw_paths_from_above(_in_drawing_order(drawing), ax)
     if "boxes" in layers:
         for drawn in drawing.boxes:
             boxes = _in_ego_frame(dataset, sample, drawn)
-            style: dict[str, Any] = {"linestyle": DASHED} if drawn.role == "missed" else {}
             fill = _FILLS.get(drawn.role, _BOX_OPACITY)
-            colors = [ROLE_COLORS[drawn.role]] * len(boxes)
-            draw_boxes_from_above(boxes, ax, colors, fill=fill, **style)
+            colors = [_edge_color(drawn.role)] * len(boxes)
+            draw_boxes_from_above(boxes, ax, colors, fill=fill, **_line_style(drawn.role))
     for place in drawing.places:
         color = ROLE_COLORS[place.role]
         marker: dict[str, Any] = _marker_of(place.role)
@@ -123,30 +163,35 @@ def draw_drawing_from_above(
 
 
 def draw_drawing_in_camera(
-    dataset: Dataset, sample: str, drawing: Drawing, camera: str, ax: Axes, *, image: bool = True
+    dataset: Dataset,
+    sample: str,
+    drawing: Drawing,
+    camera: str,
+    ax: Axes,
+    *,
+    image: bool = True,
+    frame: int = 0,
 ) -> Axes:
     """Render a drawing over an image of a camera (a token); the ground is assumed to be flat.
 
-    What labelled boxes hide from the camera is faint.
+    Paths and places that labelled boxes hide from the camera are faint. The own box of the camera's
+    agent is left out, because the camera is inside it. `frame` is the index of the cells' frame.
     """
     view = view_of(dataset, sample, camera, ax, image=image)
     obstacles = _obstacles(dataset, view)
-    for path in _in_drawing_order(drawing):
-        _draw_path_in_camera(path, obstacles, view)
-    optical_from_ego = view.optical_from_ego
-    channel = camera.rsplit("/", 1)[1]
+    for cells in _without_found(drawing.cells):
+        _draw_cells_in_camera(cells, frame, view)
+    _draw_paths_in_camera(_in_drawing_order(drawing), obstacles, view)
+    own_ids = _own_ids(dataset, sample, camera)
     for drawn in drawing.boxes:
-        boxes = _in_ego_frame(dataset, sample, drawn).transform(optical_from_ego, channel)
-        is_other = boxes.actor_id != OWN_ACTOR_ID
-        order = np.argsort(-boxes.center[:, 2], kind="stable")
-        rows = order[is_other[order]]
-        colors = [ROLE_COLORS[drawn.role]] * len(rows)
-        style: dict[str, Any] = {"linestyle": DASHED} if drawn.role == "missed" else {}
-        draw_boxes_in_image(boxes.select(rows), view.lens, ax, colors, **style)
+        boxes = _in_ego_frame(dataset, sample, drawn)
+        _draw_boxes_in_camera(replace(drawn, boxes=boxes), own_ids, view)
     for place in drawing.places:
         color = ROLE_COLORS[place.role]
-        posts = list(view.posts(place.xy))
-        view.draw_lines(posts, color, width=2.0)
+        tops = view.optical(place.xy, POST_HEIGHT_M)
+        for position, is_hidden in zip(place.xy, is_covered(tops, obstacles), strict=True):
+            opacity = _HIDDEN_OPACITY if is_hidden else 1.0
+            view.draw_lines(list(view.posts(position[None])), color, width=2.0, opacity=opacity)
         if place.note:
             view.write(place.note, place.xy, color)
     if drawing.alarm is not None:
@@ -155,12 +200,24 @@ def draw_drawing_in_camera(
 
 
 def best_camera_of_drawing(dataset: Dataset, sample: str, drawing: Drawing) -> str:
-    """Return the token of the agent's image that shows most of a drawing's positions.
+    """Return the token of the image that shows a drawing best.
 
-    Near positions count more. If no image shows any, it is the front camera's.
+    For an alarm it is the image, of any agent, that shows the colliding pair best. Otherwise it is
+    the one of the sample's agent that shows most of the drawing's positions; near positions count
+    more. If no image shows any, it is the front camera's.
     """
+    pairs = [drawn for drawn in drawing.boxes if drawn.role == "collision"]
+    if drawing.alarm is not None and pairs:
+        world_from_ego = dataset.world_from(sample, "ego")
+        pair = _in_ego_frame(dataset, sample, pairs[0]).transform(world_from_ego, "world")
+        frame_token = dataset.get("sample", sample)["frame_token"]
+        samples = [record["token"] for record in dataset.samples_of(frame_token)]
+        view = best_view(dataset, samples, pair)
+        if view is not None:
+            return view.camera
     positions = _shown_positions(drawing)
-    points = np.column_stack([positions, np.zeros(len(positions))])
+    heights = np.full(len(positions), ground_height(dataset, sample))
+    points = np.column_stack([positions, heights])
     weights = {}
     for channel in sorted(CAMERAS, key=lambda name: name != "Camera_Front"):
         camera = f"{sample}/{channel}"
@@ -184,13 +241,20 @@ def drawing_handles(drawing: Drawing) -> list[Artist]:
         if path.width:
             handle: Artist = Patch(facecolor=(color, _RIBBON_OPACITY), edgecolor=color)
         else:
-            width = _LINE_WIDTHS_PT.get(path.role, _PREDICTED_WIDTH_PT)
-            handle = Line2D([], [], color=color, linewidth=width)
+            handle = Line2D([], [], color=color, linewidth=_line_width(path.role))
         handles[path.label] = handle
     for boxes in drawing.boxes:
-        color = ROLE_COLORS[boxes.role]
+        color = _edge_color(boxes.role)
         fill = _FILLS.get(boxes.role, _BOX_OPACITY)
-        handles[boxes.label] = Patch(facecolor=(color, fill), edgecolor=color)
+        handles[boxes.label] = Patch(
+            facecolor=(color, fill), edgecolor=color, **_line_style(boxes.role)
+        )
+    for cells in _without_found(drawing.cells):
+        color = _cell_color(cells.role)
+        handle = Patch(facecolor=(color, _CELL_OPACITY), edgecolor=color)
+        if cells.role == "missed":
+            handle.set(edgecolor=MUTED_COLOR, linestyle=DASHED)
+        handles[cells.label] = handle
     for place in drawing.places:
         color = ROLE_COLORS[place.role]
         marker: dict[str, Any] = _marker_of(place.role)
@@ -228,17 +292,16 @@ def is_covered(points: FloatArray, boxes: Boxes) -> BoolArray:
         points: (N, 3) points in the frame of the boxes, such as an optical frame.
         boxes: Boxes that hide what is behind them.
     """
-    covered = np.zeros(len(points), dtype=bool)
-    for box in boxes:
-        box_from_frame = box.rotation_matrix.T
-        start = box_from_frame @ -box.center
-        directions = points @ box_from_frame.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = (np.array([[-0.5], [0.5]]) * box.size - start)[:, None] / directions
-        entry = np.fmax.reduce(shares.min(axis=0), axis=1)
-        leave = np.fmin.reduce(shares.max(axis=0), axis=1)
-        covered |= (entry < leave) & (entry > 0) & (entry < _SHARE_BEFORE_POINT)
-    return covered
+    frame_from_box = quaternions.to_matrix(boxes.rotation)
+    start = -(boxes.center[:, None] @ frame_from_box)  # the origin, seen from each box
+    directions = points @ frame_from_box
+    sides = np.stack([-boxes.size / 2, boxes.size / 2])[:, :, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = (sides - start) / directions
+    entry = np.fmax.reduce(shares.min(axis=0), axis=-1)
+    leave = np.fmin.reduce(shares.max(axis=0), axis=-1)
+    covers = (entry < leave) & (entry > 0) & (entry < _SHARE_BEFORE_POINT)
+    return np.asarray(covers.any(axis=0))
 
 
 def _shown_positions(drawing: Drawing) -> FloatArray:
@@ -250,6 +313,9 @@ def _shown_positions(drawing: Drawing) -> FloatArray:
     positions += [path.xy for path in drawing.paths]
     positions += [place.xy for place in drawing.places]
     positions += [drawn.boxes.center[:, :2] for drawn in drawing.boxes if drawn.role != "collision"]
+    for cells in drawing.cells:
+        is_occupied = cells.instance.any(axis=0)
+        positions.append(cells.grid.centers()[is_occupied])
     all_positions = np.concatenate(positions)
     is_near = np.abs(all_positions).max(axis=1) <= _MAX_VIEW_RANGE_M - _VIEW_MARGIN_M
     near_positions: FloatArray = all_positions[is_near]
@@ -276,32 +342,160 @@ def _obstacles(dataset: Dataset, view: CameraView) -> Boxes:
     return boxes.select(boxes.actor_id != OWN_ACTOR_ID)
 
 
-def _draw_path_from_above(path: DrawnPath, ax: Axes) -> None:
-    color = ROLE_COLORS[path.role]
-    opacity = path_opacity(path)
-    if path.width and len(path.xy) > 1:
-        outline = ribbon(path.xy, path.width)
-        ax.fill(*outline.T, color=color, alpha=_RIBBON_OPACITY * opacity, linewidth=0, zorder=3)
-    width = _LINE_WIDTHS_PT.get(path.role, _PREDICTED_WIDTH_PT)
-    ax.plot(*path.xy.T, color=color, alpha=opacity, linewidth=width, zorder=4)
+def _own_ids(dataset: Dataset, sample: str, camera: str) -> list[int]:
+    """Return the ids, in boxes of a sample, of the agent that a camera is on."""
+    camera_sample = camera.rsplit("/", 1)[0]
+    agent_token = dataset.get("sample", camera_sample)["agent_token"]
+    own_ids = [OWN_ACTOR_ID] if camera_sample == sample else []
+    actor_id = dataset.get("agent", agent_token)["actor_id"]
+    if actor_id is not None:
+        own_ids.append(actor_id)
+    return own_ids
 
 
-def _draw_path_in_camera(path: DrawnPath, obstacles: Boxes, view: CameraView) -> None:
-    from matplotlib.collections import PolyCollection
+def _line_style(role: Role) -> dict[str, Any]:
+    """Return the options for the outlines of boxes and cells; missed ones are dashed."""
+    if role == "missed":
+        return {"linestyle": DASHED}
+    return {}
 
-    color = ROLE_COLORS[path.role]
-    width = _LINE_WIDTHS_PT.get(path.role, _PREDICTED_WIDTH_PT)
-    for piece, is_hidden in _pieces(path.xy, obstacles, view):
+
+def _edge_color(role: Role) -> str:
+    """Return the colour of outlines from above; missed ones would be too pale on a road."""
+    if role == "missed":
+        return MUTED_COLOR
+    return ROLE_COLORS[role]
+
+
+def _cell_color(role: Role) -> str:
+    if role == "truth":
+        return _TRUE_CELL_COLOR
+    return ROLE_COLORS[role]
+
+
+def _draw_cells_from_above(kinds: Sequence[DrawnCells], ax: Axes) -> None:
+    """Draw a trail of all kinds of cells; where predictions are drawn, found true cells are not."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgb
+
+    shown_kinds = _without_found(kinds)
+    if not shown_kinds:
+        return
+    kind_maps = np.zeros(shown_kinds[0].instance.shape, dtype=np.int64)
+    colors = ["white"]
+    for number, cells in enumerate(shown_kinds, 1):
+        kind_maps[cells.instance > 0] = number
+        colors.append(_cell_color(cells.role))
+    palette = np.array([to_rgb(color) for color in colors])
+    grid = shown_kinds[0].grid
+    picture = np.dstack([trail_picture(kind_maps, palette), kind_maps.any(axis=0)])
+    draw_cells(ax, picture, grid)
+    for cells in shown_kinds:
+        if cells.role == "missed":
+            lines = instance_outlines(cells.instance.max(axis=0), grid)
+            style = {"colors": _edge_color(cells.role), "linestyles": DASHED}
+            ax.add_collection(LineCollection(lines, linewidths=1.0, zorder=3, **style))
+
+
+def _without_found(kinds: Sequence[DrawnCells]) -> list[DrawnCells]:
+    """Return the cells without the found true ones, where predicted cells lie on them."""
+    has_predictions = any(cells.role not in ("truth", "missed") for cells in kinds)
+    return [cells for cells in kinds if cells.role != "truth" or not has_predictions]
+
+
+def _draw_cells_in_camera(cells: DrawnCells, frame: int, view: CameraView) -> None:
+    """Draw the cells of a frame on the ground; missed ones are only outlined."""
+    color = _cell_color(cells.role)
+    is_missed = cells.role == "missed"
+    areas = view.on_ground(instance_outlines(cells.instance[frame], cells.grid))
+    if not is_missed:
+        view.fill(areas, color, opacity=_CELL_OPACITY)
+    view.draw_lines(areas, color, width=_OUTLINE_WIDTH_PT, dashed=is_missed)
+
+
+def instance_outlines(instance: AnyArray, grid: BevGrid) -> list[FloatArray]:
+    """Return closed lines (P, 2), metres in the ego frame, around instances in a map (H, W).
+
+    Holes are not outlined.
+    """
+    low, _, cell_size = np.array([grid.x, grid.y]).T
+    lines = []
+    for instance_id in np.unique(instance[instance > 0]).tolist():
+        rows, columns = np.nonzero(instance == instance_id)
+        first_row, first_column = rows.min(), columns.min()
+        part = instance[first_row : rows.max() + 1, first_column : columns.max() + 1]
+        first_cell = np.array([first_column, first_row], dtype=np.float64)
+        for polygon in outlines(part == instance_id, first_cell, 1.0).geoms:
+            corners = np.asarray(polygon.exterior.coords)
+            lines.append(low + corners * cell_size)
+    return lines
+
+
+def _draw_boxes_in_camera(drawn: DrawnBoxes, own_ids: Sequence[int], view: CameraView) -> None:
+    """Draw boxes in the ego frame, the nearest on top, with the highest scores."""
+    channel = view.camera.rsplit("/", 1)[1]
+    boxes = drawn.boxes.transform(view.optical_from_ego, channel)
+    is_other = ~np.isin(boxes.actor_id, own_ids)
+    order = np.argsort(-boxes.center[:, 2], kind="stable")
+    rows = order[is_other[order]]
+    color = ROLE_COLORS[drawn.role]
+    colors = [color] * len(rows)
+    shown_boxes = boxes.select(rows)
+    in_image = draw_boxes_in_image(
+        shown_boxes, view.lens, view.ax, colors, **_line_style(drawn.role)
+    )
+    if drawn.scores is None or (drawn.scores == 1).all():
+        return
+    rows = rows[in_image]
+    surest_rows = rows[np.argsort(-drawn.scores[rows], kind="stable")][:_MAX_SCORES]
+    tops = boxes.select(surest_rows).corners()[:, _TOP_CORNERS].mean(axis=1)
+    pixels, depth = view.lens.project(tops)
+    is_shown = view.lens.in_image(pixels, depth)
+    shown_scores = drawn.scores[surest_rows[is_shown]].tolist()
+    chips = [
+        (f"{score:.2f}", pixel) for score, pixel in zip(shown_scores, pixels[is_shown], strict=True)
+    ]
+    place_chips(view.ax, chips, colors=[color] * len(chips))
+
+
+def _draw_paths_from_above(paths: Sequence[DrawnPath], ax: Axes) -> None:
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba
+
+    colors = []
+    widths = []
+    for path in paths:
+        color = ROLE_COLORS[path.role]
         opacity = path_opacity(path)
-        if is_hidden:
-            opacity *= _HIDDEN_OPACITY
-        if path.width:
-            areas = view.on_ground([ribbon(piece, path.width)])
-            polygons = PolyCollection(
-                areas, facecolors=color, alpha=_RIBBON_OPACITY * opacity, edgecolors="none"
-            )
-            view.ax.add_collection(polygons, autolim=False)
-        view.draw_lines(view.on_ground([piece]), color, width=width, opacity=opacity)
+        if path.width and len(path.xy) > 1:
+            outline = ribbon(path.xy, path.width)
+            ax.fill(*outline.T, color=color, alpha=_RIBBON_OPACITY * opacity, linewidth=0, zorder=3)
+        colors.append(to_rgba(color, opacity))
+        widths.append(_line_width(path.role))
+    lines = LineCollection([path.xy for path in paths], colors=colors, linewidths=widths, zorder=4)
+    ax.add_collection(lines, autolim=False)
+
+
+def _draw_paths_in_camera(paths: Sequence[DrawnPath], obstacles: Boxes, view: CameraView) -> None:
+    """Draw paths; pieces of the same look are drawn together, since each drawing takes time."""
+    pieces_by_look: dict[tuple[Role, float], list[FloatArray]] = {}
+    for path in paths:
+        for piece, is_hidden in _pieces(path.xy, obstacles, view):
+            opacity = path_opacity(path)
+            if is_hidden:
+                opacity *= _HIDDEN_OPACITY
+            if path.width:
+                areas = view.on_ground([ribbon(piece, path.width)])
+                view.fill(areas, ROLE_COLORS[path.role], opacity=_RIBBON_OPACITY * opacity)
+            pieces_by_look.setdefault((path.role, opacity), []).append(piece)
+    for (role, opacity), pieces in pieces_by_look.items():
+        lines = view.on_ground(pieces)
+        view.draw_lines(lines, ROLE_COLORS[role], width=_line_width(role), opacity=opacity)
+
+
+def _line_width(role: Role) -> float:
+    """Return the width of a path's line, in points."""
+    return _LINE_WIDTHS_PT.get(role, _PREDICTED_WIDTH_PT)
 
 
 def _pieces(
@@ -309,17 +503,17 @@ def _pieces(
 ) -> Iterator[tuple[FloatArray, bool]]:
     """Divide a path (T, 2) where it begins or ceases to be hidden; all its positions remain.
 
-    Yield each part, and whether it is hidden.
+    Yield each part, and whether it is hidden. A path behind the camera has no parts.
     """
-    dense_parts = [path[:1]]
-    for start, end in pairwise(path):
-        count = max(int(np.ceil(np.linalg.norm(end - start) / _MAX_PIECE_M)), 1)
-        dense_parts.append(np.linspace(start, end, count + 1)[1:])
-    dense_path = np.concatenate(dense_parts)
-    if len(dense_path) < 2:
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths / _MAX_PIECE_M), 1).astype(np.int64)
+    corners = np.concatenate([[0], np.cumsum(counts)])
+    rows = np.arange(corners[-1] + 1)
+    dense_path = np.column_stack([np.interp(rows, corners, column) for column in path.T])
+    middles = view.optical((dense_path[:-1] + dense_path[1:]) / 2)
+    if not (middles[:, 2] > 0).any():
         return
-    middles = (dense_path[:-1] + dense_path[1:]) / 2
-    hidden = is_covered(view.optical(middles), obstacles)
+    hidden = is_covered(middles, obstacles)
     changes = np.flatnonzero(np.diff(hidden)) + 1
     bounds = [0, *changes.tolist(), len(hidden)]
     for start, end in pairwise(bounds):
@@ -338,6 +532,8 @@ def _draw_alarm(alarm: DrawnAlarm, ax: Axes) -> None:
     from matplotlib.patches import Rectangle
 
     left, low, width, height = _BAR
+    corners = np.array([(0.0, 0.0), (left + width, low + _ALARM_LINES * height)])
+    keep_free(ax, [ax.transData.inverted().transform(ax.transAxes.transform(corners))])
     color = COLLIDER_COLOR if alarm.fires else "black"
     options: dict[str, Any] = {"transform": ax.transAxes, "zorder": 7}
     bar = Rectangle((left, low), width, height, facecolor="white", edgecolor="black", **options)

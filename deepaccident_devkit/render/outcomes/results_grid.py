@@ -14,7 +14,6 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, EvaluationError
 from deepaccident_devkit.evaluation.counting import evaluate_samples
 from deepaccident_devkit.evaluation.drawing import Drawing
-from deepaccident_devkit.evaluation.predictions import labels_at_present
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import (
     EvaluationSetup,
@@ -24,18 +23,11 @@ from deepaccident_devkit.evaluation.runs.setups import (
 )
 from deepaccident_devkit.evaluation.task import headlines
 from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
-from deepaccident_devkit.render.boxes import collider_ids
 from deepaccident_devkit.render.captions import draw_legend, set_scene_title, set_title
 from deepaccident_devkit.render.figures import Layer, figure_or_new, lay_out_figure
-from deepaccident_devkit.render.motion_maps import draw_trail_of, maps_of_labels
-from deepaccident_devkit.render.outcomes.above import (
-    MOTION_LAYERS,
-    draw_motion_side,
-    layers_without_ids,
-    motion_outcome,
-)
 from deepaccident_devkit.render.outcomes.described import described_sample
-from deepaccident_devkit.render.outcomes.drawings import DRAWING_LAYERS, draw_drawing_from_above
+from deepaccident_devkit.render.outcomes.drawings import draw_drawing_from_above
+from deepaccident_devkit.render.outcomes.evaluation import drawing_layers
 from deepaccident_devkit.render.styles import in_own_settings, text_size
 
 if TYPE_CHECKING:
@@ -149,7 +141,7 @@ def _badness(loader: SampleLoader, tokens: Sequence[str], workers: int | None) -
     badness = {}
     for token in tokens:
         for number in headlines(evaluator.compute([token])):
-            is_main = number.path == evaluator.main_numbers[0]
+            is_main = number.path in evaluator.main_numbers[:1]
             if is_main and number.value is not None and np.isfinite(number.value):
                 sign = 1.0 if number.higher_is_better is False else -1.0
                 badness[token] = sign * number.value
@@ -191,7 +183,7 @@ def render_results(
         results: Results by the name of the method, which stands at the left of its row.
         task: Task that judges the predictions; None for the one of the results.
         protocol: Protocol of the task; None for the one of `render_evaluation`.
-        layers: Layers of the task, as for `render_evaluation`.
+        layers: Layers, as for `render_evaluation`.
         fig: Empty figure to render on; a new one if None.
 
     Returns:
@@ -203,15 +195,15 @@ def render_results(
         ChoiceError: No such task, protocol or layer.
         EvaluationError: The protocol cannot evaluate such predictions.
     """
+    shown_layers = drawing_layers(layers)
     loaders = [_loader_of(dataset, opened, task, protocol) for opened in results.values()]
     width, height = _PANEL_SIZE_IN
     rows = len(results) + 1
     fig = figure_or_new(fig, (width * len(samples), height * rows))
     axes = fig.subplots(rows, len(samples), squeeze=False)
-    draw_column = _draw_motion if loaders[0].setup.task == "motion" else _draw_described
     handles: dict[Any, Artist] = {}
     for sample, column in zip(samples, axes.T, strict=True):
-        for handle in draw_column(loaders, sample, layers, column):
+        for handle in _draw_column(loaders, sample, shown_layers, column):
             handles.setdefault(handle.get_label(), handle)
         set_scene_title(column[0], dataset, sample)
         for ax in column:
@@ -222,25 +214,25 @@ def render_results(
     return lay_out_figure(fig)
 
 
-def _draw_described(
+def _draw_column(
     loaders: Sequence[SampleLoader],
     sample: str,
-    layers: Sequence[Layer] | None,
+    layers: frozenset[Layer],
     column: Sequence[Axes],
 ) -> list[Artist]:
-    """Draw what a task describes of a sample, and return the handles for a legend."""
-    shown_layers = layers_without_ids(layers, DRAWING_LAYERS)
+    """Draw the truth and all methods of a sample, and return the handles for a legend."""
     described = [described_sample(loader, sample) for loader in loaders]
     drawings = [method.drawing for method in described]
     everything = Drawing(
         paths=tuple(chain.from_iterable(drawing.paths for drawing in drawings)),
         boxes=drawings[0].boxes,
+        cells=tuple(chain.from_iterable(drawing.cells for drawing in drawings)),
         places=tuple(chain.from_iterable(drawing.places for drawing in drawings)),
     )
     handles: list[Artist] = []
     for drawing, ax in zip([_true_part(drawings[0]), *drawings], column, strict=True):
         handles += draw_drawing_from_above(
-            loaders[0].dataset, sample, drawing, shown_layers, ax, shown=everything
+            loaders[0].dataset, sample, drawing, layers, ax, shown=everything
         )
     for method, ax in zip(described, column[1:], strict=True):
         set_title(ax, method.words.partition(": ")[2], fontsize=text_size(), y=None)
@@ -248,36 +240,10 @@ def _draw_described(
 
 
 def _true_part(drawing: Drawing) -> Drawing:
-    """Return what a drawing shows of the truth.
-
-    The collision of an alarm is true; that of a plan is the plan's own.
-    """
-    roles = {"truth", "past", "missed"}
-    if drawing.alarm is not None:
-        roles.add("collision")
-    boxes = [drawn for drawn in drawing.boxes if drawn.role in roles]
-    return Drawing(
-        paths=tuple(path for path in drawing.paths if path.role in roles),
-        boxes=tuple(replace(drawn, role="truth", label="true box") for drawn in boxes),
-        places=tuple(place for place in drawing.places if place.role in roles),
-    )
-
-
-def _draw_motion(
-    loaders: Sequence[SampleLoader],
-    sample: str,
-    layers: Sequence[Layer] | None,
-    column: Sequence[Axes],
-) -> list[Artist]:
-    """Draw instances: the true ones in colours, the predicted ones as right or false."""
-    shown_layers = layers_without_ids(layers, MOTION_LAYERS)
-    for loader, ax in zip(loaders, column[1:], strict=True):
-        prediction, label = loader(sample)
-        draw_motion_side(motion_outcome(prediction, label), "predicted", layers=layers, ax=ax)
-    pair_ids = collider_ids(loaders[0].dataset, sample)
-    _, label = loaders[0](sample)
-    maps = maps_of_labels(labels_at_present(label), pair_ids)
-    draw_trail_of(maps, shown_layers, column[0])
-    for ax in column[1:]:
-        ax.axis(column[0].axis())
-    return []
+    """Return the truth of a drawing as it is for all methods, without outcomes."""
+    truth = drawing.truth
+    pair = [drawn for drawn in truth.boxes if drawn.role == "collision"]
+    others = [drawn for drawn in truth.boxes if drawn.role != "collision"]
+    true_boxes = [replace(drawn, role="truth", label="true box") for drawn in others]
+    cells = [replace(drawn, role="truth", label="true instance") for drawn in truth.cells]
+    return replace(truth, boxes=(*true_boxes, *pair), cells=tuple(cells))

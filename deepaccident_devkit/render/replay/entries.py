@@ -1,4 +1,4 @@
-"""Agents, actors, cameras and foreseen accidents of a scenario, as data for a replay page."""
+"""Agents, actors and cameras of a scenario, as data for a replay page."""
 
 from __future__ import annotations
 
@@ -12,24 +12,8 @@ from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
-from deepaccident_devkit.evaluation import (
-    Accident,
-    AccidentContext,
-    BoxAccidents,
-    MotionOutput,
-    accident_context,
-)
-from deepaccident_devkit.evaluation.accident import Prediction
-from deepaccident_devkit.evaluation.accident.scoring import ERRORS_AT, hit_of
-from deepaccident_devkit.evaluation.alarms import Pair, named_alarms
-from deepaccident_devkit.evaluation.predictions import checked_prediction
-from deepaccident_devkit.evaluation.results import Results
-from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
-from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
-from deepaccident_devkit.geometry import SE3, Boxes, quaternions
-from deepaccident_devkit.motion import MotionLabels
+from deepaccident_devkit.geometry import Boxes, quaternions
 from deepaccident_devkit.render.boxes import actor_color, agent_letters, camera_name, recorders_of
-from deepaccident_devkit.render.outcomes.above import count_words, error_words
 from deepaccident_devkit.render.styles import AGENT_COLORS
 from deepaccident_devkit.support.arrays import (
     AnyArray,
@@ -48,12 +32,6 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, pair_approach, scenar
 
 if TYPE_CHECKING:
     from deepaccident_devkit.tables.records import ScenarioRecord
-
-# A results file, or predictions by sample token.
-ReplayPrediction = Results | Mapping[str, Any]
-_PROTOCOL = BoxAccidents()
-# Maximum number of alarms of a sample that are shown: right ones first, then the most confident.
-_MAX_ALARMS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -327,130 +305,3 @@ def _seen_masks(recording: ReplayRecording, ids: IntArray) -> AnyArray:
             is_visible = np.isin(ids, visible)
             masks[is_visible, column] |= 1 << bit
     return masks
-
-
-def predicted_samples(
-    recording: ReplayRecording, prediction: ReplayPrediction
-) -> list[tuple[AgentName, int]]:
-    """Return the agents and frames with a prediction, ordered by frame.
-
-    Raises:
-        NotAvailableError: There is no prediction for this scenario and these agents.
-    """
-    samples = []
-    for frame in recording.frames:
-        for agent in recording.agents:
-            if recording.sample(agent, frame) in prediction:
-                samples.append((agent, frame))
-    if not samples:
-        raise NotAvailableError(
-            f"prediction: has no sample of {recording.scenario['token']} and "
-            f"{', '.join(recording.agents)}; choose a scenario and agents that the prediction "
-            "has, or replay without a prediction"
-        )
-    return samples
-
-
-def prediction_entries(recording: ReplayRecording, prediction: ReplayPrediction) -> dict[str, Any]:
-    """Return the rule in words, and the foreseen accidents of each sample with a prediction.
-
-    Instance maps in a mapping must have the orientation of the released labels.
-
-    Raises:
-        NotAvailableError: There is no prediction for this scenario and these agents, or a sample
-            has no label.
-    """
-    horizon = RELEASED_HORIZON
-    if isinstance(prediction, Results) and prediction.form is not None:
-        seconds = (prediction.form.frames - 1) * prediction.form.step
-        horizon = min(RELEASED_HORIZON, seconds)
-    samples = []
-    for agent, frame in predicted_samples(recording, prediction):
-        samples.append(_sample_entry(recording, prediction, agent, frame, horizon))
-    rule = (
-        f"Protocol boxes: an accident within {horizon:g} s counts as predicted if the position "
-        f"errors of both actors sum to less than {ERRORS_AT:g} m."
-    )
-    return {"rule": rule, "samples": samples}
-
-
-def _sample_entry(
-    recording: ReplayRecording,
-    prediction: ReplayPrediction,
-    agent: str,
-    frame: int,
-    horizon: float,
-) -> dict[str, Any]:
-    token = recording.sample(agent, frame)
-    foreseen, label, context = _load_sample(recording, prediction, token, horizon)
-    truth = context.truth
-    if truth is None:  # only for the type checker: a context with a horizon has a truth
-        raise NotAvailableError(f"{token}: has no truth to compare with; choose a labelled sample")
-    world_from_ego = recording.dataset.world_from(token, "ego")
-    alarms = []
-    for accident, ids in named_alarms(foreseen, label, truth, _PROTOCOL.reading):
-        alarms.append(_alarm_entry(recording, accident, ids, context, world_from_ego))
-    truth_words = "no accident comes within the horizon"
-    if truth.accident is not None:
-        truth_words = f"an accident comes in {truth.accident.time:.1f} s"
-    return {
-        "frame": frame - 1,
-        "agent": recording.agents.index(agent),
-        "verdict": _verdict(foreseen, label, context),
-        "text": f"{short_name(agent)} at frame {frame}: {truth_words}",
-        "alarms": sorted(alarms, key=lambda alarm: not alarm["right"])[:_MAX_ALARMS],
-        "more": max(0, len(alarms) - _MAX_ALARMS),
-    }
-
-
-def _load_sample(
-    recording: ReplayRecording, prediction: ReplayPrediction, token: str, horizon: float
-) -> tuple[MotionOutput | list[Accident], MotionLabels | None, AccidentContext]:
-    """Return the prediction for a sample (a token), its label and its accident."""
-    if isinstance(prediction, Results):
-        setup = EvaluationSetup(task="accident", protocol="boxes", horizon=horizon)
-        foreseen, label, context = SampleLoader(recording.dataset, prediction, setup)(token)
-        return checked_prediction(foreseen), label, context
-    checked = checked_prediction(prediction[token])
-    return checked, None, accident_context(recording.dataset, token, horizon)
-
-
-def _verdict(foreseen: Prediction, label: MotionLabels | None, context: AccidentContext) -> str:
-    """Return the outcome of a sample in words, or `not judged`."""
-    counts = _PROTOCOL.counts(foreseen, label, context)
-    if counts["unjudged"] and not (counts["positive"] or counts["alarms"]):
-        return "not judged"
-    result = _PROTOCOL.result([counts])
-    return count_words(result.within[ERRORS_AT])
-
-
-def _alarm_entry(
-    recording: ReplayRecording,
-    accident: Accident,
-    ids: Pair | None,
-    context: AccidentContext,
-    world_from_ego: SE3,
-) -> dict[str, Any]:
-    counts = _PROTOCOL.counts([accident], None, context)
-    error = None
-    if counts["alarms"]:
-        error = counts["alarms"][0]
-    text = f"predicted {accident.words}"
-    if error and error["position"] is not None:
-        text += f": {error_words(error['position'], error['time'])}"
-    elif error is None:
-        text += ": it would be after the end of the recording"
-    if ids is not None:
-        names = ["an unknown actor" if actor is None else str(actor) for actor in ids]
-        text += f"; names {' and '.join(names)}"
-        if context.pair is not None and set(ids) == set(context.pair):
-            text += ", who collide"
-    points = [[x, y, 0.0] for x, y in accident.positions.tolist()]
-    world_points = world_from_ego.apply(points)
-    return {
-        "places": recording.page_coordinates(world_points[:, :2]),
-        "right": bool(error and hit_of([error], ERRORS_AT)),
-        "time": round(accident.time, 1),
-        "text": text,
-        "actors": [actor for actor in ids or () if actor is not None],
-    }

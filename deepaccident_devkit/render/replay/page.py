@@ -13,15 +13,13 @@ from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ChoiceError, NotAvailableError, SensorFileError
 from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.captions import scenario_words
-from deepaccident_devkit.render.replay.drawn import drawing_entries, task_to_draw
+from deepaccident_devkit.render.replay.drawn import ReplayPrediction, drawing_entries
 from deepaccident_devkit.render.replay.entries import (
-    ReplayPrediction,
     ReplayRecording,
     actor_entries,
     agent_entries,
     camera_entries,
     pair_entries,
-    prediction_entries,
     recording_of,
 )
 from deepaccident_devkit.render.replay.road import road_picture
@@ -44,7 +42,6 @@ from deepaccident_devkit.render.styles import (
     COLORS,
     GRID_COLOR,
     HEIGHT_COLORS,
-    OUTCOME_COLORS,
     POINT_COLOR,
 )
 from deepaccident_devkit.support.files import write_bytes
@@ -101,11 +98,9 @@ def render_replay(
             accident, for the first one.
         path: Path of the file to write.
         prediction: Results of a model, or predictions by sample token; boxes in a mapping are in
-            the frame of the task's protocol. Of motion and accidents, the page shows the foreseen
-            accidents and whether they are right by the accident protocol `boxes`; of other
-            predictions, what the task draws. None for no prediction.
-        task: Name of the task that draws the predictions, also of a plug-in, such as `warning` for
-            accidents; None for the kind of the predictions.
+            the frame of the task's protocol. None for no prediction.
+        task: Name of the task that draws the predictions, also of a plug-in, such as `accident` for
+            motion; None for the kind of the predictions.
         agents: Agents whose cameras, views and predictions the page shows, as in
             `v2x.cooperating_agents`; None for all present agents.
         progress: Whether to show a progress bar.
@@ -120,7 +115,6 @@ def render_replay(
             folder or does not end in `.html` or `.htm`.
         NotAvailableError: The release has no scenario, lacks one of the agents, or the prediction
             is of other samples.
-        EvaluationError: No task has such predictions.
         SensorFileError: An image or a point cloud cannot be read.
     """
     target = path_of(path)
@@ -154,15 +148,20 @@ def render_replay(
 
 
 def tried_replay(
-    dataset: Dataset, scenario: str, path: Path, *, prediction: ReplayPrediction | None = None
+    dataset: Dataset,
+    scenario: str,
+    path: Path,
+    *,
+    prediction: ReplayPrediction | None = None,
+    task: str | None = None,
 ) -> str | None:
     """Try to write the replay of a scenario; return None, or the reason if this failed.
 
     Possible reasons are that a file cannot be read, or that the prediction cannot be shown.
     """
     try:
-        render_replay(dataset, scenario, path, prediction=prediction)
-    except (NotAvailableError, SensorFileError) as error:
+        render_replay(dataset, scenario, path, prediction=prediction, task=task)
+    except (ChoiceError, NotAvailableError, SensorFileError) as error:
         return str(error)
     return None
 
@@ -173,17 +172,18 @@ def served_replay(
     folder: str,
     *,
     prediction: ReplayPrediction | None = None,
+    task: str | None = None,
 ) -> dict[str, Any]:
     """Return the data for a page that loads all agents' pictures and points from a server.
 
     The page's scripts request `images/AGENT/CHANNEL/FRAME?width=PIXELS` (JPEG) and
     `points/AGENT/FRAME`, which answers with `cloud_text`, below `folder`, an address that ends in a
-    slash. Errors are as for `render_replay`.
+    slash. Other arguments and errors are as for `render_replay`.
     """
     recording = recording_of(dataset, scenario, None)
     files = camera_files(recording)
     clouds = lidar_files(recording)
-    data, _ = _page_data(recording, prediction, None, files, clouds)
+    data, _ = _page_data(recording, prediction, task, files, clouds)
     for agent, cameras in zip(recording.agents, data["cameras"], strict=True):
         for channel, camera in zip(CAMERAS, cameras, strict=True):
             camera["channel"] = channel
@@ -228,11 +228,7 @@ def _page_data(
         impact = recording.page_coordinates(recording.contact.point[:2])
     predicted = None
     if prediction is not None:
-        drawing_task = task_to_draw(prediction, task)
-        if drawing_task:
-            predicted = drawing_entries(recording, prediction, drawing_task)
-        else:
-            predicted = prediction_entries(recording, prediction)
+        predicted = drawing_entries(recording, prediction, task)
     data: dict[str, Any] = {
         "scenario": token,
         "facts": facts(recording),
@@ -244,7 +240,6 @@ def _page_data(
             "points": POINT_COLOR,
             "grid": GRID_COLOR,
             "heights": HEIGHT_COLORS,
-            **OUTCOME_COLORS,
         },
         "markers": dict(CATEGORY_MARKERS),
         "agents": agent_entries(recording),

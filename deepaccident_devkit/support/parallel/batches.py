@@ -169,7 +169,7 @@ def run_unordered(
 
 def in_order(results: _Results[_Result]) -> Generator[_Result, None, None]:
     """Yield the results of `run_unordered` in order, each as soon as all before it are ready."""
-    waiting: dict[int, _Result] = {}
+    waiting = {}
     next_position = 0
     with closing(results):
         for position, result in results:

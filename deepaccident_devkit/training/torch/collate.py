@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from deepaccident_devkit.errors import ConfigError, EvaluationError
 from deepaccident_devkit.evaluation.evaluator import Evaluator, EvaluatorT
 from deepaccident_devkit.support.arrays import AnyArray
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import AGENTS
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def collate(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
     _check_alike(items)
     agent_count = max(len(item["agents"]) for item in items)
-    batch: dict[str, Any] = {} if get_worker_info() is None else _WorkersBatch()
+    batch: NamedValues = {} if get_worker_info() is None else _WorkersBatch()
     for key in items[0]:
         values = [item[key] for item in items]
         if key in _LIST_KEYS:
@@ -115,7 +116,7 @@ def collate_fusion(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
         if key in items[0]:
             parts = [item[key][mask] for item, mask in zip(items, masks, strict=True)]
             batch[key] = _joined(key, parts)
-    names: list[tuple[str, ...]] = []
+    names = []
     clouds: list[Any] = []
     transforms = []
     for item, mask in zip(items, masks, strict=True):
@@ -168,13 +169,13 @@ def collate_all_egos(items: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return batch
 
 
-def _without_keys(item: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+def _without_keys(item: NamedValues, keys: Sequence[str]) -> NamedValues:
     """Return an item without some keys."""
     remaining_keys = [key for key in item if key not in keys]
     return {key: item[key] for key in remaining_keys}
 
 
-def _collate_by_default(items: Sequence[V2XItem], **_: object) -> dict[str, Any]:
+def _collate_by_default(items: Sequence[V2XItem], **_: object) -> NamedValues:
     """Collate with `collate` or, for all egos, `collate_all_egos`; torch calls this for items."""
     if "egos" in items[0]:
         return collate_all_egos(items)
@@ -220,7 +221,7 @@ ForkingPickler.register(V2XItem, lambda item: (V2XItem, (_sendable(item),)))
 ForkingPickler.register(_WorkersBatch, lambda batch: (dict, (_sendable(batch),)))
 
 
-def _check_alike(items: Sequence[dict[str, Any]]) -> None:
+def _check_alike(items: Sequence[NamedValues]) -> None:
     """Check that there is an item, and that all items have the same keys; raises ConfigError."""
     if not items:
         raise ConfigError("batch: expected at least one item, found none")

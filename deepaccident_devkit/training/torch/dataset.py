@@ -10,7 +10,7 @@ import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -20,6 +20,7 @@ from deepaccident_devkit.errors import ConfigError, MissingFileError, NotAvailab
 from deepaccident_devkit.motion import Augmentation, MotionLabelConfig, bev_segmentation
 from deepaccident_devkit.motion.sample_labels import motion_labels_of
 from deepaccident_devkit.support.arrays import IntArray, checked_whole
+from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.tables.tables import token_of
 from deepaccident_devkit.tables.tokens import agent_token
 from deepaccident_devkit.taxonomy import IGNORED_ID, AgentName
@@ -226,7 +227,7 @@ class V2XDataset(TorchDataset):
         )
         return names, arrived, missing_counts
 
-    def _received_item(self, sample: str, augmentation: Augmentation) -> dict[str, Any]:
+    def _received_item(self, sample: str, augmentation: Augmentation) -> NamedValues:
         """Return the sample's own tensors, and the sensor data that arrived."""
         import torch
 
@@ -237,7 +238,7 @@ class V2XDataset(TorchDataset):
         world_from_ego = dataset.world_from(sample, "ego").matrix @ inverse_augmentation
         poses = sensor_data.relative_poses(dataset, sample, names, arrived, augmentation)
         motions = sensor_data.own_motions(dataset, names, arrived, augmentation)
-        item: dict[str, Any] = {
+        item: NamedValues = {
             "token": sample,
             "agents": names,
             "agent_valid": tensor(sensor_data.valid_mask(names, arrived)),
@@ -261,13 +262,13 @@ class V2XDataset(TorchDataset):
 
     def _target_items(
         self, samples: Sequence[str], augmentation: Augmentation
-    ) -> list[dict[str, Any]]:
+    ) -> list[NamedValues]:
         """Return the tensors to be predicted, with each sample's agent as the ego."""
         grid = self.config.bev_segmentation
-        items: list[dict[str, Any]] = []
+        items: list[NamedValues] = []
         label_items = self._label_items(samples, augmentation)
         for sample, label_item in zip(samples, label_items, strict=True):
-            item: dict[str, Any] = {}
+            item: NamedValues = {}
             if self.config.boxes is not None:
                 item.update(self._box_item(sample, augmentation))
             if self.config.window is not None:

@@ -605,7 +605,7 @@ def test_detected_boxes_are_drawn_right_false_and_missed(
             centers[entity.id.split()[0]] = (position.x, position.y, position.z)
     np.testing.assert_allclose(centers["right"], right.center, atol=1e-6)
     np.testing.assert_allclose(centers["false"], false.center, atol=1e-6)
-    assert {*centers} == {"right", "false"}
+    assert {*centers} == {"right", "false", "collision"}
     cloud = read_cloud(recording.decoded("/ego_vehicle/prediction/boxes/points")[0])
     offsets = read_positions(cloud)[None] - boxes.corners()[0][:, None]
     distances_m = np.linalg.norm(offsets, axis=-1)
@@ -717,7 +717,7 @@ def test_unknown_scenarios_and_invalid_predictions_are_refused(
         ),
         (
             lambda: export({token: "an accident"}),
-            ConfigError,
+            ChoiceError,
             ("DetectedBoxes, or a list of Accidents", "found str"),
         ),
         (

@@ -239,7 +239,7 @@ def test_the_bev_camera_lies_under_the_picture_the_right_way_round(
     ax = new_axes()
     ax.set(xlim=(70, 130), ylim=(-80, -20), aspect="equal")
 
-    draw_underlay(image, ax, target_from_ego=world_from_ego, view_range=30)
+    draw_underlay(image, ax, target_from_ego=world_from_ego)
 
     assert (ax.get_xlim(), ax.get_ylim()) == ((70, 130), (-80, -20))
     canvas = render_canvas(ax)

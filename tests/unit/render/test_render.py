@@ -23,9 +23,7 @@ from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.accident import draw_countdown
 from deepaccident_devkit.render.outcomes import (
-    draw_outcome_in_camera,
     render_outcome_in_cameras,
-    sample_verdict,
 )
 from deepaccident_devkit.render.styles import current_style
 from deepaccident_devkit.taxonomy import AGENTS
@@ -172,7 +170,7 @@ REFUSED_CASES: list[tuple[Draw, type[Exception], str]] = [
     refuse_layer("render_calibration", "bev"),
     refuse_layer("render_link", "image", Link()),
     refuse_layer("render_sample", "labels"),
-    refuse_layer("render_evaluation", "labels", []),
+    refuse_layer("render_evaluation", "points", []),
     refuse_layer("render_motion_labels", "velocities", style="trail"),
     (
         lambda da, sample: da.render_accident(scenario_of(sample), layers=["labels"]),
@@ -255,7 +253,7 @@ REFUSED_CASES: list[tuple[Draw, type[Exception], str]] = [
             (
                 lambda da, sample, draw=draw: draw(da, sample, [], task="motion"),
                 ChoiceError,
-                "task.*accident.*'motion'",
+                "task 'motion': .*found accident",
             ),
             (
                 lambda da, sample, draw=draw: draw(da, sample, [], protocol="released"),
@@ -285,30 +283,18 @@ def test_what_cannot_be_rendered_is_refused(
     assert plt.get_fignums() == []
 
 
-@pytest.mark.parametrize(
-    ("camera", "frame", "sentence"),
-    [
-        ("Camera_Front", -1, "frame: expected a recorded frame, from 0 to {last}, found -1"),
-        ("Camera_Front", 99, "frame: expected a recorded frame, from 0 to {last}, found 99"),
-        ("lidar01", None, "camera: expected one of .*, found 'lidar01'"),
-    ],
-)
-def test_a_panel_of_no_camera_or_frame_is_refused(
-    da_motion: DeepAccident,
-    sample: str,
-    labels: MotionLabels,
-    camera: str,
-    frame: int | None,
-    sentence: str,
+@pytest.mark.parametrize("frame", [-1, 99])
+def test_a_frame_that_is_not_recorded_is_refused(
+    da_motion: DeepAccident, sample: str, labels: MotionLabels, frame: int
 ) -> None:
     prediction = instances_of(labels.instance, labels.config.grid)
-    verdict = sample_verdict(da_motion, sample, prediction, label=labels)
+    last = int(labels.label_valid.sum()) - 1
 
     assert_raises(
         (
-            lambda: draw_outcome_in_camera(da_motion, verdict, camera, frame=frame),
+            lambda: render_outcome_in_cameras(da_motion, sample, prediction, frame=frame),
             ChoiceError,
-            sentence.format(last=int(labels.label_valid.sum()) - 1),
+            f"frame: expected a recorded frame, from 0 to {last}, found {frame}",
         )
     )
 

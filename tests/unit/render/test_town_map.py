@@ -7,9 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex
 from support.expected_errors import assert_raises
-from support.rendered_pixels import canvas_positions, has_color, new_axes, render_canvas
+from support.rendered_pixels import (
+    canvas_positions,
+    ground_colors,
+    has_color,
+    new_axes,
+    render_canvas,
+)
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
@@ -36,11 +41,8 @@ def unmapped_da(release_root: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 def read_ground_colors(ax: Axes) -> list[set[str]]:
     """Return the colours of each picture drawn, the lowest picture first."""
-    colors = []
-    for image in sorted(ax.images, key=lambda image: image.get_zorder()):
-        pixels = np.asarray(image.get_array()).reshape(-1, 3)
-        colors.append({to_hex(color / 255) for color in np.unique(pixels, axis=0)})
-    return colors
+    images = sorted(ax.images, key=lambda image: image.get_zorder())
+    return [ground_colors(image) for image in images]
 
 
 def test_a_stored_map_replaces_a_missing_bev_camera_but_none_is_made_for_it(

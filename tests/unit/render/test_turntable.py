@@ -7,7 +7,7 @@ from support.replay_page import accident_scenario
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.render.figures import figure_of_pixels
 from deepaccident_devkit.render.turntable import draw_turntable
-from deepaccident_devkit.taxonomy import AGENTS
+from deepaccident_devkit.taxonomy import AGENTS, short_name
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (640, 500)])
@@ -29,7 +29,21 @@ def test_it_has_points_of_all_agents_and_twelve_edges_of_each_box(da: DeepAccide
     draw_turntable(da, frame, agents=AGENTS, fig=fig)
 
     (ax,) = fig.axes
-    points, lines = ax.collections
+    points, lines, road = ax.collections
     assert len(np.unique(points.get_facecolor(), axis=0)) == len(AGENTS)
     assert len(lines._segments3d) % 12 == 0
     assert len(lines._segments3d) > 0
+
+    (legend,) = fig.legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert {short_name(agent) for agent in AGENTS} <= {*names}
+    scenario, number = frame.rsplit("/", 1)
+    positions = np.array(
+        [da.world_from(f"{scenario}/{agent}/{number}", "ego").translation for agent in AGENTS]
+    )
+    x, y, z = road._offsets3d
+    offsets = (positions - positions.mean(axis=0))[:4]  # the infrastructure is beside the road
+    for offset in offsets:
+        distances = np.hypot(x - offset[0], y - offset[1])
+        assert distances.min() < 3
+    np.testing.assert_allclose(z, offsets[0, 2], atol=0.1)

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex, to_rgb, to_rgba
-from support.rendered_pixels import read_texts
+from matplotlib.colors import to_hex, to_rgba
+from support.rendered_pixels import ground_colors, read_texts
 from support.replay_page import normal_scenario
 
 from deepaccident_devkit import DeepAccident
@@ -155,8 +155,7 @@ def test_the_road_is_from_the_bev_camera_nearest_to_the_middle(
     sample = da.get_sample(da.scenario[0], "ego_vehicle", 3)
     ax = draw_panel(da, sample)
     (road,) = ax.images
-    road_rgb = np.rint(255 * np.array(to_rgb(BEV_COLORS["road"])))
-    assert (road.get_array() == road_rgb).all(axis=-1).any()
+    assert BEV_COLORS["road"] in ground_colors(road)
     middle = np.mean(ax.viewLim.get_points(), axis=0)
     ego_from_world = da.world_from(sample, "ego").inverse()
     positions = []

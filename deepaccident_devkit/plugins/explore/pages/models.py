@@ -138,7 +138,6 @@ def _make_bundle_context(explorer: Explorer, model: Model, bundle: Bundle) -> Va
         "faults": worst.faults,
         "waits": [*worst.waits],
         "choices": choices,
-        "path": bundle.summary["results"]["path"],
     }
 
 

@@ -20,7 +20,6 @@ from deepaccident_devkit.evaluation.breakdowns import (
     attribute_name,
     sample_attributes,
 )
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.runs.setups import (
     SampleLoader,
     agent_of,
@@ -47,7 +46,7 @@ from deepaccident_devkit.plugins.explore.pages.scenario import read_sample_token
 from deepaccident_devkit.plugins.explore.scenarios import UNKNOWN_VALUE
 from deepaccident_devkit.render.figures import detached_figure
 from deepaccident_devkit.render.outcomes import render_evaluation, render_outcome_in_cameras
-from deepaccident_devkit.render.outcomes.evaluation import figure_size
+from deepaccident_devkit.render.outcomes.evaluation import FIGURE_SIZE_IN
 from deepaccident_devkit.support.human_names import metric_name
 from deepaccident_devkit.support.pages import path_in_address
 from deepaccident_devkit.support.text import natural_order
@@ -279,7 +278,7 @@ def explain_missing_picture(explorer: Explorer, model: Model, token: str) -> str
     if not is_sample(explorer.dataset, token):
         return "This sample is not in this release."
     if model.results is None:
-        return f"The predictions of {model.name} were not given."
+        return model.missing_results
     if not model.has(token):
         return f"{model.name} has no prediction for this sample."
     try:
@@ -345,14 +344,12 @@ def list_frames_ahead(explorer: Explorer, model: Model, token: str) -> list[floa
 def _render_picture(explorer: Explorer, model: Model, token: str, choice: _PictureChoice) -> Any:
     results = model.results
     if results is None:
-        raise NotAvailableError(f"{model.name}: its predictions were not given")
+        raise NotAvailableError(model.missing_results)
     loader = SampleLoader(explorer.dataset, results, model.setup)
     prediction = loader.prediction(token)
     task = model.setup.task
     arguments: dict[str, Any] = {"task": task, "protocol": model.setup.rules}
-    if not isinstance(prediction, DetectedBoxes):
-        arguments["label"] = loader.label(token)
-    size = _FIGURE_SIZES.get((choice.kind, choice.size), figure_size(task))
+    size = _FIGURE_SIZES.get((choice.kind, choice.size), FIGURE_SIZE_IN)
     arguments["fig"] = detached_figure(size)
     if choice.kind == "above":
         return render_evaluation(explorer.dataset, token, prediction, **arguments)
@@ -516,10 +513,7 @@ def make_sample_context(explorer: Explorer, model: Model, token: str) -> Variabl
         score = scores.samples[token]
         if score.value is not None:
             number = f"{metric_name(scores.name)} {score.text}"
-    missing_path = ""
-    if model.results is None and model.bundle is not None:
-        missing_path = str(model.bundle.summary["results"]["path"])
-    _, figure_height = figure_size(model.setup.task)
+    _, figure_height = FIGURE_SIZE_IN
     return {
         "model": model,
         "token": token,
@@ -535,7 +529,6 @@ def make_sample_context(explorer: Explorer, model: Model, token: str) -> Variabl
         "why_not": explain_missing_picture(explorer, model, token),
         "rules": describe_rules(model),
         "tall": round(80 * figure_height),
-        "remedy": missing_path,
     }
 
 

@@ -20,7 +20,6 @@ from deepaccident_devkit.descriptions import describe
 from deepaccident_devkit.errors import NotAvailableError, TokenError
 from deepaccident_devkit.interactions import interactions
 from deepaccident_devkit.plugins.explore.explorer import Explorer
-from deepaccident_devkit.plugins.explore.models import FORESEEN
 from deepaccident_devkit.plugins.explore.pages.responses import (
     PICTURE_CACHING,
     Variables,
@@ -46,6 +45,10 @@ _JPEG_QUALITY = 80
 # The function that renders each view of a moment, and the view's width and height in inches.
 _VIEWS: Mapping[str, tuple[Callable[..., Any], tuple[float, float]]] = {
     "sample": (render_sample, (15.5, 5.4)),
+    "truth": (
+        partial(render_sample, layers=("image", "bev", "boxes", "trajectories", "grid")),
+        (15.5, 5.9),
+    ),
     "labels": (render_motion_labels, (12.5, 9.4)),
 }
 _MAX_PAIRS = 30
@@ -127,9 +130,7 @@ def make_scenario_context(explorer: Explorer, token: str, model: str | None) -> 
     for name, candidate in explorer.models.items():
         if candidate.results and token in candidate.scenarios:
             models.append(name)
-    replayed_model = None
-    if model in models and explorer.models[model].setup.task in (*FORESEEN, "warning"):
-        replayed_model = model
+    replayed_model = model if model in models else None
     twin = twin_of(explorer.dataset, token)
     replay = explorer.replay(token, replayed_model)
     return {

@@ -18,7 +18,13 @@ from deepaccident_devkit.plugins.synth.sensors.caster import NO_HIT
 from deepaccident_devkit.plugins.synth.sensors.light import Light
 from deepaccident_devkit.plugins.synth.sensors.paint import Colors, FacadePixels, Facades
 from deepaccident_devkit.plugins.synth.sensors.scene import Scene, Setting, move_points
-from deepaccident_devkit.support.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import (
+    NO_INDICES,
+    ByteArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+)
 
 # Distance between two rays from a façade to the sun.
 _CELL_SIZE_M = 0.4
@@ -82,7 +88,7 @@ def _fill_outlines(outlines: IntArray) -> IntArray:
     """
     import cv2
 
-    cells = [np.zeros(0, dtype=np.int64)]
+    cells = [NO_INDICES]
     lows = np.maximum(outlines.min(axis=1), 0)
     highs = np.minimum(outlines.max(axis=1) + 1, MAP_CELLS)
     is_on_map = (lows < highs).all(axis=1)

@@ -390,7 +390,7 @@ def _choose_delayed_roles(cast: Cast) -> tuple[Role, ...]:
 
     They are the roles of the pair except ego and other; if there are none, other and its follower.
     """
-    strangers: list[Role] = []
+    strangers = []
     for row in cast.pair or ():
         role = cast.users[row].role
         if role not in ("ego", "other"):

@@ -90,7 +90,7 @@ def background_users(
         (background.walking if sidewalks else 0, draw_walker),
         (background.crossing, draw_crosser),
     ]
-    users: list[RoadUser] = []
+    users = []
     for count, draw in draws:
         for _ in range(count):
             user = draw()

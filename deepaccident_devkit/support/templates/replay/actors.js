@@ -1,6 +1,11 @@
 // What is known of actors at a frame: who sees them, how fast they are, which of them is an agent.
 
-/** @import { Actor, ActorState, Agent, Alarm, Colors, Sample } from "./types.js" */
+import { middleOf } from "./map_view.js";
+
+/** @import { Actor, ActorState, Agent, DrawnLine, DrawnPlace, Sample } from "./types.js" */
+
+const FAINT = 0.1; // opacity of what is predicted for a later frame
+const CLOSE = 200; // centimetres
 
 /**
  * @param {Actor} actor
@@ -73,41 +78,20 @@ export function nextActor(actors, frame, chosen, step) {
 // predictions
 
 /**
- * @param {string} verdict
- * @param {Colors} colors
- */
-export function verdictColor(verdict, colors) {
-  if (verdict === "TP" || verdict === "TN") return colors.right;
-  if (verdict === "FN") return colors.missed;
-  return verdict === "not judged" ? colors.grid : colors.false;
-}
-
-/**
- * Return the colour of a sample's mark. Where a task draws the sample, it is red if an alarm fires, or something collides.
- * @param {Sample} sample
- * @param {Colors} colors
- */
-export function sampleColor(sample, colors) {
-  if (!sample.lines) return verdictColor(sample.verdict, colors);
-  const isGrave = sample.alarm ? sample.alarm.fires : sample.places?.some((place) => place.color === colors.pair);
-  return isGrave ? colors.pair : colors.points;
-}
-
-/**
- * Return the lines that samples draw at a frame: passing ones only at the frame of their sample.
+ * Return the lines that samples draw at a frame. Those that are predicted for a later frame are faint, and those for an
+ * earlier one are left out.
  * @param {Sample[]} samples
  * @param {number} frame
+ * @returns {DrawnLine[]}
  */
 export function linesAt(samples, frame) {
-  return samples.flatMap((sample) => (sample.lines ?? []).filter((line) => !line.passing || sample.frame === frame));
-}
-
-/**
- * @param {Alarm} alarm
- * @param {Colors} colors
- */
-export function alarmColor(alarm, colors) {
-  return alarm.right ? colors.right : colors.false;
+  return samples.flatMap(({ lines }) =>
+    lines.flatMap((line) => {
+      const [first, last] = line.frames ?? [frame, frame];
+      if (frame > last) return [];
+      return [frame < first ? { ...line, opacity: FAINT, filled: false } : line];
+    }),
+  );
 }
 
 /**
@@ -132,29 +116,25 @@ export function lastBefore(frames, frame) {
 }
 
 /**
- * An alarm, the letters of the agents that raise it, and the actors that it names.
- * @typedef {Alarm & { by: string[], names: string }} JoinedAlarm
+ * A marked place, and the letters of the agents whose predictions have it.
+ * @typedef {DrawnPlace & { by: string[] }} JoinedPlace
  */
 
 /**
- * Join the alarms of agents that predict the same. Actors are named unless they are the colliding pair.
+ * Join the places of agents that say the same about points that are close to each other.
  * @param {Sample[]} samples
  * @param {Agent[]} agents
- * @param {number[]} pair ids
  */
-export function joinedAlarms(samples, agents, pair) {
-  /** @type {Map<string, JoinedAlarm>} */
+export function joinedPlaces(samples, agents) {
+  /** @type {Map<string, JoinedPlace>} */
   const byText = new Map();
-  for (const { agent, alarms } of samples) {
-    for (const alarm of alarms) {
-      const isPair = alarm.actors.length === 2 && alarm.actors.every((id) => pair.includes(id));
-      const names = alarm.actors.length && !isPair ? `: ${alarm.actors.join(", ")}` : "";
-      const [one, other] = alarm.places;
-      const middle = [Math.round((one[0] + other[0]) / 400), Math.round((one[1] + other[1]) / 400)];
-      const key = [alarm.right, alarm.time, names, ...middle].join(" ");
+  for (const { agent, places } of samples) {
+    for (const place of places) {
+      const middle = middleOf(place.points).map((coordinate) => Math.round(coordinate / CLOSE));
+      const key = [place.note, place.label, place.color, ...middle].join(" ");
       const joined = byText.get(key);
       if (joined) joined.by.push(agents[agent].short);
-      else byText.set(key, { ...alarm, names, by: [agents[agent].short] });
+      else byText.set(key, { ...place, by: [agents[agent].short] });
     }
   }
   return [...byText.values()];

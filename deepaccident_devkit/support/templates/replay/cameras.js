@@ -5,7 +5,7 @@ import { selection } from "./choices.js";
 import { agentOptions, data, sources } from "./data.js";
 import { byId, chip, drawn, made } from "./elements.js";
 import { lightIn } from "./lit.js";
-import { drawBoxes } from "./picture_boxes.js";
+import { drawOver } from "./picture_boxes.js";
 import { hasPictures, isOutdated, pictureFrame, pictureTitle } from "./pictures.js";
 import { show } from "./refresh.js";
 import { state } from "./state.js";
@@ -131,7 +131,7 @@ function showCamera(card) {
     const frame = load(card, camera, card.figure.classList.contains("large"));
     describe(card, camera, frame);
     card.select.options[0].textContent = card.chosen ? "automatic" : `auto: ${camera.title}`;
-    if (state.boxes) drawBoxes(card, camera, frame);
+    drawOver(card, camera, frame);
   }
   const sample = state.foreseen.find((candidate) => candidate.agent === card.number);
   card.judged.replaceChildren(...(sample ? [verdictBadge(sample)] : []));
@@ -233,7 +233,6 @@ export function showEveryCamera() {
       picture.image.alt = pictureText(picture.agent, camera, frame);
       picture.where.textContent = camera.title;
     }
-    picture.boxes.replaceChildren();
-    if (state.boxes) drawBoxes(picture, camera, frame);
+    drawOver(picture, camera, frame);
   }
 }

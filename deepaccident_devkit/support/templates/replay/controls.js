@@ -68,6 +68,11 @@ for (const [layer, title] of Object.entries(LAYERS)) {
     state.layers[layer] = checked;
   });
 }
+if (data.prediction) {
+  addCheckbox("layers", "hold", "keep this prediction", state.held, (checked) => {
+    state.held = checked;
+  });
+}
 byId("clouds").hidden = sources.withPoints.length < 2;
 for (const number of sources.withPoints) {
   const agent = data.agents[number];

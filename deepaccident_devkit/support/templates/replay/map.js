@@ -1,20 +1,19 @@
 // The scene from above, on a canvas.
 
-import { actorOf, agentByNumber, alarmColor, isSeen, joinedAlarms, linesAt, seersOf } from "./actors.js";
+import { actorOf, agentByNumber, isSeen, joinedPlaces, linesAt, seersOf } from "./actors.js";
 import { channelsOf, lightened } from "./colors.js";
 import { data, pair, sources } from "./data.js";
 import { byId } from "./elements.js";
 import { placeBeside } from "./labels.js";
-import { gridStep, MapView, middleOf, multiples, shapeOf } from "./map_view.js";
+import { gridStep, MapView, middleOf, multiples, RING_METRES, shapeOf } from "./map_view.js";
 import { actorOnMap } from "./picking.js";
 import { state } from "./state.js";
 
-/** @import { JoinedAlarm } from "./actors.js" */
+/** @import { JoinedPlace } from "./actors.js" */
 /** @import { Actor, ActorState, DrawnLine, Pixel, Point, Rectangle, Road, SceneView } from "./types.js" */
 
 export const TRAIL_FRAMES = 20;
 export const GRID_METRES = 10;
-export const RING_METRES = 1.2;
 const FONT = "600 11px system-ui, sans-serif";
 const INK = "#1c1c1c";
 const CHIP = "#ffffffe6";
@@ -92,18 +91,13 @@ class SceneMap {
     if (layers.trails) for (const actor of data.actors) this.drawTrail(actor);
     this.drawSights();
     const samples = layers.prediction ? state.foreseen : [];
-    for (const alarm of samples.flatMap((sample) => sample.alarms)) this.drawPlaces(alarm.places, alarmColor(alarm, data.colors));
     for (const line of linesAt(samples, state.frame)) this.drawLine(line);
-    const places = samples.flatMap((sample) => sample.places ?? []);
-    for (const place of places) this.drawPlaces(place.points, thin(place.color));
+    for (const place of samples.flatMap((sample) => sample.places)) this.drawPlaces(place.points, thin(place.color));
     for (const [actor, now] of [...actors].reverse()) this.drawActor(actor, now);
     if (layers.agents) this.drawPoles();
     if (data.impact) this.drawImpact(data.impact);
     this.drawNames();
-    for (const alarm of joinedAlarms(samples, data.agents, pair.map((actor) => actor.id))) this.drawAlarm(alarm);
-    for (const { note, points, color } of places) {
-      if (note) this.writeBeside(note, around(this.view.pixel(points[0]), RING_METRES * this.view.scale + 4), color);
-    }
+    for (const place of joinedPlaces(samples, data.agents)) if (place.note) this.drawNote(place);
   }
 
   /**
@@ -347,10 +341,10 @@ class SceneMap {
   }
 
   /**
-   * Draw a path, above a ribbon of its width if it has one, or the outline of a box.
+   * Draw a path, above a ribbon of its width if it has one, or the outline of a box or shape.
    * @param {DrawnLine} line
    */
-  drawLine({ points, color, opacity = 1, width = 0, dashed }) {
+  drawLine({ points, color, opacity = 1, width = 0, dashed, filled }) {
     const pen = this.pen;
     pen.beginPath();
     for (const point of points) pen.lineTo(...this.view.pixel(point));
@@ -359,6 +353,8 @@ class SceneMap {
     pen.lineWidth = width * this.view.scale;
     pen.globalAlpha = 0.3 * opacity;
     if (width) pen.stroke();
+    pen.fillStyle = thin(color);
+    if (filled) pen.fill();
     pen.lineWidth = dashed ? 1.5 : 2.5;
     pen.globalAlpha = 0.2 + 0.8 * opacity;
     if (dashed) pen.setLineDash([5, 3]);
@@ -386,15 +382,14 @@ class SceneMap {
   }
 
   /**
-   * Write what an alarm says beside where it expects the impact, with a line that ends before the rings.
-   * @param {JoinedAlarm} alarm
+   * Write a note and its agents beside a marked place, with a line that ends before the rings.
+   * @param {JoinedPlace} place
    */
-  drawAlarm(alarm) {
+  drawNote({ note, by, points, color }) {
     const pen = this.pen;
-    const [x, y] = this.view.pixel(middleOf(alarm.places));
+    const [x, y] = this.view.pixel(middleOf(points));
     const ring = RING_METRES * this.view.scale;
-    const words = `${alarm.right ? "✓" : "✗"} ${alarm.by.join(" ")} ${alarm.time.toFixed(1)} s${alarm.names}`;
-    const box = this.writeBeside(words, around([x, y], 2 * ring + 12), alarmColor(alarm, data.colors));
+    const box = this.writeBeside(`${by.join(" ")}: ${note}`, around([x, y], 2 * ring + 12), color);
     const across = Math.min(Math.max(x, box[0]), box[2]);
     const down = Math.min(Math.max(y, box[1]), box[3]);
     const share = Math.min(1, (1.5 * ring) / Math.max(Math.hypot(across - x, down - y), 1));

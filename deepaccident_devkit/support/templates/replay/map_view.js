@@ -9,6 +9,7 @@ const MARGIN = 16;
 const PAIR_MARGIN = 36;
 const LEAST_BOX = 5; // pixels
 const LEAST_MARK = 9;
+export const RING_METRES = 1.2; // around marked places
 /** @type {Record<string, string>} matplotlib's names of markers to ours */
 const SHAPES = { o: "circle", D: "diamond", "^": "triangle" };
 
@@ -159,10 +160,11 @@ export function multiples(from, to, step) {
 }
 
 /**
- * Return the middle of two places.
- * @param {readonly [Point, Point]} places
+ * Return the mean of some points.
+ * @param {Point[]} points
  * @returns {Point}
  */
-export function middleOf([one, other]) {
-  return [(one[0] + other[0]) / 2, (one[1] + other[1]) / 2];
+export function middleOf(points) {
+  const mean = (/** @type {0 | 1} */ axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length;
+  return [mean(0), mean(1)];
 }

@@ -1,9 +1,10 @@
-// The boxes of actors over the pictures of cameras.
+// The boxes of actors and the prediction of the moment over the pictures of cameras.
 
 import { isSeen } from "./actors.js";
 import { data } from "./data.js";
 import { drawn } from "./elements.js";
 import { placeAbove } from "./labels.js";
+import { predictionParts } from "./picture_predictions.js";
 import { cornersInCamera, edgesInPicture, extentOf, isAhead, pathOf, pixelOf } from "./projection.js";
 import { state } from "./state.js";
 
@@ -23,16 +24,28 @@ const INK = "#1c1c1c";
  */
 
 /**
- * Draw the boxes of the actors that the agent sees, of the highlighted one and, dashed, of the colliding pair.
+ * Draw the agent's prediction and, if the reader wants them, boxes over a picture.
  * @param {AgentPicture} picture
  * @param {Camera} camera
- * @param {number} frame
+ * @param {number} frame of the picture
  */
-export function drawBoxes(picture, camera, frame) {
+export function drawOver(picture, camera, frame) {
   const [width, height] = camera.lens;
   picture.boxes.setAttribute("viewBox", `0 0 ${width} ${height}`);
   picture.size = [width, height];
   picture.places = [];
+  const boxes = state.boxes ? boxGroups(picture, camera, frame) : [];
+  picture.boxes.replaceChildren(...predictionParts(picture.number, camera, frame), ...boxes);
+}
+
+/**
+ * Make the boxes of the actors that the agent sees, of the highlighted one and, dashed, of the colliding pair.
+ * @param {AgentPicture} picture
+ * @param {Camera} camera
+ * @param {number} frame
+ */
+function boxGroups(picture, camera, frame) {
+  const [width] = camera.lens;
   const ratio = width / Math.max(picture.boxes.clientWidth, 1);
   const isLarge = picture.figure.classList.contains("large");
   /** @type {Rectangle[]} */
@@ -56,7 +69,7 @@ export function drawBoxes(picture, camera, frame) {
     }
     groups.push(drawn("g", { "data-actor": actor.id, class: isLit ? "lit" : "" }, ...parts));
   }
-  picture.boxes.replaceChildren(...groups);
+  return groups;
 }
 
 /**

@@ -28,10 +28,19 @@ export function cameraAxes(pose) {
  * @param {ActorState} state
  */
 export function cornersInCamera(pose, actor, state) {
+  return inCamera(pose, cornersOf(actor, state));
+}
+
+/**
+ * Return places in the axes of a camera, centimetres.
+ * @param {CameraPose} pose
+ * @param {Vector[]} places in the world, centimetres
+ */
+export function inCamera(pose, places) {
   const axes = cameraAxes(pose);
   /** @type {Vector} */
   const eye = [pose[0], pose[1], pose[2]];
-  return cornersOf(actor, state).map((corner) => inAxes(axes, difference(corner, eye)));
+  return places.map((place) => inAxes(axes, difference(place, eye)));
 }
 
 /**
@@ -51,15 +60,16 @@ export function isAhead(corner) {
 }
 
 /**
- * Return the edges of a box in a picture; none if the box lies outside of it. What is behind the camera is cut off.
+ * Return edges in a picture; none if all lie outside of it. What is behind the camera is cut off.
  * @param {Camera} camera
  * @param {Vector[]} corners in the camera's axes
+ * @param {number[][]} joined which corners an edge joins; by default those of a box
  * @returns {[Pixel, Pixel][]}
  */
-export function edgesInPicture(camera, corners) {
+export function edgesInPicture(camera, corners, joined = EDGES) {
   /** @type {[Pixel, Pixel][]} */
   const edges = [];
-  for (const [from, to] of EDGES) {
+  for (const [from, to] of joined) {
     const [one, other] = [corners[from], corners[to]];
     if (!isAhead(one) && !isAhead(other)) continue;
     edges.push([pixelOf(camera, cutOff(one, other)), pixelOf(camera, cutOff(other, one))]);
@@ -70,13 +80,35 @@ export function edgesInPicture(camera, corners) {
 }
 
 /**
+ * Return the corners of an area in a picture; what is behind the camera is cut off.
+ * @param {Camera} camera
+ * @param {Vector[]} corners in the camera's axes
+ * @returns {Pixel[]}
+ */
+export function areaInPicture(camera, corners) {
+  return corners.flatMap((corner, number) => {
+    const next = corners[(number + 1) % corners.length];
+    const ends = [isAhead(corner) ? [corner] : [], isAhead(corner) === isAhead(next) ? [] : [crossing(corner, next)]];
+    return ends.flat().map((end) => pixelOf(camera, end));
+  });
+}
+
+/**
+ * Return the place between two others that is as near as a camera sees.
+ * @param {Vector} one
+ * @param {Vector} other
+ */
+function crossing(one, other) {
+  return between(other, one, (NEAR - other[2]) / (one[2] - other[2]));
+}
+
+/**
  * Return an end of an edge or, if it is too near, the place on the edge that is as near as a camera sees.
  * @param {Vector} end
  * @param {Vector} other
  */
 function cutOff(end, other) {
-  if (end[2] >= NEAR) return end;
-  return between(other, end, (NEAR - other[2]) / (end[2] - other[2]));
+  return end[2] >= NEAR ? end : crossing(end, other);
 }
 
 /**

@@ -1,6 +1,5 @@
 // The page of a replay: what is drawn when, what does not change with time, and what the pages around may ask for.
 
-import { sampleColor } from "./actors.js";
 import { showCameras, showEveryCamera } from "./cameras.js";
 import { shareOf } from "./clock.js";
 import { stay } from "./controls.js";
@@ -37,7 +36,7 @@ for (const [name, value] of data.facts) {
   byId("facts").append(made("dt", { textContent: name }), made("dd", { textContent: value }));
 }
 byId("notes").append(...data.notes.map((note) => made("li", { textContent: note })));
-byId("foreseen-key").hidden = !data.prediction || Boolean(data.prediction.legend);
+byId("foreseen-key").hidden = !data.prediction || !data.prediction.samples.some((sample) => sample.places.length);
 
 const others = data.actors.filter((actor) => actor.role === "other");
 const categories = new Map(
@@ -62,7 +61,7 @@ function addMark(frame, color) {
   byId("marks").append(mark);
 }
 
-for (const [frame, [sample]] of samplesAt) addMark(frame, sampleColor(sample, data.colors));
+for (const [frame, [sample]] of samplesAt) addMark(frame, sample.color);
 const impact = data.countdown.indexOf(0);
 if (impact >= 0) addMark(impact, data.colors.pair);
 

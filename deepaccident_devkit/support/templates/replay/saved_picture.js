@@ -65,10 +65,9 @@ class Picture {
     if (pen === null) throw new Error("this browser draws nothing on a canvas");
     this.pen = pen;
     const { backgroundColor, color } = getComputedStyle(document.body);
-    this.paper = backgroundColor;
     this.ink = color;
     pen.scale(ratio, ratio);
-    pen.fillStyle = this.paper;
+    pen.fillStyle = backgroundColor;
     pen.fillRect(0, 0, width, height);
   }
 
@@ -171,12 +170,15 @@ async function drawPicture() {
   const words = [data.scenario, byId("time").textContent, byId("countdown").textContent];
   picture.write(words.filter(Boolean).join("   "), GAP, GAP + HEADING / 2, { size: 16, most: width - 2 * GAP });
   state.sharpness = SHARPNESS;
-  map.draw();
-  space.drawNow();
-  addScene(picture, canvases);
-  state.sharpness = 1;
-  map.draw();
-  space.draw();
+  try {
+    map.draw();
+    space.drawNow();
+    addScene(picture, canvases);
+  } finally {
+    state.sharpness = 1;
+    map.draw();
+    space.draw();
+  }
   for (const card of cards) await picture.addCard(card, sceneWidth + 2 * GAP, HEADING + GAP);
   return picture.canvas;
 }

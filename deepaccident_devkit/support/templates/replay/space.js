@@ -1,14 +1,15 @@
 // The scene in three dimensions: clouds, boxes with headings and trails, cameras, and names.
 
-import { actorOf, agentByNumber, alarmColor, isSeen, linesAt } from "./actors.js";
-import { centreInMetres, cornersOf, EDGES, FACES, GroundPlane } from "./boxes.js";
+import { actorOf, agentByNumber, isSeen, linesAt } from "./actors.js";
+import { centreInMetres, cornersOf, EDGES, FACES } from "./boxes.js";
 import { cameraOf, cards } from "./cameras.js";
 import { changed, channelsOf, lightened, mixed } from "./colors.js";
-import { data, last, pair, sources } from "./data.js";
+import { data, ground, last, pair, sources } from "./data.js";
 import { byId, made } from "./elements.js";
 import { Gpu, Numbers } from "./gpu.js";
 import { placeOver } from "./labels.js";
-import { GRID_METRES, map, RING_METRES, roadImage, TRAIL_FRAMES } from "./map.js";
+import { GRID_METRES, map, roadImage, TRAIL_FRAMES } from "./map.js";
+import { RING_METRES } from "./map_view.js";
 import { Orbit } from "./orbit.js";
 import { actorInSpace } from "./picking.js";
 import { eyeOf, frustumCorners } from "./projection.js";
@@ -32,7 +33,6 @@ class Space {
   constructor(canvas) {
     this.canvas = canvas;
     this.orbit = new Orbit();
-    this.ground = GroundPlane.below(data.actors);
     this.zoomed = 1; // by the reader
     /** @type {Record<Kind, Numbers>} */
     this.kinds = { points: new Numbers(), lines: new Numbers(), faces: new Numbers(), picture: new Numbers() };
@@ -91,7 +91,7 @@ class Space {
    * @returns {Vector}
    */
   onGround(x, y, height = 0) {
-    return [x, y, this.ground.heightAt(x, y) + height];
+    return [x, y, ground.heightAt(x, y) + height];
   }
 
   fromAbove() {
@@ -253,7 +253,7 @@ class Space {
     const points = new Float32Array((cloud.length / 3) * 7);
     for (let index = 0, at = 0; index < cloud.length; index += 3, at += 7) {
       const [x, y, z] = [cloud[index] / 100, cloud[index + 1] / 100, cloud[index + 2] / 100];
-      const share = (z - this.ground.heightAt(x, y) - HEIGHTS[0]) / (HEIGHTS[1] - HEIGHTS[0]);
+      const share = (z - ground.heightAt(x, y) - HEIGHTS[0]) / (HEIGHTS[1] - HEIGHTS[0]);
       points.set([x, y, z], at);
       points.set(state.pointsBy === "height" ? mixed(heights, share) : color, at + 3);
       points[at + 6] = 1;
@@ -355,15 +355,14 @@ class Space {
   }
 
   addForeseen() {
-    for (const alarm of state.foreseen.flatMap((sample) => sample.alarms)) {
-      const color = channelsOf(alarmColor(alarm, data.colors));
-      for (const [x, y] of alarm.places) this.addRing(x / 100, y / 100, color);
-    }
-    for (const { points, color } of state.foreseen.flatMap((sample) => sample.places ?? [])) {
+    for (const { points, color } of state.foreseen.flatMap((sample) => sample.places)) {
       for (const [x, y] of points) this.addRing(x / 100, y / 100, this.thin(color));
     }
-    for (const { points, color, opacity = 1, dashed } of linesAt(state.foreseen, state.frame)) {
+    for (const { points, color, opacity = 1, dashed, filled } of linesAt(state.foreseen, state.frame)) {
       const corners = points.map(([x, y]) => this.onGround(x / 100, y / 100, 0.2));
+      for (const [number, corner] of filled ? corners.slice(2).entries() : []) {
+        this.triangle([corners[0], corners[number + 1], corner], this.thin(color), 0.3 * opacity);
+      }
       for (const [number, corner] of corners.slice(1).entries()) {
         this.line(corners[number], corner, this.thin(color), dashed ? 1.5 : 3, 0.2 + 0.8 * opacity);
       }

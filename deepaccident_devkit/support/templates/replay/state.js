@@ -21,6 +21,7 @@ export const state = {
   chosen: null,
   lit: null,
   foreseen: [],
+  held: false,
   sharpness: 1,
 };
 

@@ -1,7 +1,7 @@
 // The strip below the slider, on its scale: the pair's speeds, gap and time to collision, who sees it, and verdicts.
 // Below the slider itself: which frames have files. A click on the strip goes to a frame.
 
-import { isSeen, sampleColor, seersOf } from "./actors.js";
+import { isSeen, seersOf } from "./actors.js";
 import { frameAtShare, shareOf } from "./clock.js";
 import { barExtent, curvePath, known, runs } from "./curves.js";
 import { data, last, pair } from "./data.js";
@@ -137,7 +137,7 @@ function addSight(actor) {
 /** @param {Sample[]} samples */
 function addVerdicts(samples) {
   const lines = samples.map((sample) =>
-    bar([sample.frame, sample.frame], sample.agent * BAND, BAND - 0.8, sampleColor(sample, data.colors)),
+    bar([sample.frame, sample.frame], sample.agent * BAND, BAND - 0.8, sample.color),
   );
   return addRow("verdicts", plot(BAND * data.agents.length, ...lines), () => {
     const words = state.foreseen.map((sample) => `${data.agents[sample.agent].short} ${sample.verdict}`);
@@ -152,7 +152,7 @@ function addVerdicts(samples) {
 function addAlarms(samples) {
   const lines = samples.flatMap((sample) => {
     if (!sample.alarm) return [];
-    const line = bar([sample.frame, sample.frame], sample.agent * BAND, BAND - 0.8, sampleColor(sample, data.colors));
+    const line = bar([sample.frame, sample.frame], sample.agent * BAND, BAND - 0.8, sample.color);
     line.setAttribute("fill-opacity", String(0.2 + 0.8 * sample.alarm.score));
     return [line];
   });
@@ -169,7 +169,7 @@ function addAlarms(samples) {
  */
 function addTimes(label, samples) {
   const lines = samples.flatMap((sample) =>
-    (sample.places ?? []).flatMap((place) => {
+    sample.places.flatMap((place) => {
       const frame = sample.frame + Math.round(place.time / data.period);
       if (place.label !== label || frame > last) return [];
       return [bar([frame, frame], sample.agent * BAND, BAND - 0.8, place.color)];
@@ -177,7 +177,7 @@ function addTimes(label, samples) {
   );
   return addRow(label, plot(BAND * data.agents.length, ...lines), () => {
     const words = state.foreseen.flatMap((sample) =>
-      (sample.places ?? [])
+      sample.places
         .filter((place) => place.label === label)
         .map((place) => `${data.agents[sample.agent].short} in ${place.time.toFixed(1)} s`),
     );
@@ -197,7 +197,7 @@ if (data.prediction) {
   const { samples } = data.prediction;
   rows.push(addVerdicts(samples));
   if (samples.some((sample) => sample.alarm)) rows.push(addAlarms(samples));
-  const labels = samples.flatMap((sample) => (sample.places ?? []).map((place) => place.label));
+  const labels = samples.flatMap((sample) => sample.places.map((place) => place.label));
   rows.push(...[...new Set(labels)].map((label) => addTimes(label, samples)));
 }
 

@@ -71,38 +71,29 @@
  */
 
 /**
- * An accident that a model predicts: where the two actors are at the impact, and in how many seconds.
- * @typedef {object} Alarm
- * @property {[Point, Point]} places
- * @property {boolean} right
- * @property {number} time
- * @property {string} text
- * @property {number[]} actors ids, as far as they are known
- */
-
-/**
- * What a model predicts from an agent's view at a frame, and what that counts as.
+ * What a task draws of an agent's prediction at a frame, and what that counts as.
  * @typedef {object} Sample
  * @property {number} frame
  * @property {number} agent number in the list of agents
  * @property {string} verdict
+ * @property {string} color of the verdict
  * @property {string} text
- * @property {Alarm[]} alarms
- * @property {number} more how many alarms or lines are left out
- * @property {DrawnLine[]} [lines] where a task draws the sample
- * @property {DrawnPlace[]} [places]
- * @property {{ score: number, fires: boolean } | null} [alarm]
+ * @property {number} more how many lines are left out
+ * @property {DrawnLine[]} lines
+ * @property {DrawnPlace[]} places
+ * @property {{ score: number, fires: boolean } | null} alarm
  */
 
 /**
- * A path or the outline of a box; `width` (metres) is that of a ribbon. A passing line is only right at its sample's frame.
+ * A path, or the outline of a box or shape; `width` (metres) is that of a ribbon.
  * @typedef {object} DrawnLine
  * @property {Point[]} points
  * @property {string} color
  * @property {number} [opacity] from 0 to 1
  * @property {number} [width]
  * @property {boolean} dashed
- * @property {boolean} [passing]
+ * @property {boolean} [filled]
+ * @property {[first: number, last: number]} [frames] that it is predicted for; all if there are none
  */
 
 /**
@@ -131,9 +122,6 @@
  * @property {string} points
  * @property {string} grid
  * @property {string[]} heights from low to high
- * @property {string} right
- * @property {string} false
- * @property {string} missed
  */
 
 /**
@@ -157,7 +145,7 @@
  * @property {Actor[]} actors the colliding pair first
  * @property {{ gap: (number | null)[], ttc: (number | null)[] } | null} pair gap (cm) and time to collision (ds)
  * @property {Road | null} road
- * @property {{ rule: string, samples: Sample[], legend?: [label: string, color: string][] } | null} prediction
+ * @property {{ rule: string, samples: Sample[], legend: [label: string, color: string][] } | null} prediction
  * @property {Camera[][]} cameras those of each agent
  * @property {number[]} files how many sensor files each frame has
  * @property {number} sensors how many it would have
@@ -190,6 +178,7 @@
  * @property {number | null} chosen id of the actor that was clicked
  * @property {number | null} lit id of the actor that all views highlight: pointed at, or else chosen
  * @property {Sample[]} foreseen the samples of the last evaluated frame
+ * @property {boolean} held whether these stay when time goes on
  * @property {number} sharpness pixels of the scene's drawings by the screen's
  */
 

@@ -1,6 +1,6 @@
 // What a model predicts, and what its predictions count as.
 
-import { lastBefore, sampleColor, samplesByFrame } from "./actors.js";
+import { lastBefore, samplesByFrame } from "./actors.js";
 import { data } from "./data.js";
 import { badge, byId, made, smallText } from "./elements.js";
 import { go } from "./playback.js";
@@ -14,7 +14,7 @@ export const samplesAt = samplesByFrame(data.prediction?.samples ?? []);
 
 /** @param {Sample} sample */
 export function verdictBadge(sample) {
-  return badge(sample.verdict, sampleColor(sample, data.colors));
+  return badge(sample.verdict, sample.color);
 }
 
 /**
@@ -48,14 +48,14 @@ function nothingYet() {
   return `No prediction yet${first === undefined ? "" : ` (first at frame ${first + 1})`}.`;
 }
 
-/** Show what was predicted at the last evaluated frame. */
+/** Show what was predicted at the last evaluated frame or, if the reader keeps it, at an earlier one. */
 export function showForeseen() {
   if (!data.prediction) return;
-  const frame = lastBefore(samplesAt.keys(), state.frame);
+  const [kept] = state.held ? state.foreseen : [];
+  const frame = kept?.frame ?? lastBefore(samplesAt.keys(), state.frame);
   state.foreseen = frame === null ? [] : samplesAt.get(frame) ?? [];
   const lines = state.foreseen.flatMap((sample) => [
     made("p", {}, verdictBadge(sample), sample.text),
-    ...sample.alarms.map((alarm) => smallText(alarm.text, alarm.right ? "right" : "")),
     ...(sample.more ? [smallText(`and ${sample.more} more with lower scores`)] : []),
   ]);
   byId("foreseen").replaceChildren(...(lines.length ? lines : [smallText(nothingYet())]));

@@ -23,8 +23,7 @@ from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.plugins.safety import avoidability_report, lead_time_ledger
 from deepaccident_devkit.plugins.safety.prevention import prevention_evaluator
 from deepaccident_devkit.plugins.synth import SynthConfig, make_release
-from deepaccident_devkit.render.outcomes.above import difference_words
-from deepaccident_devkit.render.outcomes.verdicts import sample_verdict
+from deepaccident_devkit.render.outcomes.described import sample_drawing
 from deepaccident_devkit.statistics import dataset_statistics
 from deepaccident_devkit.v2x.collisions import default_scenario
 
@@ -155,10 +154,8 @@ def test_descriptions_and_verdicts_say_that_it_is_unplaced(unplaced: SimpleNames
     assert default_scenario(unplaced.dataset) != unplaced.token  # the other accident can be shown
 
     sample = f"{unplaced.token}/ego_vehicle/020"
-    verdict: Any = sample_verdict(unplaced.dataset, sample, [ALARM], protocol="boxes")
-    assert difference_words(verdict.compared).startswith(
-        "collision in 1.0 s, but no label shows both actors"
-    )
+    described = sample_drawing(unplaced.dataset, sample, [ALARM])
+    assert "; collision in 1.0 s, but no label shows both actors" in described.words
 
 
 def test_an_unplaced_accident_is_a_collision_everywhere(

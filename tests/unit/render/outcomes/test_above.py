@@ -1,19 +1,18 @@
-"""Accident predictions from above: positions, distances in metres and words."""
+"""Outcomes from above agree with the metrics, and are drawn where they are."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
-from support.rendered_pixels import collections_of_kind, first_image, new_axes, read_title
+from support.rendered_pixels import read_title
 from support.replay_page import normal_scenario
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import (
     Accident,
-    AccidentContext,
-    AccidentEvaluator,
     DetectedBoxes,
     MotionEvaluator,
     MotionOutput,
@@ -21,69 +20,76 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
+from deepaccident_devkit.evaluation.drawing import Drawing
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure
-from deepaccident_devkit.render.outcomes import (
-    draw_accident_outcome,
-    draw_detection_outcome,
-    motion_outcome,
-    render_evaluation,
-)
-from deepaccident_devkit.render.outcomes.above import difference_words, verdict_words
-from deepaccident_devkit.render.styles import OUTCOME_COLORS
-from deepaccident_devkit.taxonomy import OWN_ACTOR_ID
+from deepaccident_devkit.render.outcomes import render_evaluation
+from deepaccident_devkit.render.outcomes.described import sample_drawing
+from deepaccident_devkit.render.styles import MUTED_COLOR, OUTCOME_COLORS
 
 
-def test_accidents_foreseen_where_none_comes(da_motion: DeepAccident) -> None:
+def test_an_alarm_where_no_accident_comes(da_motion: DeepAccident) -> None:
     token = da_motion.get_sample(normal_scenario(da_motion), "ego_vehicle", 5)["token"]
     alarm = Accident(positions=np.array([[5.0, 0.0], [7.0, 0.0]]), time=1.0)
     figure = render_evaluation(da_motion, token, [alarm], fig=detached_figure((9, 5)))
-    assert read_title(figure).endswith("FP within 5/10/15 m")
-    assert [ax.get_title() for ax in figure.axes] == [
-        "ego, front",
-        "no collision within the horizon,\nbut predicted in 1.0 s",
-    ]
-
-    no_accident = ComparedAccidents(true=None, predicted=())
-    assert difference_words(no_accident) == "no collision within the horizon"
-    assert not draw_accident_outcome(no_accident, ax=new_axes()).lines
+    assert read_title(figure).endswith(
+        "FP within 5/10/15 m; no collision ahead; alarm for a collision in 1.0 s, score 1"
+    )
+    assert [ax.get_title() for ax in figure.axes] == ["ego, front", ""]
 
 
-def test_the_verdict_names_several_of_a_kind(da_motion: DeepAccident, sample: str) -> None:
+def test_the_outcome_names_several_of_a_kind(da_motion: DeepAccident, sample: str) -> None:
     far = Accident(positions=np.array([[40.0, 40.0], [42.0, 40.0]]), time=1.0)
-    alarms = [far, replace(far, score=0.5)]
-    context = AccidentContext(truth=box_truth(da_motion, sample))
-    evaluator = AccidentEvaluator("boxes")
-    evaluator.update(sample, alarms, None, context)
-    assert verdict_words(evaluator.compute()) == "2 FP + FN within 5/10/15 m"
+    described = sample_drawing(da_motion, sample, [far, replace(far, score=0.5)])
+    assert described.words.startswith("accident: 2 FP + FN within 5/10/15 m; collision in 1.0 s")
+
+
+def test_the_pair_and_its_paths_lead_to_the_collision(da_motion: DeepAccident, sample: str) -> None:
+    accident: Any = box_truth(da_motion, sample).accident
+    drawing = sample_drawing(da_motion, sample, []).drawing
+
+    (pair,) = drawing.boxes
+    assert {*pair.boxes.actor_id.tolist()} == {*accident.ids}
+    starts = {tuple(path.xy[0].round(1)) for path in drawing.paths}
+    assert starts == {tuple(center.round(1)) for center in pair.boxes.center[:, :2]}
+    ends = [path.xy[-1] for path in drawing.paths]
+    distances = np.linalg.norm(np.array(ends)[:, None] - accident.positions, axis=-1)
+    assert distances.min(axis=0).max() < 0.01
+    assert drawing.alarm is not None
+    assert not drawing.alarm.fires
 
 
 def test_detections_are_coloured_by_their_matches(da_motion: DeepAccident, sample: str) -> None:
     truth = detection_truth(da_motion, sample, "paper")
     is_near = (np.abs(truth.center[:, :2]) < 50).all(axis=1)  # well within the protocol's area
-    truth = truth.select(is_near)
-    matched = truth.select(np.arange(2, len(truth)))
-    center = np.vstack([matched.center + np.array([0.3, 0.0, 0.0]), [[20.0, -45.0, 0.0]]])
+    missed, *matched = np.flatnonzero(is_near).tolist()
+    center = np.vstack([truth.center[matched] + [0.3, 0.0, 0.0], [[20.0, -45.0, 0.0]]])
     detected = DetectedBoxes.from_arrays(
         center,
-        np.vstack([matched.size, [[4.0, 2.0, 1.5]]]),
-        np.append(matched.yaw, 0.0),
+        np.vstack([truth.size[matched], [[4.0, 2.0, 1.5]]]),
+        np.append(truth.yaw[matched], 0.0),
         np.linspace(1, 0.5, len(center)),
-        category=np.append(matched.category, 0),
+        category=np.append(truth.category[matched], 0),
         frame="lidar",
     )
 
-    ax = draw_detection_outcome(detected, truth, "paper", ax=new_axes())
+    figure = render_evaluation(
+        da_motion, sample, detected, protocol="paper", fig=detached_figure((9, 5))
+    )
 
     centers = {}
-    for shape in ax.collections:
+    for shape in figure.axes[1].collections:
         if isinstance(shape, PolyCollection) and len(shape.get_paths()):
             color = to_hex(shape.get_edgecolor()[0])
-            centers[color] = [path.vertices[:4].mean(axis=0) for path in shape.get_paths()]
-    np.testing.assert_allclose(centers[OUTCOME_COLORS["false"]], [(20, -45)])
-    np.testing.assert_allclose(centers[OUTCOME_COLORS["missed"]], truth.center[:2, :2], atol=1e-6)
-    assert len(centers[OUTCOME_COLORS["right"]]) == len(matched)
+            vertices = [path.vertices[:4].mean(axis=0) for path in shape.get_paths()]
+            centers.setdefault(color, vertices)
+    ego_from_world = da_motion.world_from(sample, "ego").inverse()
+    ego_from_lidar = ego_from_world @ da_motion.world_from(sample, "lidar")
+    false_center, missed_center = ego_from_lidar.apply(np.array([center[-1], truth.center[missed]]))
+    np.testing.assert_allclose(centers[OUTCOME_COLORS["false"]], [false_center[:2]], atol=1e-6)
+    drawn_missed = np.array(centers[MUTED_COLOR])
+    assert np.linalg.norm(drawn_missed - missed_center[:2], axis=1).min() < 1e-6
+    assert figure.axes[1].get_title() == f"prediction: {len(matched)} detected, 1 false"
 
 
 def damage_instances(labels: MotionLabels) -> MotionOutput:
@@ -98,51 +104,49 @@ def damage_instances(labels: MotionLabels) -> MotionOutput:
     return instances_of(instance, labels.config.grid)
 
 
+def counted_instances(drawing: Drawing) -> dict[str, int]:
+    """Count the instances of each role over all frames."""
+    return {
+        cells.role: sum(len(np.unique(ids[ids > 0])) for ids in cells.instance)
+        for cells in drawing.cells
+    }
+
+
 def test_motion_outcomes_agree_with_the_counts(
     da_motion: DeepAccident, sample: str, labels: MotionLabels
 ) -> None:
     output = damage_instances(labels)
     evaluator = MotionEvaluator("released")
     evaluator.update(sample, output, labels)
-    counts = evaluator.compute().ranges["100x100"]
+    expected = evaluator.compute().ranges["100x100"]
 
-    outcome = motion_outcome(output, labels)
+    counts = counted_instances(sample_drawing(da_motion, sample, output).drawing)
 
-    assert len(outcome.matches) == counts.true_positive
-    for side, instance, expected in (
-        ("true", labels.instance, counts.false_negative),
-        ("predicted", outcome.predicted.instance, counts.false_positive),
-    ):
-        num_wrong = 0
-        for ids, kinds in zip(instance, outcome.outcomes(side), strict=False):  # type: ignore[arg-type]
-            num_wrong += len(np.unique(ids[kinds == 2]))
-        assert num_wrong == expected > 0
+    assert counts["truth"] == counts["right"] == expected.true_positive > 0
+    assert counts["missed"] == expected.false_negative > 0
+    assert counts["false"] == expected.false_positive > 0
 
     figure = render_evaluation(da_motion, sample, output, fig=detached_figure((10, 6)))
     left, right = figure.axes
-    missed_cells = first_image(left)[labels.instance[0] == 3]
-    missed_color = to_rgb(OUTCOME_COLORS["missed"])
+    assert left.get_title() == f"truth: {counts['truth']} found, {counts['missed']} missed"
+    assert right.get_title() == f"prediction: {counts['right']} right, {counts['false']} false"
+    missed_cells = left.images[-1].get_array()[labels.instance[0] == 3]
+    missed_color = [*to_rgb(OUTCOME_COLORS["missed"]), 1]
     np.testing.assert_allclose(missed_cells, np.tile(missed_color, (len(missed_cells), 1)))
-    np.testing.assert_allclose(first_image(right)[4, 4], to_rgb(OUTCOME_COLORS["false"]))
+    cells = right.images[-1].get_array()
+    np.testing.assert_allclose(cells[4, 4], [*to_rgb(OUTCOME_COLORS["false"]), 1])
+    assert cells[30, 4, 3] == 0  # the road shows through free cells
 
 
 def test_what_lies_beyond_the_range_is_not_judged(
-    labels: MotionLabels, monkeypatch: pytest.MonkeyPatch
+    da_motion: DeepAccident,
+    sample: str,
+    labels: MotionLabels,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("deepaccident_devkit.render.outcomes.above.RANGES", {"30x30": 30.0})
-    outcome = motion_outcome(instances_of(labels.instance, labels.config.grid), labels)
-    kinds = outcome.outcomes("true")[0]
-    assert set(np.unique(kinds[labels.instance[0] > 0]).tolist()) == {1, 3}
-
-
-def test_actors_are_drawn_where_the_truth_has_them(da_motion: DeepAccident, sample: str) -> None:
-    truth = box_truth(da_motion, sample)
-    compared = ComparedAccidents(true=truth.accident, predicted=())
-    ax = draw_accident_outcome(compared, truth, ax=new_axes())
-
-    boxes = da_motion.boxes(sample, "ego")
-    own_corners = boxes.bottom_corners()[boxes.actor_id == OWN_ACTOR_ID, :, :2]
-    drawn_corners = []
-    for shape in collections_of_kind(ax, PolyCollection):
-        drawn_corners += [path.vertices[:4] for path in shape.get_paths()]
-    assert np.abs(np.array(drawn_corners) - own_corners).max(axis=(1, 2)).min() < 0.3
+    output = instances_of(labels.instance, labels.config.grid)
+    all_counts = counted_instances(sample_drawing(da_motion, sample, output).drawing)
+    monkeypatch.setattr("deepaccident_devkit.evaluation.motion.RANGES", {"30x30": 30.0})
+    counts = counted_instances(sample_drawing(da_motion, sample, output).drawing)
+    assert 0 < counts["right"] < all_counts["right"]
+    assert counts["false"] == counts["missed"] == 0

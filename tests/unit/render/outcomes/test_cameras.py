@@ -9,13 +9,7 @@ import pytest
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_hex, to_rgba
 from support.figure_texts import STYLES, find_text_faults
-from support.rendered_pixels import (
-    canvas_positions,
-    collections_of_kind,
-    has_color,
-    new_axes,
-    render_canvas,
-)
+from support.rendered_pixels import collections_of_kind, new_axes
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import (
@@ -26,18 +20,17 @@ from deepaccident_devkit.evaluation import (
     detection_truth,
     instances_of,
 )
-from deepaccident_devkit.evaluation.accident.scoring import ComparedAccidents
+from deepaccident_devkit.evaluation.drawing import Drawing, DrawnPlaces
 from deepaccident_devkit.motion import MotionLabels
 from deepaccident_devkit.render import detached_figure, style
 from deepaccident_devkit.render.boxes import NEAR_PLANE_M
-from deepaccident_devkit.render.outcomes import (
-    draw_outcome_in_camera,
-    render_outcome_in_cameras,
-    sample_verdict,
+from deepaccident_devkit.render.outcomes import render_outcome_in_cameras
+from deepaccident_devkit.render.outcomes.described import sample_drawing
+from deepaccident_devkit.render.outcomes.drawings import (
+    best_camera_of_drawing,
+    draw_drawing_in_camera,
 )
-from deepaccident_devkit.render.outcomes.above import FORESEEN_COLOR
-from deepaccident_devkit.render.outcomes.verdicts import AccidentVerdict
-from deepaccident_devkit.render.styles import COLLIDER_COLOR, MISSING_COLOR, OUTCOME_COLORS
+from deepaccident_devkit.render.styles import MISSING_COLOR, OUTCOME_COLORS, PREDICTED_COLOR
 from deepaccident_devkit.taxonomy import CAMERAS, OWN_ACTOR_ID
 from deepaccident_devkit.v2x.poses import camera_of
 
@@ -110,11 +103,6 @@ def rectangle_corners(rectangle: tuple[float, float, float, float]) -> Any:
     return np.array([(x, y) for x in (first_x, last_x) for y in (first_y, last_y)])
 
 
-def make_verdict(sample: str, true: Accident | None, *alarms: Accident) -> AccidentVerdict:
-    compared = ComparedAccidents(true=true, predicted=alarms)
-    return AccidentVerdict(sample=sample, compared=compared, truth=None, words="")
-
-
 def find_outcomes(ax: Any) -> list[str]:
     """Return the kinds of outcomes that have lines."""
     return [kind for kind, color in OUTCOME_COLORS.items() if find_lines(ax, color)]
@@ -122,24 +110,29 @@ def find_outcomes(ax: Any) -> list[str]:
 
 def draw_in_camera(
     da: DeepAccident,
-    verdict: Any,
+    sample: str,
+    prediction: Any,
     channel: str = "Camera_Front",
     *,
     size: tuple[float, float] = (5, 5),
-    frame: int | None = None,
+    frame: int = 0,
 ) -> Any:
-    return draw_outcome_in_camera(da, verdict, channel, ax=new_axes(size), frame=frame)
+    ax = new_axes(size)
+    drawing = sample_drawing(da, sample, prediction).drawing
+    draw_drawing_in_camera(da, sample, drawing, f"{sample}/{channel}", ax, frame=frame)
+    return ax
 
 
 def test_detected_boxes_are_where_the_labels_have_them(
     da: DeepAccident, approach_sample: str
 ) -> None:
     detected = predict_labels(da, approach_sample)
-    verdict: Any = sample_verdict(da, approach_sample, detected)
-    matched_ids = set(detected.boxes.actor_id[verdict.matches.truth].tolist()) - {OWN_ACTOR_ID}
+    drawing = sample_drawing(da, approach_sample, detected).drawing
+    (found,) = [drawn.boxes for drawn in drawing.boxes if drawn.role == "truth"]
+    matched_ids = {*found.actor_id.tolist()} - {OWN_ACTOR_ID}
     num_corners = 0
     for channel in CAMERAS:
-        ax = draw_in_camera(da, verdict, channel, size=(4, 2.5))
+        ax = draw_in_camera(da, approach_sample, detected, channel, size=(4, 2.5))
 
         boxes = da.boxes(approach_sample, channel)
         corners = boxes.corners()[np.isin(boxes.actor_id, [*matched_ids])].reshape(-1, 3)
@@ -149,14 +142,10 @@ def test_detected_boxes_are_where_the_labels_have_them(
             distances = distances_to_lines(pixels, find_lines(ax, color, dashed=False))
             assert distances.max(initial=0) < 1e-6
         assert set(find_outcomes(ax)) <= {"right"}
+        assert not ax.texts  # all scores are 1
 
         in_image = camera.in_image(pixels, depth, min_depth=NEAR_PLANE_M, margin=2)
         num_corners += in_image.sum()
-        if channel == "Camera_Front":
-            canvas = render_canvas(ax)
-            assert in_image.any()
-            for position in canvas_positions(ax, pixels[in_image]):
-                assert has_color(canvas, position, OUTCOME_COLORS["right"])
     assert num_corners > 20
 
 
@@ -164,18 +153,17 @@ def test_a_shifted_box_is_false_and_the_true_one_missed(
     da: DeepAccident, approach_sample: str
 ) -> None:
     exact = predict_labels(da, approach_sample)
-    verdict: Any = sample_verdict(da, approach_sample, exact)
     camera_from_boxes = da.world_from(approach_sample, "Camera_Front").inverse() @ da.world_from(
         approach_sample, exact.boxes.frame
     )
     depth = camera_from_boxes.apply(exact.boxes.center)[:, 2]
-    rows_ahead = [row for row in verdict.matches.truth.tolist() if depth[row] > 5]
-    row = min(rows_ahead, key=lambda candidate: depth[candidate])
+    row = int(np.where(depth > 5, depth, np.inf).argmin())
     center = exact.boxes.center.copy()
     center[row] = [*center[row, :2] * 0.5, center[row, 2] + 30.0]
-    shifted = DetectedBoxes(boxes=replace(exact.boxes, center=center), scores=exact.scores)
+    scores = np.linspace(0.3, 0.7, len(center))
+    shifted = DetectedBoxes(boxes=replace(exact.boxes, center=center), scores=scores)
 
-    ax = draw_in_camera(da, sample_verdict(da, approach_sample, shifted))
+    ax = draw_in_camera(da, approach_sample, shifted)
 
     camera = camera_of(da, f"{approach_sample}/Camera_Front")
     for kind, boxes in (("false", shifted.boxes), ("missed", exact.boxes)):
@@ -187,6 +175,9 @@ def test_a_shifted_box_is_false_and_the_true_one_missed(
     missed_pixels = pixels
     for color in (OUTCOME_COLORS["right"], "black"):
         assert distances_to_lines(missed_pixels, find_lines(ax, color)).max() > 0.1
+    written = [text.get_text() for text in ax.texts]
+    assert 0 < len(written) <= 10
+    assert {*written} <= {f"{score:.2f}" for score in scores.tolist()}
 
 
 def test_cells_are_polygons_on_the_ground(
@@ -194,11 +185,10 @@ def test_cells_are_polygons_on_the_ground(
 ) -> None:
     later = (20.0, 22.0, 3.0, 4.0)
     output = predict_rectangles(labels, AHEAD_M, AHEAD_M, later)
-    verdict = sample_verdict(da_motion, sample, output, label=labels)
     camera = camera_of(da_motion, f"{sample}/Camera_Front")
     color = OUTCOME_COLORS["false"]
-    for frame, rectangle in ((None, AHEAD_M), (0, AHEAD_M), (2, later)):
-        ax = draw_in_camera(da_motion, verdict, frame=frame)
+    for frame, rectangle in ((0, AHEAD_M), (2, later)):
+        ax = draw_in_camera(da_motion, sample, output, frame=frame)
 
         (line,) = find_lines(ax, color, dashed=False)
         ground_corners = rectangle_corners(rectangle)
@@ -228,9 +218,8 @@ def test_instances_are_judged_frame_by_frame(
     instance = labels.instance.copy()
     instance[1:] = 0  # exact now, and nothing later
     output = instances_of(instance, labels.config.grid)
-    verdict = sample_verdict(da_motion, sample, output, label=labels)
     present, later = (
-        draw_in_camera(da_motion, verdict, "Camera_Back", frame=frame) for frame in (0, 2)
+        draw_in_camera(da_motion, sample, output, "Camera_Back", frame=frame) for frame in (0, 2)
     )
 
     assert find_outcomes(present) == ["right"]
@@ -238,37 +227,30 @@ def test_instances_are_judged_frame_by_frame(
 
 
 @pytest.mark.parametrize(("agent", "ground"), [("ego_vehicle", 0.0), ("infrastructure", -4.0)])
-def test_positions_of_accidents_are_on_the_ground(
+def test_places_are_on_the_ground(
     da: DeepAccident, approach_sample: str, agent: str, ground: float
 ) -> None:
     sample = approach_sample.replace("ego_vehicle", agent)
     box_bottoms = da.boxes(sample, "ego").bottom_corners()[..., 2]
     assert abs(np.median(box_bottoms) - ground) < 0.7
-    true_accident = Accident(positions=np.array([[15.0, 2.0], [18.0, -1.0]]), time=1.5)
     alarm = Accident(positions=np.array([[14.0, 3.0], [17.0, 0.0]]), time=1.2, score=0.8)
 
-    ax = draw_in_camera(da, make_verdict(sample, true_accident, alarm), size=(8, 4.5))
+    ax = draw_in_camera(da, sample, [alarm], size=(8, 4.5))
 
-    camera = camera_of(da, f"{sample}/Camera_Front")
-    ego_from_camera = da.ego_from(sample, "Camera_Front")
+    points = ground_in_camera(da, sample, "Camera_Front", alarm.positions, ground)
+    pixels, _ = camera_of(da, f"{sample}/Camera_Front").project(points)
+    assert distances_to_lines(pixels, find_lines(ax, PREDICTED_COLOR)).max() < 1e-6
+    assert "in 1.2 s, score 0.8" in [text.get_text() for text in ax.texts]
 
-    def project_to_ground(pixels: Any) -> Any:
-        """Return where the rays through pixels meet the ground, in the ego frame."""
-        directions = np.insert(pixels, 2, 1, axis=1) @ np.linalg.inv(camera.intrinsic).T
-        rays = ego_from_camera.rotate(directions)
-        share = (ground - ego_from_camera.translation[2]) / rays[:, 2]
-        return (ego_from_camera.translation + share[:, None] * rays)[:, :2]
 
-    rings = [line for line in find_lines(ax, COLLIDER_COLOR) if len(line) > 4]
-    for ring, position in zip(rings, true_accident.positions, strict=True):
-        radii = np.linalg.norm(project_to_ground(ring) - position, axis=1)
-        np.testing.assert_allclose(radii, 1.0)
-
-    strokes = [line for line in find_lines(ax, FORESEEN_COLOR) if len(line) == 2]
-    crosses = np.array([project_to_ground(stroke) for stroke in strokes[-4:]])
-    np.testing.assert_allclose(
-        crosses.mean(axis=1), np.repeat(alarm.positions, 2, axis=0), atol=1e-9
-    )
+def test_what_is_below_the_images_of_the_pole_does_not_choose_its_camera(
+    da: DeepAccident, approach_sample: str
+) -> None:
+    sample = approach_sample.replace("ego_vehicle", "infrastructure")
+    positions = np.array([[1.5, 0.0], [1.6, 0.0], [1.7, 0.0], [-20.0, 0.0]])
+    place = DrawnPlaces(xy=positions, time=0.0, role="predicted")
+    camera = best_camera_of_drawing(da, sample, Drawing(places=(place,)))
+    assert camera == f"{sample}/Camera_Back"
 
 
 def make_predictions(
@@ -278,13 +260,14 @@ def make_predictions(
     accident: Any = box_truth(dataset, token).accident
     near = Accident(positions=accident.positions + 1.5, time=accident.time, score=0.9)
     motion = instances_of(np.roll(labels.instance, 2, axis=-1), labels.config.grid)
+    exact = predict_labels(dataset, token)
+    detected = DetectedBoxes(boxes=exact.boxes, scores=np.linspace(0.2, 0.9, len(exact)))
     return [
-        (predict_labels(dataset, token), {}),
+        (detected, {}),
         ([near], {}),
         ([], {}),
-        (motion, {}),
+        (motion, {"frame": 2}),
         (motion, {"task": "accident", "protocol": "boxes"}),
-        (motion, {"label": labels}),
     ]
 
 

@@ -1,8 +1,6 @@
 """Tasks draw themselves: plans, forecasts, warnings and tasks of plug-ins, with their verdicts."""
 
-from collections.abc import Collection
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,16 +10,12 @@ from support.rendered_pixels import new_axes
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError
-from deepaccident_devkit.evaluation import Accident, DetectedBoxes, Evaluator, Forecast, Plan
+from deepaccident_devkit.evaluation import Forecast, Plan
 from deepaccident_devkit.evaluation.drawing import Drawing, DrawnAlarm, DrawnPath
-from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.forecasting.truth import forecasting_truth
 from deepaccident_devkit.evaluation.planning import planning_scene, trivial_plans
-from deepaccident_devkit.evaluation.runs.setups import TASKS
-from deepaccident_devkit.evaluation.task import Row, TaskResult
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.render import detached_figure, render_evaluation
-from deepaccident_devkit.render.outcomes import render_outcome_in_cameras
+from deepaccident_devkit.render import render_evaluation
 from deepaccident_devkit.render.outcomes.described import sample_drawing
 from deepaccident_devkit.render.outcomes.drawings import (
     draw_drawing_in_camera,
@@ -58,35 +52,6 @@ def view_points(points: Any, intrinsic: Any) -> Any:
     """Project as nuscenes-devkit's `view_points(points, view, normalize=True)` does."""
     projected = intrinsic @ points.T
     return (projected / projected[2:3])[:2].T
-
-
-def predictions_by_task(dataset: DeepAccident, sample: str) -> dict[str, Any]:
-    alarm = Accident(positions=np.array([[8.0, 0.0], [9.0, 1.0]]), time=0.5, score=0.9)
-    return {
-        "planning": [straight_plan()],
-        "forecasting": forecasts_of_truth(dataset, sample),
-        "warning": [alarm],
-    }
-
-
-@pytest.mark.parametrize("task", ["planning", "forecasting", "warning"])
-def test_each_task_is_drawn_from_above_and_in_cameras(
-    da: DeepAccident, approach_sample: str, task: str
-) -> None:
-    prediction = predictions_by_task(da, approach_sample)[task]
-
-    figure = render_evaluation(
-        da, approach_sample, prediction, task=task, fig=detached_figure((10, 6))
-    )
-    cameras = render_outcome_in_cameras(
-        da, approach_sample, prediction, task=task, fig=detached_figure((10, 6))
-    )
-
-    assert len(figure.axes) == 2
-    assert len(cameras.axes) == 6
-    for drawn in (figure, cameras):
-        assert f"{task}: " in drawn.get_suptitle()
-        assert drawn.legends
 
 
 def test_a_drawn_plan_lies_where_nuscenes_view_points_puts_it(
@@ -218,54 +183,14 @@ def test_a_ribbon_has_the_width_of_the_vehicle() -> None:
     np.testing.assert_allclose(outline[0], outline[-1])
 
 
-@dataclass(frozen=True)
-class NoRules:
-    """A protocol without choices."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FoundResult(TaskResult):
-    """The number of boxes."""
-
-    rows: ClassVar[tuple[Row, ...]] = (Row("found", "share", "higher"),)
-    found: float
-
-
-class FoundEvaluator(Evaluator[FoundResult]):
-    """A task of a plug-in that says nothing about pictures."""
-
-    task = "found_boxes"
-    description = "Count boxes."
-    result_kinds: ClassVar[tuple[str, ...]] = ("detection",)
-    protocols: ClassVar[dict[str, Any]] = {"all": NoRules()}
-    result_class = FoundResult
-
-    def truth(self, dataset: Any, token: str, /, *_unused: Any) -> tuple[int]:
-        return (len(dataset.boxes(token)),)
-
-    def update(self, token: str, prediction: DetectedBoxes, labelled: int) -> None:
-        self.add(token, {"found": len(prediction) / labelled})
-
-    def result_of(self, counts: Collection[Counts]) -> FoundResult:
-        return FoundResult(found=sum(sample["found"] for sample in counts))
-
-
-def test_a_task_of_a_plug_in_draws_its_predictions_and_numbers(
-    da: DeepAccident, approach_sample: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(TASKS, "found_boxes", FoundEvaluator)
-    boxes = da.boxes(approach_sample, "world")
-    prediction = DetectedBoxes(boxes=boxes, scores=np.ones(len(boxes)))
-
-    figure = render_evaluation(
-        da, approach_sample, prediction, task="found_boxes", fig=detached_figure((10, 6))
-    )
-
-    assert "found 1.000" in figure.get_suptitle()
-    legend_texts = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend_texts == ["detected"]
-
-
 def test_a_prediction_for_another_task_is_refused(da: DeepAccident, approach_sample: str) -> None:
     with pytest.raises(ChoiceError, match="planning"):
         render_evaluation(da, approach_sample, [straight_plan()], task="forecasting")
+
+
+def test_an_empty_list_is_for_the_task_that_draws_it(
+    da: DeepAccident, approach_sample: str
+) -> None:
+    drawing = sample_drawing(da, approach_sample, [], task="forecasting").drawing
+    assert {path.role for path in drawing.paths} == {"past", "truth"}
+    assert sample_drawing(da, approach_sample, []).words.startswith("accident: ")

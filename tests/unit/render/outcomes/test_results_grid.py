@@ -1,12 +1,14 @@
 """Several results side by side: the truth and methods in rows, samples in columns."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.lines import Line2D
+from matplotlib.collections import LineCollection
 from support.command_calls import invoke_command
+from support.rendered_pixels import collections_of_kind
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, TokenError
@@ -110,15 +112,25 @@ def test_samples_are_in_columns_and_the_truth_has_no_prediction(
     np.testing.assert_allclose(ends, [[6.0] * 3, [30.0] * 3])
     for column, sample in enumerate(planned_samples):
         recorded = planning_scene(da_motion, sample).recorded[:31, :2]
-        paths = [line.get_xydata() for line in axes[0, column].lines]
+        paths = [path for path, _ in drawn_paths(axes[0, column])]
         assert any(np.array_equal(path, recorded) for path in paths)
-        assert farthest(axes[0, column], width=2.4) == 0
+        assert farthest(axes[0, column]) == 0
 
 
-def farthest(ax: Any, width: float = 2.4) -> float:
+def drawn_paths(ax: Any) -> list[tuple[Any, float]]:
+    """Return the positions and the line width of each path from above."""
+    paths = []
+    for lines in collections_of_kind(ax, LineCollection):
+        widths = itertools.cycle(lines.get_linewidths())
+        for path, width in zip(lines.get_paths(), widths, strict=False):
+            paths.append((path.vertices, float(width)))
+    return paths
+
+
+def farthest(ax: Any) -> float:
     """Return the largest x of the predicted paths, which are the widest lines; 0 without any."""
-    paths: list[Line2D] = [line for line in ax.lines if line.get_linewidth() == width]
-    return max((float(np.max(line.get_xdata())) for line in paths), default=0.0)
+    ends = [float(path[:, 0].max()) for path, width in drawn_paths(ax) if width == 2.4]
+    return max(ends, default=0.0)
 
 
 def test_samples_are_picked_by_the_first_score_or_by_the_difference(

@@ -24,35 +24,18 @@ def data(page: Path) -> dict[str, Any]:
     return read_page_data(page)
 
 
-def foresee_accident(
-    dataset: DeepAccident, token: str, *, offset_m: float = 0.0, **changes: Any
-) -> Accident:
-    """Predict the true accident of a sample, some metres away or with other values."""
-    truth = box_truth(dataset, token).accident
-    values = {
-        "positions": truth.positions + np.array([offset_m, 0.0]),
-        "time": truth.time,
-        "ids": truth.ids,
-        **changes,
-    }
-    return Accident(**values)
-
-
 @pytest.fixture(scope="session")
 def predictions(da_motion: DeepAccident) -> dict[str, list[Accident]]:
-    """Alarms by sample: one correct, one far away, none, and four far away."""
+    """Alarms by sample: one correct, none, and more than a page shows."""
     scenario = accident_scenario(da_motion)
     ego = f"{scenario}/ego_vehicle"
-    unlikely_alarms = [
+    truth = box_truth(da_motion, f"{ego}/020").accident
+    far_alarms = [
         Accident(positions=np.full((2, 2), position_m), time=1.0, score=0.1)
-        for position_m in (200.0, 300.0, 400.0)
+        for position_m in (200.0, 300.0, 400.0, 500.0, 600.0)
     ]
     return {
-        f"{ego}/020": [foresee_accident(da_motion, f"{ego}/020", score=0.75)],
-        f"{ego}/025": [foresee_accident(da_motion, f"{ego}/025", offset_m=20.0)],
+        f"{ego}/020": [Accident(positions=truth.positions, time=truth.time, score=0.75)],
         f"{ego}/030": [],
-        f"{scenario}/infrastructure/030": [
-            foresee_accident(da_motion, f"{ego}/030", offset_m=90.0, ids=None),
-            *unlikely_alarms,
-        ],
+        f"{scenario}/infrastructure/030": far_alarms,
     }

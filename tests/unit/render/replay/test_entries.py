@@ -2,27 +2,15 @@
 
 import itertools
 import shutil
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support.expected_errors import assert_raises
 from support.replay_page import accident_scenario, normal_scenario, read_page_data
 
 from deepaccident_devkit import DeepAccident
-from deepaccident_devkit.errors import EvaluationError, NotAvailableError
-from deepaccident_devkit.evaluation import (
-    Accident,
-    Results,
-    ResultsWriter,
-    instances_of,
-    read_results,
-)
-from deepaccident_devkit.evaluation.predictions import labels_at_present
 from deepaccident_devkit.geometry import quaternions
 from deepaccident_devkit.interactions import interactions
-from deepaccident_devkit.motion import OWN_BOX_ID, MotionLabelConfig, motion_labels
 from deepaccident_devkit.render.boxes import camera_name
 from deepaccident_devkit.render.replay import recording_of, render_replay
 from deepaccident_devkit.render.styles import AGENT_COLORS, CATEGORY_COLORS, COLLIDER_COLOR
@@ -156,97 +144,3 @@ def test_without_labels_there_are_the_agents(own_release: Path, tmp_path: Path) 
     assert data["actors"] == []
     assert [len(agent["poses"]) for agent in data["agents"]] == [4] * 5
     assert data["countdown"][-1] == 0
-
-
-def test_each_sample_has_its_verdict(
-    da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
-) -> None:
-    page = render_replay(da_motion, None, tmp_path / "a.html", prediction=predictions)
-    data = read_page_data(page)
-
-    samples = data["prediction"]["samples"]
-    assert [(sample["frame"], sample["agent"], sample["verdict"]) for sample in samples] == [
-        (19, 0, "TP"),
-        (24, 0, "FP + FN"),
-        (29, 0, "FN"),
-        (29, 4, "4 FP + FN"),
-    ]
-    (hit,) = samples[0]["alarms"]
-    assert (hit["right"], hit["time"]) == (True, 1.5)
-    (miss,) = samples[1]["alarms"]
-    assert miss["right"] is False
-    assert "position error 40.0 m" in miss["text"]
-    unknown, *far_alarms = samples[3]["alarms"]
-    assert (len(far_alarms), samples[3]["more"]) == (2, 1)
-    assert "names an unknown actor" in unknown["text"]
-
-    # the foreseen positions are the pair's last ones on the page's own ground, in centimetres; a
-    # slope takes a few
-    pair = [actor["states"][-1][:2] for actor in data["actors"] if actor["role"] == "pair"]
-    np.testing.assert_allclose(sorted(hit["places"]), sorted(pair), atol=8)
-
-
-def write_results(path: Path, task: Any, predictions: Mapping[str, Any]) -> Results:
-    """Write predictions by sample to a results file and open it."""
-    with ResultsWriter(path, task) as writer:
-        for token, prediction in predictions.items():
-            writer.add(token, prediction)
-    return read_results(path)
-
-
-def test_results_files_give_the_same_page(
-    da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
-) -> None:
-    results = write_results(tmp_path / "results.json", "accident", predictions)
-    page = render_replay(da_motion, None, tmp_path / "a.html", prediction=predictions)
-    page_of_file = render_replay(da_motion, None, tmp_path / "b.html", prediction=results)
-    assert page_of_file.read_bytes() == page.read_bytes()
-
-
-def test_motion_is_read_for_accidents(da_motion: DeepAccident, tmp_path: Path) -> None:
-    """The prediction is the pair as the labels draw it, and no other actor: it foresees the true
-    accident.
-    """
-    config = MotionLabelConfig()
-    scenario = da_motion.get("scenario", accident_scenario(da_motion))
-    motion = {}
-    for frame in ("020", "030"):
-        token = f"{scenario['token']}/ego_vehicle/{frame}"
-        label = labels_at_present(motion_labels(da_motion, token, config))
-        pair = [
-            label.id_map[actor_id]
-            for actor_id in (OWN_BOX_ID, *scenario["collision"]["ids"])
-            if actor_id in label.id_map
-        ]
-        instance = np.where(np.isin(label.instance, pair), label.instance, 0)
-        motion[token] = instances_of(instance, config.grid)
-
-    page = render_replay(da_motion, None, tmp_path / "a.html", prediction=motion)
-
-    samples = read_page_data(page)["prediction"]["samples"]
-    assert [sample["verdict"] for sample in samples] == ["TP", "TP"]
-
-
-def test_predictions_of_something_else_are_refused(
-    da_motion: DeepAccident, predictions: dict[str, list[Accident]], tmp_path: Path
-) -> None:
-    token = next(iter(predictions))
-    normal = normal_scenario(da_motion)
-
-    def replay(prediction: Any, scenario: str | None = None) -> Callable[[], object]:
-        return lambda: render_replay(
-            da_motion, scenario, tmp_path / "a.html", prediction=prediction
-        )
-
-    assert_raises(
-        (
-            replay(predictions, normal),
-            NotAvailableError,
-            ("prediction", normal, "ego_vehicle"),
-        ),
-        (
-            replay({token: [7]}),
-            EvaluationError,
-            ("a MotionOutput or a list of Accidents", "list with int"),
-        ),
-    )

@@ -115,4 +115,4 @@ def test_the_command_writes_the_page(
     assert [agent["name"] for agent in data["agents"]] == ["ego_vehicle", "infrastructure"]
     samples = data["prediction"]["samples"]
     verdicts = [(sample["verdict"], sample["agent"]) for sample in samples]
-    assert verdicts == [("TP", 0), ("FP + FN", 0), ("FN", 0), ("4 FP + FN", 1)]
+    assert verdicts == [("alarm", 0), ("no alarm", 0), ("alarm", 1)]

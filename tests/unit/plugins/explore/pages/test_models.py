@@ -7,7 +7,6 @@ import json
 import re
 import shlex
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from support.text_contents import contained_parts, missing_parts
 
 from deepaccident_devkit import DeepAccident
 from deepaccident_devkit.evaluation import Accident, Resampling, ResultsWriter
+from deepaccident_devkit.evaluation.accident.scoring import count_words
 from deepaccident_devkit.evaluation.runs import (
     EvaluationRun,
     default_selection,
@@ -32,7 +32,6 @@ from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup
 from deepaccident_devkit.plugins.explore import Explorer, make_app
 from deepaccident_devkit.plugins.explore.evaluations import verdict_text
 from deepaccident_devkit.plugins.explore.pages.samples import sample_path
-from deepaccident_devkit.render.outcomes.above import count_words
 
 pytestmark = pytest.mark.slow
 
@@ -95,6 +94,10 @@ def image_addresses(page: str) -> list[str]:
     return [html.unescape(address) for address in re.findall(r'<img src="([^"]+)"', page)]
 
 
+def picture_names(page: str) -> list[str]:
+    return [Path(urlsplit(address).path).stem for address in image_addresses(page)]
+
+
 def token_of_address(address: str) -> str:
     _, path = urlsplit(address).path.split("/sample/", 1)
     recording, frame = path.rsplit("/", 1)
@@ -129,6 +132,10 @@ def edit_summary(folder: Path, edit: Callable[[dict[str, Any]], object]) -> None
     path.write_text(json.dumps(summary))
 
 
+def edit_results(folder: Path, **changes: str) -> None:
+    edit_summary(folder, lambda summary: summary["results"].update(changes))
+
+
 def save_bundle(
     da: DeepAccident,
     folder: Path,
@@ -149,7 +156,7 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
     """Open a site of evaluations and of results without one.
 
     The evaluations are of accidents (with and without a copy of the results, by another protocol,
-    partial, with a hostile name), of motion, of boxes, of warnings and of forecasts.
+    partial, with a hostile name and without results), and of all other tasks.
     """
     folder = tmp_path_factory.mktemp("models")
     tokens = default_selection(BOXES, "train").tokens(da_motion)
@@ -167,6 +174,7 @@ def site(da_motion: DeepAccident, tmp_path_factory: pytest.TempPathFactory) -> I
         ("motion", "released", "maps"),
         ("detection", "released", "detection.json"),
         ("warning", "clean", "warning.json"),
+        ("planning", "clean", "planning.json"),
         ("forecasting", "clean", "forecasting.json"),
     ):
         setup = EvaluationSetup(task=task, protocol=protocol)
@@ -279,7 +287,7 @@ def test_accident_verdicts_agree_with_the_evaluator(site: Site) -> None:
 
 
 @pytest.mark.parametrize(
-    "task", ["accident", "motion", "detection", "warning", "planning", "forecasting"]
+    "task", ["accident", "motion", "detection", "warning", "task of a plug-in"]
 )
 def test_verdicts_of_a_strange_row_are_no_error(task: str) -> None:
     row = {
@@ -299,13 +307,17 @@ def test_verdicts_of_a_strange_row_are_no_error(task: str) -> None:
 # a sample
 
 
-@pytest.mark.parametrize("name", ["first", "motion", "detection", "warning", "alone"])
-def test_a_sample_shows_the_prediction_from_above_and_in_cameras(site: Site, name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    ["first", "motion", "detection", "warning", "planning", "forecasting", "alone", HOSTILE],
+)
+def test_a_sample_shows_the_prediction_and_always_the_truth(site: Site, name: str) -> None:
     token = min(site.explorer.models[name].tokens)
     address = model_address("model", name, "sample", sample_path(token))
-    pictures = image_addresses(site.page(address))
-    assert len(pictures) == 2
-    for picture in pictures:
+    page = site.page(address)
+    names = ["above", "cameras", "truth"]
+    assert picture_names(page) == (names[-1:] if name == HOSTILE else names)
+    for picture in image_addresses(page):
         response = site.get(urljoin(address, picture))
         assert response.status == 200
         assert response.headers["content-type"] == "image/png"
@@ -351,48 +363,32 @@ def test_a_sample_that_is_not_evaluated_is_a_sentence(site: Site) -> None:
     address = model_address("model", "part", "sample", sample_path(token))
     page = site.page(address)
     assert not missing_parts(page, "has no prediction for this sample", "is not in the evaluation")
-    assert image_addresses(page) == []
+    assert picture_names(page) == ["truth"]
     assert site.get(f"{address}/above.png").status == 404
 
 
-# missing results, and files that are not opened
+# results that a bundle names
 
 
-def test_the_results_that_a_bundle_names_are_not_opened(
-    site: Site, open_site: Callable[..., Site]
+def test_the_results_that_a_bundle_names_are_shown_if_they_are_the_same(
+    site: Site, open_site: Callable[..., Site], tmp_path: Path
 ) -> None:
-    """The results exist and the release has all samples, but a bundle may come from anywhere."""
-    results = site.explorer.models["second"].bundle.summary["results"]["path"]  # type: ignore[union-attr]
-    assert Path(results).is_file()
-    token = last_token(site, "second")
-    address = model_address("model", "second", "sample", sample_path(token))
-    opened_files: set[str] = set()
-    is_watching = True  # a hook cannot be removed again
-
-    def watch(event: str, arguments: tuple[Any, ...]) -> None:
-        if is_watching and event == "open":
-            opened_files.add(Path(str(arguments[0])).name)
-
-    sys.addaudithook(watch)
-    other = open_site(bundles=[site.folder / "second"])
-    page = other.page(address)
-    model_page = other.page("/model/second/")
-    other.page("/model/second/samples")
-    assert other.get(f"{address}/above.png").status == 404
-    is_watching = False
-
-    assert "samples.parquet" in opened_files
-    assert Path(results).name not in opened_files
-    assert not missing_parts(page, "--results PATH", html.escape(results))
-    assert image_addresses(page) == []
-    assert "--results PATH" in model_page
-
-
-def test_given_results_join_their_bundle(site: Site, open_site: Callable[..., Site]) -> None:
-    other = open_site(bundles=[site.folder / "second"], results=[site.folder / "quiet.json"])
-    assert [*other.explorer.models] == ["second"]
+    """Without them, a page has the truth and a sentence, until the results are given."""
     path = sample_path(last_token(site, "second"))
-    assert image_addresses(other.page(model_address("model", "second", "sample", path)))
+    results = site.folder / "quiet.json"
+    assert "The predictions are not shown" not in site.page("/model/second/")
+    for name, entry in (("changed", {"fingerprint": "5e"}), ("moved", {"path": "/no/such"})):
+        shutil.copytree(site.folder / "second", tmp_path / name)
+        edit_results(tmp_path / name, **entry)
+        other = open_site(bundles=[tmp_path / name])
+        for page in (other.page(f"/model/{name}/"), other.page(f"/model/{name}/sample/{path}")):
+            assert "is missing or has changed. Pass them with --results PATH" in page
+        assert picture_names(page) == ["truth"]
+        assert other.get(f"/model/{name}/sample/{path}/above.png").status == 404
+
+    other = open_site(bundles=[tmp_path / "moved"], results=[results])
+    assert [*other.explorer.models] == ["moved"]
+    assert picture_names(other.page(f"/model/moved/sample/{path}")) == ["above", "cameras", "truth"]
 
 
 # the command
@@ -544,10 +540,8 @@ def test_two_models_are_shown_at_the_same_moment(site: Site) -> None:
         assert verdict in html.unescape(page)
 
     assert page.count("<section") == 2
-    pictures = image_addresses(page)
-    names = [urlsplit(picture).path.rsplit("/", 1)[1] for picture in pictures]
-    assert names == ["above.png", "cameras.png"]  # the second model has no pictures
-    for picture in pictures:
+    assert picture_names(page) == ["truth", *("above", "cameras") * 2]
+    for picture in image_addresses(page):
         assert site.get(urljoin(address, picture)).status == 200
     swapped = model_address("compare", "second", "first", "sample", path, better="b")
     swap_links = [link for link in link_addresses(page) if "/second/first/" in link]

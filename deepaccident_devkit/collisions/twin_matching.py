@@ -9,7 +9,9 @@ from typing import Final, Literal
 
 import numpy as np
 
-from deepaccident_devkit.dataset import Dataset
+from deepaccident_devkit.collisions.recorded import Accident, accident_of
+from deepaccident_devkit.collisions.twins import twin_of
+from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, FrozenArrays, IntArray
 from deepaccident_devkit.taxonomy import AgentName
@@ -93,6 +95,35 @@ def twin_recording(dataset: Dataset, scenario: str) -> TwinRecording:
         speeds=speeds,
         agents=agents,
     )
+
+
+def twin_recordings(
+    dataset: Dataset, scenario: RowArgument
+) -> tuple[Accident, TwinRecording, TwinRecording]:
+    """Return the accident, its recording, and the recording of its twin.
+
+    Args:
+        dataset: The release.
+        scenario: Token or record of the accident or of its twin.
+
+    Raises:
+        TokenError: If the release has no such scenario.
+        NotAvailableError: If the release does not contain the scenario's twin, neither of the two
+            ends in an accident, one of them has no labels, or `accident_of` raises it.
+    """
+    record = dataset.scenario[dataset.getind("scenario", scenario)]
+    twin = twin_of(dataset, record)
+    if twin is None:
+        raise NotAvailableError(
+            f"{record['token']}: this release has no twin of it, with the same name and subtype"
+        )
+    if record["collision"] is None and twin["collision"] is not None:
+        twin, record = record, twin
+    accident = accident_of(dataset, record)
+    if accident is None:
+        raise NotAvailableError(f"{record['token']}: neither it nor its twin ends in an accident")
+    recording = twin_recording(dataset, record["token"])
+    return accident, recording, twin_recording(dataset, twin["token"])
 
 
 def shift_of(recording: TwinRecording, twin: TwinRecording) -> int:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepaccident_devkit.plugins.safety.twin_matching import (
+from deepaccident_devkit.collisions.twin_matching import (
     TwinRecording,
     matched_rows,
     shift_of,
