@@ -73,9 +73,11 @@ REFERENCE = {
         "evaluation.motion",
         "evaluation.accident",
         "evaluation.detection",
+        "evaluation.tracking",
         "evaluation.warning",
         "evaluation.planning",
         "evaluation.forecasting",
+        "evaluation.segmentation",
     ),
     "Results files and whole evaluations": (
         "evaluation.results",

@@ -13,32 +13,32 @@ _ARROWS = {"higher": "↑", "lower": "↓", "neither": ""}
 
 _HEAD = """# Glossary
 
-For everyone who meets an unknown word in the devkit, its pages or its results.
+For everyone who meets an unknown word in the devkit.
 `python docs/make_glossary.py` makes this page from the table of names.
 
 ## Words
 
 - **actor**: a road user in the labels
 - **agent**: one of the five recorders
-- **alarm**: one predicted accident, with a time, two positions and a score
+- **alarm**: one predicted accident
 - **annotation**: one box of one label
 - **baseline**: a predictor without a learned model
-- **bundle**: the folder that an evaluation writes
+- **bundle**: folder that an evaluation writes
 - **cluster, scenario pair**: an accident and its twin, counted as one
-- **colliding pair**: the two actors that collide, according to the meta file
+- **colliding pair**: the two actors that collide
 - **delta-v**: a vehicle's change of velocity in the impact
 - **DRAC**: deceleration that just avoids a collision
-- **ego**: the agent that recorded the sample
+- **ego**: agent that recorded the sample
 - **frame**: a moment of a scenario, or a coordinate system
-- **heads**: raw maps that a model outputs
+- **heads**: raw maps of a model
 - **headline**: a metric that is shown first
 - **horizon**: how far a model looks ahead
 - **impact**: the moment of the collision, the recording's last frame
 - **label, meta, calib**: the files of boxes, scenario facts and poses
-- **lead time**: time from when agents see both colliders to the impact
+- **lead time**: from when agents see both colliders to the impact
 - **link**: the radio between agents, with latency, pose noise and packet loss
 - **partner**: an agent that sends its data to ego
-- **PET**: post-encroachment time, between one actor leaving a place and another arriving
+- **PET**: time between one actor leaving a place and another arriving
 - **protocol, switch**: the rules of a metric, and one choice in them
 - **release**: a folder in DeepAccident's format
 - **sample**: one agent at one frame
@@ -48,7 +48,7 @@ For everyone who meets an unknown word in the devkit, its pages or its results.
 - **track**: one actor at one frame, merged from all labels
 - **TTA, mTTA**: time from the first alarm to the impact, and its mean
 - **TTC**: time to collision at constant velocity
-- **twins**: an accident and a normal scenario with the same traffic and weather
+- **twins**: accident and normal scenario with the same traffic
 
 """
 

@@ -42,13 +42,13 @@ COUNTERPARTS = sorted(set(re.findall(r"`([^`\n]+)`", _ROWS)))
 PAGES = [TOP / "README.md", *sorted(DOCS.glob("*.md")), *sorted((TOP / "schema").glob("**/*.md"))]
 FORMATS_WITH_OWN_PAGE = ("town-maps",)
 PAGES_ABOUT_LABELS = (
-    "docs/evaluating.md",
     "docs/evaluators.md",
     "docs/safety.md",
     "docs/baselines.md",
 )
 PAGES_ABOUT_SENSORS = (
     "README.md",
+    "docs/evaluating.md",
     "docs/exports.md",
     "docs/format.md",
     "docs/index.md",

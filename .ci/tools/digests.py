@@ -446,7 +446,8 @@ def add_evaluations(collector: DigestCollector, evaluated: Evaluated) -> None:
     from deepaccident_devkit.evaluation.runs.setups import TASKS
 
     dataset, predict_results = evaluated.dataset, plugin("baselines").predict_results
-    tasks = tuple(evaluated.tasks or TASKS)
+    predicted_tasks = [task for task in TASKS if task != "segmentation"]  # baselines lack it
+    tasks = tuple(evaluated.tasks or predicted_tasks)
     kinds = tuple(dict.fromkeys(chain.from_iterable(result_kinds(TASKS[task]) for task in tasks)))
     for (name, baseline), kind in product(evaluated.baselines.items(), kinds):
         label = f"{evaluated.name}/{name}, {kind}"

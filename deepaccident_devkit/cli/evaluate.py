@@ -356,8 +356,8 @@ def _refuse_unused(setup: EvaluationSetup, options: NamedValues) -> None:
         return
     if _select_samples(setup, options).samples == "all":
         reason = "the protocol sets its own horizon"
-        if setup.task == "detection":
-            reason = "detections are only of the present"
+        if setup.task in ("detection", "tracking"):
+            reason = "boxes are only of the present"
         refuse_unused(f"with --samples all, as {reason}", "horizon")
 
 

@@ -41,6 +41,18 @@ from deepaccident_devkit.evaluation.motion import MotionEvaluator, MotionResult,
 from deepaccident_devkit.evaluation.planning import Plan, PlanningEvaluator, PlanningResult
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, instances_of
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results
+from deepaccident_devkit.evaluation.segmentation import (
+    SegmentationEvaluator,
+    SegmentationOutput,
+    SegmentationResult,
+)
+from deepaccident_devkit.evaluation.tracking import (
+    TrackingEvaluator,
+    TrackingResult,
+    TrackingTruth,
+    Tracks,
+    tracking_truth,
+)
 from deepaccident_devkit.evaluation.warning import (
     AnticipationResult,
     CleanWarnings,
@@ -79,6 +91,13 @@ __all__ = [
     "Results",
     "ResultsWriter",
     "SampleAttributes",
+    "SegmentationEvaluator",
+    "SegmentationOutput",
+    "SegmentationResult",
+    "TrackingEvaluator",
+    "TrackingResult",
+    "TrackingTruth",
+    "Tracks",
     "WarningEvaluator",
     "accident_context",
     "box_truth",
@@ -91,5 +110,6 @@ __all__ = [
     "motion_counts",
     "read_results",
     "sample_attributes",
+    "tracking_truth",
     "vpq_counts",
 ]

@@ -175,14 +175,16 @@ def joined_drawing(predictions: Iterable[Any]) -> Drawing:
     """
     paths: list[DrawnPath] = []
     boxes: list[DrawnBoxes] = []
+    cells: list[DrawnCells] = []
     places: list[DrawnPlaces] = []
     for prediction in predictions:
         if hasattr(prediction, "drawing"):
             drawing: Drawing = prediction.drawing()
             paths += drawing.paths
             boxes += drawing.boxes
+            cells += drawing.cells
             places += drawing.places
-    return Drawing(paths=tuple(paths), boxes=tuple(boxes), places=tuple(places))
+    return Drawing(paths=tuple(paths), boxes=tuple(boxes), cells=tuple(cells), places=tuple(places))
 
 
 def drawn_pair(dataset: Dataset, token: str, frame: str = "ego") -> tuple[DrawnBoxes, ...]:
@@ -203,3 +205,15 @@ def drawn_pair(dataset: Dataset, token: str, frame: str = "ego") -> tuple[DrawnB
     boxes = cooperative_boxes(dataset, record, frame=frame)
     pair = boxes.select(np.isin(boxes.actor_id, collision["ids"]))
     return (DrawnBoxes(boxes=pair, role="collision", label="colliding pair"),)
+
+
+def drawn_paths(paths: FloatArray, times: FloatArray, role: Role, label: str) -> list[DrawnPath]:
+    """Describe paths (A, T, 2) at times (T,) for a picture, without their missing positions."""
+    drawn_paths = []
+    for path in paths:
+        is_known = np.isfinite(path[:, 0])
+        known_path = path[is_known]
+        if len(known_path) > 1:
+            drawn_path = DrawnPath(xy=known_path, times=times[is_known], role=role, label=label)
+            drawn_paths.append(drawn_path)
+    return drawn_paths

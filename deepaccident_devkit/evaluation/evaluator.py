@@ -48,6 +48,8 @@ class Evaluator(SampleCounts, Generic[_Result]):
         main_numbers: Paths of the headlines that breakdowns show; samples are ranked by the first.
         needs_whole_recordings: Whether the task follows whole recordings; then it cannot be broken
             down by attributes that change within a recording.
+        needs_complete_recordings: Whether a recording that lacks a prediction is left out
+            completely if partial results are allowed.
         needs_meta: Whether the truth is read from the scenarios' meta files.
         vehicles_only: Whether only vehicles have such predictions, but not the infrastructure.
         has_horizon: Whether predictions look ahead to the horizon of a setup.
@@ -61,6 +63,7 @@ class Evaluator(SampleCounts, Generic[_Result]):
     result_class: ClassVar[type[Any]] = TaskResult
     main_numbers: ClassVar[tuple[str, ...]] = ()
     needs_whole_recordings: ClassVar[bool] = False
+    needs_complete_recordings: ClassVar[bool] = False
     needs_meta: ClassVar[bool] = False
     vehicles_only: ClassVar[bool] = False
     has_horizon: ClassVar[bool] = True
@@ -91,7 +94,7 @@ class Evaluator(SampleCounts, Generic[_Result]):
         Args:
             dataset: Release with the labels.
             token: Token of the sample.
-            form: How motion is stored (`Results.form`); None for other results.
+            form: How maps are stored (`Results.form`); None for results without maps.
             horizon: Seconds that the predictions look ahead.
         """
         raise NotImplementedError

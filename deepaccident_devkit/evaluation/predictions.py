@@ -75,7 +75,7 @@ class MotionOutput(FrozenArrays):
                 prediction, or if a shape does not match the grid.
             ChoiceError: If the orientation does not exist.
         """
-        grid = _checked_grid(self.grid, self.orientation)
+        grid = checked_grid(self.grid, self.orientation)
         if (self.heads is None) == (self.instances is None):
             raise GeometryError("motion output: give either heads or instances")
         if self.instances is not None:
@@ -121,7 +121,7 @@ class MotionOutput(FrozenArrays):
                 process (the message explains what to do).
             ChoiceError: If the orientation does not exist.
         """
-        oriented_grid = _checked_grid(grid, orientation)
+        oriented_grid = checked_grid(grid, orientation)
         arrays = {
             "segmentation": segmentation,
             "centerness": centerness,
@@ -226,7 +226,7 @@ def instances_of(values: ArrayLike, grid: BevGrid) -> MotionOutput:
         grid: Cells of the maps.
     """
     maps = as_numbers("instances", values, dtype=None)
-    height, width = _checked_grid(grid, None).shape
+    height, width = checked_grid(grid, None).shape
     if maps.ndim not in (3, 4) or maps.shape[-2:] != (height, width):
         raise GeometryError(
             f"instances: expected shape (T, {height}, {width}), or (K, T, {height}, {width}) for K "
@@ -270,7 +270,7 @@ def checked_prediction(prediction: object) -> MotionOutput | list[Accident]:
     return alarms
 
 
-def _checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
+def checked_grid(grid: object, orientation: Orientation | None) -> BevGrid:
     """Return a grid with an orientation; None keeps the grid's own orientation.
 
     Raise GeometryError if it is not a grid, or ChoiceError if the orientation does not exist.
@@ -353,14 +353,14 @@ def label_config(rules: Any, form: Any, horizon: float) -> MotionLabelConfig | N
     Args:
         rules: Rules of the metrics, whose field `labels` names the label protocol; rules without
             this field take the protocol of the form.
-        form: How motion is stored (`Results.form`); None for explicit accidents.
+        form: How maps are stored (`Results.form`); None for explicit accidents.
         horizon: Seconds that the labels look ahead.
 
     Returns:
         The configuration; None for explicit accidents if the rules do not need labels.
     """
     labels = getattr(rules, "labels", None)
-    if form is not None:
+    if hasattr(form, "step"):
         step = round(form.step / FRAME_PERIOD)
         protocol = labels or form.labels or "clean"
         config = MotionLabelConfig(grid=form.grid, step=step, protocol=protocol)

@@ -212,7 +212,7 @@ def _freeze_mappings(value: Any) -> Any:
     return FrozenDict({key: _freeze_mappings(item) for key, item in value.items()})
 
 
-Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min"]
+Unit = Literal["%", "share", "m", "s", "rad", "m/s", "1 - overlap", "1/min", "count"]
 # Unit → its largest possible number; other units have no limit.
 LIMITS: Final[Mapping[Unit, float]] = MappingProxyType(
     {"%": 100.0, "share": 1.0, "1 - overlap": 1.0}
@@ -326,9 +326,9 @@ def value_text(value: float | None, unit: Unit, *, signed: bool = False) -> str:
     if value is None:
         return "–"
     sign = "+" if signed else ""
-    digits = 2 if unit == "%" else 3
+    digits = {"%": 2, "count": 0}.get(unit, 3)
     number = f"{value:{sign}.{digits}f}"
-    has_no_unit = unit in ("share", "1 - overlap") or (signed and unit == "%")
+    has_no_unit = unit in ("share", "1 - overlap", "count") or (signed and unit == "%")
     if has_no_unit:
         return number
     return f"{number} {unit}"
@@ -345,8 +345,8 @@ def _numbers_at(result: object, path: str) -> Iterator[tuple[str, Any]]:
             if not inner_path:
                 yield text, item
                 continue
-            for _, value in _numbers_at(item, inner_path):
-                yield text, value
+            for inner_key, value in _numbers_at(item, inner_path):
+                yield (text if name == "*" else inner_key), value
     elif hasattr(result, name):
         value = getattr(result, name)
         if inner_path:

@@ -28,6 +28,8 @@ from deepaccident_devkit.v2x.tracks import ScenarioTracks, scenario_tracks
 
 # Seconds that the released models look ahead.
 RELEASED_HORIZON: Final = 2.0
+# Seconds before the current frame that pictures of paths show.
+_PAST_SECONDS = 1.0
 # Half a recorded frame; times that differ by less are treated as equal.
 TIME_TOLERANCE_S: Final = FRAME_PERIOD / 2
 UNPLACED_NOTE: Final = (
@@ -479,3 +481,31 @@ def constant_velocity_alarms(
         )
         alarms.append(alarm)
     return tuple(alarms)
+
+
+def recorded_past(dataset: Dataset, token: str, actor_ids: IntArray) -> FloatArray:
+    """Return where actors were in the last second, for pictures.
+
+    Args:
+        dataset: Release with the sample.
+        token: Token of the sample.
+        actor_ids: (A,) ids of the actors, ascending.
+
+    Returns:
+        Centres, shape (A, P, 2), metres in the current ego frame, at steps of 0.1 s up to the
+        current frame; NaN where no agent annotated the actor.
+    """
+    record = dataset.get("sample", token)
+    tracks = scenario_tracks(dataset, record["scenario_token"])
+    frame = int(token.rsplit("/", 1)[1])
+    frame_count = round(_PAST_SECONDS / FRAME_PERIOD) + 1
+    first_frame = frame - frame_count + 1
+    start, end = tracks.index.searchsorted((first_frame, frame + 1))
+    rows = np.arange(start, end)
+    rows = rows[np.isin(tracks.actor_id[rows], actor_ids)]
+    actor_index = actor_ids.searchsorted(tracks.actor_id[rows])
+    ego_from_world = dataset.world_from(token, "ego").inverse()
+    past = np.full((len(actor_ids), frame_count, 2), np.nan)
+    centers = ego_from_world.apply(tracks.boxes.center[rows])
+    past[actor_index, tracks.index[rows] - first_frame] = centers[:, :2]
+    return past

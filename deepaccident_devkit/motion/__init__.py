@@ -25,7 +25,9 @@ from deepaccident_devkit.motion.batch_names import config_from_names
 from deepaccident_devkit.motion.bev_segmentation import (
     BEV_CLASSES,
     BevSegmentation,
+    TagRule,
     bev_segmentation,
+    cell_tags,
     segmentation_of,
 )
 from deepaccident_devkit.motion.box_polygons import OWN_BOX_ID, FrameBoxes, FramePolygons
@@ -69,8 +71,10 @@ __all__ = [
     "MotionLabelConfig",
     "MotionLabels",
     "PostProcessing",
+    "TagRule",
     "agents_to_ego",
     "bev_segmentation",
+    "cell_tags",
     "config_from_names",
     "labels_from_polygons",
     "motion_labels",

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 
@@ -13,7 +13,14 @@ from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.motion.augmentation import Augmentation
 from deepaccident_devkit.release import BevImage
 from deepaccident_devkit.release.npz import TAGS
-from deepaccident_devkit.support.arrays import BoolArray, IntArray, ShortRepr, readonly
+from deepaccident_devkit.support.arrays import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    IntArray,
+    ShortRepr,
+    readonly,
+)
 from deepaccident_devkit.support.text import choice
 from deepaccident_devkit.taxonomy import BEV_RESOLUTION, BEV_SHAPE
 
@@ -32,6 +39,11 @@ COVERAGE: Final[Mapping[str, float]] = {
 
 With a fraction of 0, which suits classes thinner than a cell, one pixel is enough.
 """
+TagRule = Literal["majority", "corner"]
+"""How a cell gets a single tag: the tag of most of its pixels (of equally many the lowest), or the
+tag of the pixel in its rear left corner."""
+# Distance of a point from a cell's corner, metres, so that it is inside the corner's pixel.
+_INSIDE_CORNER_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,8 +110,7 @@ def segmentation_of(
     Arguments and errors are as in `bev_segmentation`.
     """
     pixels = _find_pixels(grid, augmentation)
-    padded_image = np.append(image.semantic.reshape(-1), np.uint8(0))
-    tags = padded_image[pixels]
+    tags = _tags_at(image, pixels)
     layers = []
     for name, tag_name in zip(BEV_CLASSES, _TAG_NAMES, strict=True):
         min_pixels = max(1, math.ceil(COVERAGE[name] * pixels.shape[-1]))
@@ -109,7 +120,43 @@ def segmentation_of(
     return BevSegmentation(grid=grid, masks=np.stack(layers), known=known)
 
 
-@functools.lru_cache(maxsize=4)
+def cell_tags(
+    image: BevImage, grid: BevGrid, rule: TagRule = "majority"
+) -> tuple[ByteArray, BoolArray]:
+    """Return one of CARLA's semantic tags for each cell, and which cells are known, (H, W) each.
+
+    Args:
+        image: Image of a BEV camera.
+        grid: Cells, right-handed metres.
+        rule: How a cell gets its tag; pixels outside the image have the tag 0.
+
+    Raises:
+        ChoiceError: If the rule does not exist.
+    """
+    if choice("rule", rule, get_args(TagRule)) == "majority":
+        pixels = _find_pixels(grid, None)
+        tags = _tags_at(image, pixels).reshape(-1, pixels.shape[-1])
+        num_tags = int(tags.max()) + 1
+        first_bin = num_tags * np.arange(len(tags))[:, None]
+        counts = np.bincount((first_bin + tags).reshape(-1), minlength=num_tags * len(tags))
+        most_frequent = counts.reshape(-1, num_tags).argmax(axis=1).astype(np.uint8)
+        cell_tag = most_frequent.reshape(grid.shape)
+    else:
+        _, _, x_size = grid.x
+        _, _, y_size = grid.y
+        to_corner = np.array([_INSIDE_CORNER_M - x_size / 2, y_size / 2 - _INSIDE_CORNER_M])
+        pixels = _pixels_at(grid.centers() + to_corner)[..., None]
+        cell_tag = _tags_at(image, pixels[..., 0])
+    return cell_tag, np.all(pixels < image.semantic.size, axis=-1)
+
+
+def _tags_at(image: BevImage, pixels: IntArray) -> ByteArray:
+    """Return the tags at flat indices of pixels; 0 outside the image."""
+    padded_image: ByteArray = np.append(image.semantic.reshape(-1), np.uint8(0))
+    return padded_image[pixels]
+
+
+@functools.lru_cache(maxsize=8)
 def _find_pixels(grid: BevGrid, augmentation: Augmentation | None) -> IntArray:
     """Return the flat indices of the pixels at P points spread evenly over each cell.
 
@@ -125,10 +172,15 @@ def _find_pixels(grid: BevGrid, augmentation: Augmentation | None) -> IntArray:
     if augmentation is not None:
         ego_from_augmented = np.linalg.inv(augmentation.matrix)
         points = points @ ego_from_augmented[:2, :2].T
+    return readonly(_pixels_at(points))
+
+
+def _pixels_at(points: FloatArray) -> IntArray:
+    """Return the flat indices of the pixels at points (…, 2); the number of pixels outside."""
     num_rows, num_columns = BEV_SHAPE
     # A pixel's centre is an integer and a half pixels away from the middle of the image.
     row = np.rint(num_rows / 2 - 0.5 - points[..., 0] / BEV_RESOLUTION)
     column = np.rint(num_columns / 2 - 0.5 - points[..., 1] / BEV_RESOLUTION)
     inside = (row >= 0) & (row < num_rows) & (column >= 0) & (column < num_columns)
     pixels = np.where(inside, row * num_columns + column, num_rows * num_columns)
-    return readonly(pixels.astype(np.int64))
+    return pixels.astype(np.int64)

@@ -435,9 +435,9 @@ def draw_pair_from_above(
 ) -> None:
     """Render a frame (numbered from 1) around the point of contact, in the world frame.
 
-    The view is as close-up as it can be with both actors in it. The layers are `bev` (the road),
-    `boxes`, `velocities`, `ids`, `trajectories` (up to the contact) and `grid`. The title gives the
-    pair's speeds.
+    The view is as close-up as it can be with both actors and the named agents in it. The layers are
+    `bev` (the road), `boxes`, `velocities`, `ids`, `trajectories` (up to the contact) and `grid`.
+    The title gives the pair's speeds.
 
     Args:
         pair: The pair.
@@ -454,7 +454,10 @@ def draw_pair_from_above(
     sample: Any = dataset.get("sample", sample_token(pair.scenario, first_agent, index))
     boxes = pair.tracks.at(index)
     pair_boxes = pair.at(index)
-    distances = np.abs(pair_boxes.bottom_corners()[..., :2] - point) / (ratio, 1)
+    recorders = recorders_of(dataset, pair.scenario)
+    named_actors = [actor for actor, agent in recorders.items() if agent in named_agents]
+    shown_boxes = boxes.select(np.isin(boxes.actor_id, [*pair.contact.actor_ids, *named_actors]))
+    distances = np.abs(shown_boxes.bottom_corners()[..., :2] - point) / (ratio, 1)
     view_range = float(np.clip(_PAIR_MARGIN_M + distances.max(initial=0.0), *view_ranges))
     low, high = point + np.outer((-view_range, view_range), (ratio, 1))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")

@@ -44,6 +44,7 @@ from deepaccident_devkit.render.styles import (
     TRUE_PLACE_COLOR,
     current_style,
     in_own_settings,
+    text_size,
 )
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.values import ReadOnlyValues
@@ -167,7 +168,7 @@ def render_link(
     box_ax.set(xlim=(-half_width, half_width), ylim=(-view_range, view_range), aspect="equal")
     label_axes(box_ax, "ego")
     box_ax.locator_params(nbins=6)  # each tick costs time
-    box_ax.set_title(_error_words(shared))
+    box_ax.set_title("Box positions")
     _draw_shared(shared, shown_layers, box_ax)
     insets = _magnify_largest_errors(shared, box_ax) if "boxes" in shown_layers else []
     words = f"received by {short_name(record['agent'])}"
@@ -183,7 +184,8 @@ def render_link(
         target_from_world = dataset.world_from(record, "ego").inverse()
         axes = [box_ax, *insets, *cloud_axes]
         draw_road(dataset, record["frame_token"], axes, target_from_world=target_from_world)
-    draw_legend(fig, _legend_handles(shared), columns=4)
+    title = "Mean position error by partner"
+    draw_legend(fig, _legend_handles(shared), columns=4, title=title, title_fontsize=text_size())
     set_scene_title(fig, dataset, record["token"], below=link_words(link))
     return lay_out_figure(fig)
 
@@ -383,13 +385,3 @@ def _shift_words(shared: SharedBoxes) -> str:
     distances = np.linalg.norm(ends - starts, axis=1)
     mean_distance = distances.mean()
     return f"{name}: {mean_distance:.2f} m"
-
-
-def _error_words(shared: Sequence[SharedBoxes]) -> str:
-    """State the largest distance between any partner's true and received boxes in words."""
-    max_distance = 0.0
-    for boxes in shared:
-        starts, ends = boxes.shifts
-        distances = np.linalg.norm(starts - ends, axis=1)
-        max_distance = distances.max(initial=max_distance)
-    return f"Box positions (largest error {max_distance:.2f} m, means below)"

@@ -470,7 +470,8 @@ def instance_handles(maps: MotionMaps) -> list[Artist]:
     from matplotlib.colors import to_hex
     from matplotlib.patches import Patch
 
-    drawn_colors = {to_hex(color) for color in maps.colors}
+    drawn_ids = np.unique(maps.instance)
+    drawn_colors = {to_hex(color) for color in maps.colors[drawn_ids]}
     handles: list[Artist] = []
     for name, color in hue_meanings().items():
         if color in drawn_colors:

@@ -136,7 +136,9 @@ def render_teaser(
         view_ranges=_VIEW_RANGES_M,
         named_agents=names,
     )
-    axes[-2].set_title("paths to the impact", fontsize="medium")
+    moment = moment_words(dataset, f"{pair.scenario}/{min(frames):03d}")
+    set_title(axes[-2], f"paths, {moment}", fontsize="medium")
+    axes[-2].set_anchor("N")  # level with the panels beside it
     _draw_sight(pair, names, axes[-1])
     words = roles_and_sides(dataset, contact, with_ids=not current_style().shows_few_panels)
     warning_words = cut_words(contact, record["num_frames"])
@@ -164,11 +166,10 @@ def _images(pair: CollidingPair, names: Sequence[str], frames: Sequence[int]) ->
 
 def _draw_image(pair: CollidingPair, camera: str, layers: frozenset[Layer], ax: Axes) -> None:
     """Draw an image (a token) with an edge in the hue of its agent."""
-    sample, channel = camera.rsplit("/", 1)
-    _, agent, frame = sample.rsplit("/", 2)
+    scenario, agent, frame, channel = camera.rsplit("/", 3)
     words = draw_pair_in_camera(pair, agent, int(frame), layers, ax, channels=[channel])
-    write_camera_name(words, ax)
-    set_title(ax, moment_words(pair.dataset, sample), fontsize="medium")
+    write_camera_name(f"{short_name(agent)}, {words}", ax)
+    set_title(ax, moment_words(pair.dataset, f"{scenario}/{frame}"), fontsize="medium")
     for spine in ax.spines.values():
         spine.set(visible=True, edgecolor=AGENT_COLORS[agent], linewidth=_EDGE_WIDTH_PT)
 
@@ -194,5 +195,5 @@ def _draw_sight(pair: CollidingPair, names: Sequence[str], ax: Axes) -> None:
     ax.set_yticks(range(len(names)), labels, fontsize=text_size())
     ax.set_ylim(max(len(names), 1) - 0.5, -0.5)
     ax.set_xlabel("time relative to the impact (s)", fontsize=text_size())
-    ax.set_title("sees the pair (pale: one of two)", fontsize="medium")
+    ax.set_title("sees the pair (pale: only one)", fontsize="medium")
     with_light_grid(ax, "x")

@@ -73,6 +73,8 @@ _DPI = 100.0
 # Shares of a comparison's height: the verdicts above the views, and the strip below them.
 _VERDICT_SHARE = 0.05
 _STRIP_SHARE = 0.25
+# The words of the two pictures are as large as if one of them filled the video.
+_HALF_WORD_SCALE = 2**0.5
 # Margin between views, in pixels.
 _MARGIN_PX = 5
 # Size in pixels of a picture at `_DPI` pixels per inch. Larger pictures have a higher resolution,
@@ -289,6 +291,7 @@ class VideoScene:
         height: Height of the picture, pixels.
         view_agent: Agent that views of one agent show; None for the first of `agents`.
         style: Style of the pictures, by default the current one.
+        word_scale: Size of the words, relative to those in a picture of this size.
     """
 
     dataset: Dataset
@@ -298,6 +301,7 @@ class VideoScene:
     height: int
     view_agent: str | None = None
     style: Any = field(default_factory=current_style)
+    word_scale: float = 1.0
 
     def picture(self, frame: str) -> ByteArray:
         """Render the moment of a frame's token; (height, width, 3) uint8, RGB."""
@@ -338,9 +342,9 @@ class VideoScene:
 
     @property
     def dpi(self) -> float:
-        """Pixels per inch of the words in a picture of this size."""
+        """Pixels per inch of the words."""
         scale = (self.width * self.height / _REFERENCE_PIXELS) ** 0.5
-        return float(_DPI * scale)
+        return float(_DPI * scale * self.word_scale)
 
     def figure(
         self,
@@ -384,7 +388,9 @@ class _BesideScene:
             self.beside.sides, (width // 2, width - width // 2), strict=True
         ):
             verdict = side.verdict(number)
-            scene = replace(self.scene, width=side_width, height=view_height)
+            scene = replace(
+                self.scene, width=side_width, height=view_height, word_scale=_HALF_WORD_SCALE
+            )
             described = side.described(scene.dataset, number)
             if described is not None:
                 verdict = f"{side.name}: {described.words.partition(': ')[2]}"

@@ -28,7 +28,7 @@ NameKind = Literal[
 # Tables that are searched for identifiers of an unknown kind.
 _COMMON_KINDS: Sequence[NameKind] = ("qualifiers", "values", "agents", "attributes")
 # Words of `Row.unit` that a table writes in another way; "" for numbers without a unit.
-_UNIT_NAMES = {"share": "", "1 - overlap": "1 − overlap", "1/min": "per minute"}
+_UNIT_NAMES = {"share": "", "count": "", "1 - overlap": "1 − overlap", "1/min": "per minute"}
 
 
 @cache

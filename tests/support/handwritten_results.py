@@ -76,6 +76,17 @@ def detection_document() -> dict[str, Any]:
     )
 
 
+def tracking_document() -> dict[str, Any]:
+    """Make results with two tracks, the second of which goes on, and no box in the last sample."""
+    first, second, _ = TOKENS
+    names = {"detection_name": "tracking_name", "detection_score": "tracking_score"}
+    tracks = []
+    for token, ids in ((first, ("1", "b/2")), (second, ("b/2",))):
+        entry = {names.get(name, name): value for name, value in box_entry(token).items()}
+        tracks.append([entry | {"tracking_id": track} for track in ids])
+    return results_by_token("tracking", *tracks, [])
+
+
 def plan_entry(**changes: Any) -> dict[str, Any]:
     return {
         "times": [0.5, 1.0],

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,7 +11,6 @@ from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ChoiceError, EvaluationError, GeometryError
 from deepaccident_devkit.evaluation.detection.boxes import (
     DETECTION_PROTOCOLS,
-    DetectedBoxes,
     DetectionProtocol,
     columns_of,
     detection_protocol,
@@ -33,8 +32,9 @@ from deepaccident_devkit.evaluation.detection.result import (
     detection_result,
     drawn_results,
 )
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnBoxes, drawn_pair
+from deepaccident_devkit.evaluation.drawing import Drawing, drawn_pair
 from deepaccident_devkit.evaluation.evaluator import Counts, Evaluator
+from deepaccident_devkit.evaluation.predicted_boxes import DetectedBoxes, drawn_matches
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.geometry.boxes import checked_boxes
 from deepaccident_devkit.support.arrays import FrozenArrays, IntArray
@@ -154,28 +154,20 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         world_from_prediction = dataset.world_from(token, prediction.boxes.frame)
         prediction = prediction.transform(truth_from_world @ world_from_prediction, frame)
         matches = detection_matches(prediction, true_boxes, self.protocol)
-        right = DrawnBoxes(
-            boxes=prediction.boxes.select(matches.detection),
-            scores=prediction.scores[matches.detection],
-            role="right",
-            label="detected",
+        drawing = drawn_matches(
+            prediction,
+            true_boxes,
+            {"truth": matches.truth, "missed": matches.missed},
+            {"right": matches.detection, "false": matches.false},
         )
-        false = DrawnBoxes(
-            boxes=prediction.boxes.select(matches.false),
-            scores=prediction.scores[matches.false],
-            role="false",
-            label="false",
-        )
-        found = DrawnBoxes(boxes=true_boxes.select(matches.truth), role="truth", label="found")
-        missed = DrawnBoxes(boxes=true_boxes.select(matches.missed), role="missed", label="missed")
-        pair = drawn_pair(dataset, token, frame)
         counts = self._count(token, prediction, true_boxes)
         precision = self.result_of([counts]).mean_average_precision
         limit = f"overlap {matches.threshold:g}"
         if self.protocol.measure.startswith("distance"):
             limit = f"{matches.threshold:g} m"
-        return Drawing(
-            boxes=(found, right, false, missed, *pair),
+        return replace(
+            drawing,
+            boxes=(*drawing.boxes, *drawn_pair(dataset, token, frame)),
             words=f"mAP of this sample {precision:.1f} %; boxes are matched at {limit}",
         )
 

@@ -1,4 +1,4 @@
-"""Detected boxes, a sample's true boxes under a protocol, and the columns that metrics read."""
+"""A sample's true boxes under a detection protocol, and the columns that metrics read."""
 
 from __future__ import annotations
 
@@ -9,25 +9,19 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from deepaccident_devkit.dataset import Dataset, RowArgument, Visible
-from deepaccident_devkit.errors import ConfigError, GeometryError, NotAvailableError
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnBoxes
+from deepaccident_devkit.errors import ConfigError, NotAvailableError
+from deepaccident_devkit.evaluation.predicted_boxes import check_classes
 from deepaccident_devkit.evaluation.task import as_tuples, protocol_of, switched
-from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.geometry.boxes import checked_boxes
+from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.support.arrays import (
     AnyArray,
     BoolArray,
     FloatArray,
-    FrozenArrays,
     IntArray,
-    as_numbers,
-    checked,
 )
 from deepaccident_devkit.support.text import settle_choices
-from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, SMALL_CATEGORIES, UNTRACKED_ID
 from deepaccident_devkit.v2x import Agents, cooperative_boxes
 
@@ -44,20 +38,6 @@ _CHOICES = {
 }
 # Largest total number of points of all curves.
 _MAX_POINTS = 10_000_000
-
-
-def _check_classes(classes: tuple[tuple[str, tuple[str, ...]], ...]) -> None:
-    """Raise ConfigError if a category is unknown or belongs to two classes."""
-    used_categories: list[str] = []
-    for _, categories in classes:
-        used_categories.extend(categories)
-    distinct_categories = set(used_categories)
-    is_repeated = len(distinct_categories) < len(used_categories)
-    if not used_categories or is_repeated or not distinct_categories <= set(CATEGORIES):
-        raise ConfigError(
-            f"classes: expected names of classes with categories from {', '.join(CATEGORIES)}, "
-            f"each category at most once, found {classes}"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,7 +151,7 @@ class DetectionProtocol:
         for name in ("classes", "area", "ranges", "thresholds", "small_thresholds"):
             object.__setattr__(self, name, as_tuples(getattr(self, name)))
         settle_choices(self, _CHOICES)
-        _check_classes(self.classes)
+        check_classes(self.classes)
         if self.frame not in ("lidar", "ego"):
             raise ConfigError(
                 f"frame: expected 'lidar' or 'ego', found {self.frame!r}, as ranges are "
@@ -293,83 +273,6 @@ def detection_protocol(protocol: str | DetectionProtocol, **switches: Any) -> De
     """
     base_protocol = protocol_of(protocol, DETECTION_PROTOCOLS)
     return switched(base_protocol, switches)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DetectedBoxes(FrozenArrays):
-    """Detections of one sample; arrays are read-only.
-
-    Attributes:
-        boxes: N right-handed boxes in the frame `boxes.frame`; velocities are NaN if the detector
-            does not predict them.
-        scores: (N,) float64 confidences; higher means more certain.
-    """
-
-    boxes: Boxes
-    scores: FloatArray
-
-    def __post_init__(self) -> None:
-        """Check and freeze the arrays.
-
-        Raises:
-            GeometryError: If `boxes` is not a `Boxes`, or a score is invalid.
-        """
-        checked_boxes("detected boxes", self.boxes)
-        scores = checked("scores", self.scores, (len(self.boxes),)).copy()
-        if not np.isfinite(scores).all():
-            raise GeometryError("scores: not all numbers are finite; remove boxes without a score")
-        object.__setattr__(self, "scores", scores)
-        FrozenArrays.__post_init__(self)
-
-    @classmethod
-    def from_arrays(
-        cls,
-        center: ArrayLike,
-        size: ArrayLike,
-        yaw: ArrayLike,
-        scores: ArrayLike,
-        *,
-        frame: str,
-        category: ArrayLike | None = None,
-        velocity: ArrayLike | None = None,
-    ) -> DetectedBoxes:
-        """Create detections from boxes that are upright in `frame` (right-handed, y to the left).
-
-        Args:
-            center: (N, 3) centres, metres.
-            size: (N, 3) full length, width, height, metres.
-            yaw: (N,) headings, radians, counter-clockwise.
-            scores: (N,) confidences; higher means more certain.
-            frame: Frame of all values: `lidar` for evaluators, `world` for results files.
-            category: (N,) indices or names of categories; None if all are cars.
-            velocity: (N, 2) or (N, 3) velocities over the ground, m/s; None if unknown.
-
-        Raises:
-            GeometryError: If a shape or a value is invalid.
-        """
-        columns: NamedValues = {}
-        if velocity is not None:
-            vectors = as_numbers("velocity", velocity)
-            if vectors.ndim == 2 and vectors.shape[1] == 2:
-                vectors = np.column_stack([vectors, np.zeros(len(vectors))])
-            columns["velocity"] = vectors
-        boxes = Boxes.from_arrays(center, size, yaw, frame=frame, category=category, **columns)
-        return cls(boxes=boxes, scores=scores)  # type: ignore[arg-type]  # checked in __post_init__
-
-    def transform(self, target_from_source: SE3, frame: str) -> DetectedBoxes:
-        """Transform the detections to another frame, such as `world` for results files."""
-        return replace(self, boxes=self.boxes.transform(target_from_source, frame))
-
-    def drawing(self) -> Drawing:
-        """Describe the detections for a picture."""
-        detected = DrawnBoxes(
-            boxes=self.boxes, scores=self.scores, role="predicted", label="detected"
-        )
-        return Drawing(boxes=(detected,))
-
-    def __len__(self) -> int:
-        """Return the number of boxes."""
-        return len(self.boxes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ConfigError, EvaluationError, shortened
-from deepaccident_devkit.evaluation.drawing import Drawing, DrawnPath, Role, joined_drawing
+from deepaccident_devkit.evaluation.drawing import Drawing, drawn_paths, joined_drawing
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.evaluation.forecasting.metrics import (
     MISS_DISTANCE,
@@ -32,7 +32,6 @@ from deepaccident_devkit.evaluation.forecasting.truth import (
     VIEWERS,
     ForecastingTruth,
     forecasting_truth,
-    recorded_past,
 )
 from deepaccident_devkit.evaluation.means import (
     MEAN_OF_SCENARIOS,
@@ -43,6 +42,7 @@ from deepaccident_devkit.evaluation.means import (
 )
 from deepaccident_devkit.evaluation.predictions import LONG_PATHS, LONGEST_PATH
 from deepaccident_devkit.evaluation.task import Row
+from deepaccident_devkit.evaluation.truth import recorded_past
 from deepaccident_devkit.support.arrays import FloatArray, check_minima
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
@@ -182,21 +182,9 @@ class ForecastingEvaluator(MeansEvaluator[ForecastingResult]):
         future_times = np.arange(recorded.path.shape[1] + 1) * FRAME_PERIOD
         past_times = np.arange(1 - past.shape[1], 1) * FRAME_PERIOD
         future = np.concatenate([recorded.present[:, None], recorded.path], axis=1)
-        past_paths = _drawn_paths(past, past_times, "past", "last second")
-        future_paths = _drawn_paths(future, future_times, "truth", "recorded path")
+        past_paths = drawn_paths(past, past_times, "past", "last second")
+        future_paths = drawn_paths(future, future_times, "truth", "recorded path")
         return Drawing(paths=(*past_paths, *predicted, *future_paths))
-
-
-def _drawn_paths(paths: FloatArray, times: FloatArray, role: Role, label: str) -> list[DrawnPath]:
-    """Describe paths (A, T, 2) at times (T,) for a picture, without their missing positions."""
-    drawn_paths = []
-    for path in paths:
-        is_known = np.isfinite(path[:, 0])
-        known_path = path[is_known]
-        if len(known_path) > 1:
-            drawn_path = DrawnPath(xy=known_path, times=times[is_known], role=role, label=label)
-            drawn_paths.append(drawn_path)
-    return drawn_paths
 
 
 def _sample_counts(

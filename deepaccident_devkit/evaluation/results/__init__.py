@@ -13,6 +13,8 @@ from deepaccident_devkit.evaluation.results.records import (
     RESULTS_NAMES,
     ResultsTask,
 )
+from deepaccident_devkit.evaluation.results.segmentation import SegmentationForm
+from deepaccident_devkit.evaluation.results.shards import Form
 from deepaccident_devkit.evaluation.results.writer import ResultsWriter
 
 __all__ = [
@@ -20,10 +22,12 @@ __all__ = [
     "FORMAT_VERSION",
     "RESULTS_NAMES",
     "RESULT_SCHEMAS",
+    "Form",
     "MotionForm",
     "Prediction",
     "Results",
     "ResultsTask",
     "ResultsWriter",
+    "SegmentationForm",
     "read_results",
 ]

@@ -1,7 +1,6 @@
 """`Results`: a model's predictions for many samples, read strictly from a results file.
 
-Accidents and detected boxes are read into columns of all entries; motion stays in its shards until
-it is needed.
+Entries are read into columns of all entries; maps stay in their shards until they are needed.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from deepaccident_devkit.errors import GeometryError, ResultsError, TokenError, shortened
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
 from deepaccident_devkit.evaluation.planning.scene import Plan
+from deepaccident_devkit.evaluation.predicted_boxes import DetectedBoxes, Tracks
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.motion import MotionContents, MotionForm
 from deepaccident_devkit.evaluation.results.records import (
+    FOLDER_TASKS,
     LENGTH_FIRST,
     RESULTS_FILE,
     AccidentEntry,
@@ -36,12 +35,16 @@ from deepaccident_devkit.evaluation.results.records import (
     MotionFile,
     PlanEntry,
     ResultsTask,
+    SegmentationFile,
+    TrackEntry,
     check_token,
     entry_place,
     fault_of,
     locate_errors,
     read_document,
 )
+from deepaccident_devkit.evaluation.results.shards import Form, ShardContents
+from deepaccident_devkit.evaluation.segmentation import SegmentationOutput
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
 from deepaccident_devkit.support.reading import NO_NAME, fault_text, irregular_text, read_bytes
@@ -54,10 +57,12 @@ if TYPE_CHECKING:
 
     from deepaccident_devkit.support.parallel import Engine
 
-Prediction = MotionOutput | list[Accident] | DetectedBoxes | list[Plan] | list[Forecast]
+Prediction = (
+    MotionOutput | list[Accident] | DetectedBoxes | list[Plan] | list[Forecast] | SegmentationOutput
+)
 Columns = dict[str, AnyArray]
-# Token → records of the boxes that were detected in the sample.
-_BoxRecords = Mapping[str, Sequence[BoxEntry]]
+# Token → records of the sample's boxes.
+_BoxRecords = Mapping[str, Sequence[BoxEntry | TrackEntry]]
 # The length of a quaternion may differ from 1 by this much, since `Boxes` normalises quaternions.
 _UNIT_TOLERANCE = 1e-3
 _UNKNOWN_VELOCITY = (math.nan, math.nan)
@@ -74,10 +79,10 @@ class Results:
     in threads and in forked workers.
 
     Attributes:
-        path: Path of the file, or of the folder of motion results.
+        path: Path of the file, or of the folder of results in shards.
         task: Kind of the predictions.
-        fingerprint: Hash of the file's bytes. For motion results it covers the shards, too, since
-            the file holds their checksums.
+        fingerprint: Hash of the file's bytes. It covers shards, too, since the file holds their
+            checksums.
     """
 
     def __init__(self, path: Path, task: ResultsTask, fingerprint: str) -> None:
@@ -85,7 +90,7 @@ class Results:
         self.path = path
         self.task = task
         self.fingerprint = fingerprint
-        self._file = path / RESULTS_FILE if task == "motion" else path
+        self._file = path / RESULTS_FILE if task in FOLDER_TASKS else path
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what pickle stores: everything but the contents."""
@@ -115,16 +120,17 @@ class Results:
         return copy.deepcopy(dict(self._contents.meta))
 
     @property
-    def form(self) -> MotionForm | None:
-        """How motion is stored; None for other tasks."""
+    def form(self) -> Form | None:
+        """How maps are stored; None for tasks without maps."""
         return self._contents.form
 
     def prediction(self, token: str) -> Prediction:
         """Return the prediction for a sample.
 
         Returns:
-            For motion, a MotionOutput. For detection, boxes in the world frame. For accidents,
-            plans and forecasts, a list; it is empty if nothing is predicted.
+            For motion, a MotionOutput; for segmentation, a SegmentationOutput. For detection and
+            tracking, boxes in the world frame. For accidents, plans and forecasts, a list; it is
+            empty if nothing is predicted.
 
         Raises:
             TokenError: If the results do not contain the sample.
@@ -151,7 +157,7 @@ class Results:
         """
         _read_content(self._file, self.fingerprint)
         contents = self._contents
-        if isinstance(contents, MotionContents):  # other contents were checked when they were read
+        if isinstance(contents, ShardContents):  # other contents were checked when they were read
             contents.check(**{"workers": 1, **engine})
 
     @property
@@ -164,11 +170,11 @@ class Results:
 def read_results(path: PathType) -> Results:
     """Open results in the format that schema/results/README.md describes.
 
-    All entries are checked; for motion results, only the manifest is checked.
+    All entries are checked; for results in shards, only the manifest is checked.
 
     Args:
-        path: Path of a JSON file, or of a folder that contains a results.json, as motion results
-            do.
+        path: Path of a JSON file, or of a folder that contains a results.json, as results in
+            shards do.
 
     Raises:
         ResultsError: If there are no results at the path, their version is not supported, or they
@@ -176,12 +182,12 @@ def read_results(path: PathType) -> Results:
     """
     file = _find_file(path_of(path, error=ResultsError).absolute())
     contents, fingerprint = contents_of(file)
-    if contents.task != "motion":
+    if contents.task not in FOLDER_TASKS:
         return Results(file, contents.task, fingerprint)
     if file.name != RESULTS_FILE:
         raise ResultsError(
-            f"{file}: is the manifest of motion results; rename it to {RESULTS_FILE}, the name "
-            "that all readers expect"
+            f"{file}: is the manifest of {contents.task} results; rename it to {RESULTS_FILE}, "
+            "the name that all readers expect"
         )
     return Results(file.parent, contents.task, fingerprint)
 
@@ -210,25 +216,25 @@ def _find_file(path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EntryContents:
-    """Contents of a results file, except for motion; all entries are in memory and checked.
+    """Contents of a results file without shards; all entries are in memory and checked.
 
     Attributes:
         task: Kind of the predictions.
         meta: The author's notes.
         tokens: Tokens of the samples.
         prediction: Function that returns the prediction for a token.
-        form: None, since only motion results have a form.
+        form: None, since only results in shards have a form.
     """
 
     task: ResultsTask
     meta: ReadOnlyValues
     tokens: Collection[str]
     prediction: Callable[[str], Prediction]
-    form: MotionForm | None = None
+    form: Form | None = None
 
 
 # Contents of a file. Callers must only ask for tokens that it contains.
-Contents = EntryContents | MotionContents
+Contents = EntryContents | ShardContents
 # Path and fingerprint of a file → its contents, for the files that this process parsed most
 # recently.
 cached_contents: Final[dict[tuple[Path, str], Contents]] = {}
@@ -280,8 +286,8 @@ def _parse(content: bytes, path: Path) -> Contents:
     """Parse the bytes of a results file; raise ResultsError if they violate the format."""
     try:
         document, meta = read_document(content, path)
-        if isinstance(document, MotionFile):
-            return MotionContents(path, meta, document)
+        if isinstance(document, MotionFile | SegmentationFile):
+            return ShardContents(path, meta, document)
         make_columns, make_prediction = ENTRIES[document.task]
         entries = Entries.read(document.results, make_columns)
     except (ContentError, OSError) as error:
@@ -386,8 +392,27 @@ def accidents_at(entries: Entries, token: str) -> list[Accident]:
     return accidents
 
 
-def detection_columns(results: _BoxRecords) -> Columns:
-    """Convert N boxes in the world frame to columns.
+def track_columns(results: Mapping[str, Sequence[TrackEntry]]) -> Columns:
+    """Convert N boxes of tracks to the columns of detections, and texts `ids` (N,).
+
+    Raise ContentError also if a track has two boxes in a sample.
+    """
+    ids: list[str] = []
+    for token, tracks in results.items():
+        sample_ids = [track.tracking_id for track in tracks]
+        for number, name in enumerate(sample_ids):
+            if name in sample_ids[:number]:
+                raise ContentError(
+                    f"{entry_place(token, number)}.tracking_id: {name!r} appears twice in this "
+                    "sample; give each box of a sample its own id"
+                )
+        ids += sample_ids
+    columns = detection_columns(results, "tracking")
+    return {**columns, "ids": np.array(ids, dtype=object)}
+
+
+def detection_columns(results: _BoxRecords, kind: str = "detection") -> Columns:
+    """Convert N boxes in the world frame, of detections or of tracks, to columns.
 
     The columns are center (N, 3) in metres, rotation (N, 4) as unit quaternions w, x, y, z, size
     (N, 3) as length, width and height in metres, velocity (N, 3) in m/s (NaN if unknown), category
@@ -401,8 +426,8 @@ def detection_columns(results: _BoxRecords) -> Columns:
     velocity = _make_floats([box.velocity or _UNKNOWN_VELOCITY for box in boxes], 2)
     velocity_z = np.where(np.isnan(velocity[:, :1]), np.nan, 0.0)
     code_by_name = {name: code for code, name in enumerate(CATEGORIES)}
-    codes = [code_by_name[box.detection_name] for box in boxes]
-    scores = [box.detection_score for box in boxes]
+    codes = [code_by_name[getattr(box, f"{kind}_name")] for box in boxes]
+    scores = [getattr(box, f"{kind}_score") for box in boxes]
     sizes = _make_floats([box.size for box in boxes], 3)
     return {
         "center": _make_floats([box.translation for box in boxes], 3),
@@ -445,8 +470,21 @@ def _check_unit_length(rotation: FloatArray, results: _BoxRecords) -> None:
 
 def boxes_at(entries: Entries, token: str) -> DetectedBoxes:
     """Return the boxes of a sample in the world frame; raise KeyError if the sample is unknown."""
-    columns: NamedValues = entries.sample_columns(token)
-    scores = columns.pop("score")
+    boxes, scores = _world_boxes(entries.sample_columns(token))
+    return DetectedBoxes(boxes=boxes, scores=scores)
+
+
+def tracks_at(entries: Entries, token: str) -> Tracks:
+    """Return the tracks of a sample in the world frame; raise KeyError if the sample is unknown."""
+    columns = entries.sample_columns(token)
+    ids = columns.pop("ids")
+    boxes, scores = _world_boxes(columns)
+    return Tracks(boxes=boxes, scores=scores, ids=ids)
+
+
+def _world_boxes(columns: NamedValues) -> tuple[Boxes, FloatArray]:
+    """Return the boxes and scores of the columns of a sample."""
+    scores: FloatArray = columns.pop("score")
     count = len(scores)
     boxes = Boxes(
         frame="world",
@@ -456,7 +494,7 @@ def boxes_at(entries: Entries, token: str) -> DetectedBoxes:
         camera_visible=np.zeros(count, dtype=bool),
         row=np.arange(count),
     )
-    return DetectedBoxes(boxes=boxes, scores=scores)
+    return boxes, scores
 
 
 def _make_floats(rows: Sequence[Iterable[float]], *shape: int) -> FloatArray:
@@ -539,6 +577,7 @@ def objects_at(entries: Entries, token: str) -> list[Any]:
 ENTRIES: Final[Mapping[str, tuple[Callable[..., Columns], Callable[[Entries, str], Any]]]] = {
     "accident": (accident_columns, accidents_at),
     "detection": (detection_columns, boxes_at),
+    "tracking": (track_columns, tracks_at),
     "planning": (plan_columns, objects_at),
     "forecasting": (forecast_columns, objects_at),
 }

@@ -23,19 +23,35 @@ from deepaccident_devkit.support.reading import fault_text
 from deepaccident_devkit.support.values import NamedValues
 from deepaccident_devkit.taxonomy import CATEGORIES
 
-ResultsTask = Literal["motion", "accident", "detection", "planning", "forecasting"]
+ResultsTask = Literal[
+    "motion",
+    "accident",
+    "detection",
+    "tracking",
+    "planning",
+    "forecasting",
+    "segmentation",
+]
+# Tasks whose results are arrays in a folder.
+FOLDER_TASKS: Final[tuple[ResultsTask, ...]] = ("motion", "segmentation")
 Stored = Literal["instances", "heads"]
+StoredLayers = Literal["masks", "scores"]
 _Format = Literal["DeepAccident results"]
 # Incremented when the contents of files change.
 Version = Literal[1]
 FORMAT: Final = get_args(_Format)[0]
 FORMAT_VERSION: Final = get_args(Version)[0]
 RESULTS_NAMES: Final[Mapping[ResultsTask, str]] = MappingProxyType(
-    {name: name if name == "motion" else f"{name}.json" for name in get_args(ResultsTask)}
+    {name: name if name in FOLDER_TASKS else f"{name}.json" for name in get_args(ResultsTask)}
 )
-"""Task → name of its file (of its folder for motion) if results of all tasks share a folder."""
-# Name of the JSON file in a folder: the manifest of motion results, or results of another task.
+"""Task → name of its file (or of its folder) if results of all tasks share a folder."""
+# Name of the JSON file in a folder: the manifest of arrays, or results of another task.
 RESULTS_FILE: Final = "results.json"
+# Template of an array's path in the archive, from the sample token and the name of the array.
+MEMBER: Final = "{}/{}.npy"
+# Largest number of cells of a sample, summed over all maps: twenty times the number in ten released
+# predictions of motion. A small archive can hold more, but memory cannot.
+MAX_CELLS: Final = 2**26
 # Regular expression that tokens match: words separated by `/`.
 WORDS: Final = r"^[^/\\]+(/[^/\\]+)*$"
 # Largest value in metres, seconds, or metres per second. Larger numbers are mistakes, and the
@@ -79,8 +95,16 @@ class AccidentEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
     ] = UNSET
 
 
-class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
-    """A detected box, with nuScenes' fields."""
+_Category = Annotated[Literal[CATEGORIES], Meta(description="Category.")]  # type: ignore[valid-type]
+_Score = Annotated[float, Meta(description="How sure the model is; higher means surer.")]
+_Velocity = Annotated[
+    tuple[_Measure, _Measure] | UnsetType | None,
+    Meta(description="Velocity over the ground in the world, x and y, m/s; null if unknown."),
+]
+
+
+class PlacedBox(msgspec.Struct, forbid_unknown_fields=True, gc=False):
+    """Sample, place and size of a box, with nuScenes' fields."""
 
     sample_token: Annotated[Token, Meta(description="Token of the sample that contains the box.")]
     translation: Annotated[
@@ -98,15 +122,33 @@ class BoxEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
             "world."
         ),
     ]
-    detection_name: Annotated[Literal[CATEGORIES], Meta(description="Category.")]  # type: ignore[valid-type]
-    detection_score: Annotated[
-        float, Meta(description="How sure the model is; higher means surer.")
-    ]
-    velocity: Annotated[
-        tuple[_Measure, _Measure] | UnsetType | None,
-        Meta(description="Velocity over the ground in the world, x and y, m/s; null if unknown."),
-    ] = UNSET
+
+
+class BoxEntry(PlacedBox, forbid_unknown_fields=True, gc=False):
+    """A detected box, with nuScenes' fields."""
+
+    detection_name: _Category
+    detection_score: _Score
+    velocity: _Velocity = UNSET
     attribute_name: Ignored = UNSET
+    ego_translation: Ignored = UNSET
+    num_pts: Ignored = UNSET
+
+
+class TrackEntry(PlacedBox, forbid_unknown_fields=True, gc=False):
+    """The box of a track, with nuScenes' fields."""
+
+    tracking_id: Annotated[
+        str,
+        Meta(
+            min_length=1,
+            max_length=100,
+            description="Id of the track, the same in all samples of a scenario and agent.",
+        ),
+    ]
+    tracking_name: _Category
+    tracking_score: _Score
+    velocity: _Velocity = UNSET
     ego_translation: Ignored = UNSET
     num_pts: Ignored = UNSET
 
@@ -166,15 +208,13 @@ class ForecastEntry(msgspec.Struct, forbid_unknown_fields=True, gc=False):
 ENTRY_RECORDS: Final[Mapping[str, type[msgspec.Struct]]] = {
     "accident": AccidentEntry,
     "detection": BoxEntry,
+    "tracking": TrackEntry,
     "planning": PlanEntry,
     "forecasting": ForecastEntry,
 }
 
 
-class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    """How motion is stored."""
-
-    stored: Annotated[Stored, Meta(description="Maps of ids, or a model's own maps.")]
+class _GridRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     x: Annotated[
         Axis,
         Meta(description="Start, end and cell size, metres, x forward in the present ego frame."),
@@ -183,6 +223,12 @@ class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         Axis, Meta(description="Start, end and cell size, metres, y left in the present ego frame.")
     ]
     orientation: Annotated[Orientation, Meta(description="Orientation of the cells in the maps.")]
+
+
+class MotionFormRecord(_GridRecord, kw_only=True):
+    """How motion is stored."""
+
+    stored: Annotated[Stored, Meta(description="Maps of ids, or a model's own maps.")]
     predictions: Annotated[
         Count, Meta(description="K: most predictions of a sample; the last prediction is the mean.")
     ]
@@ -193,6 +239,16 @@ class FormRecord(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     labels: Annotated[
         Literal[(*LABEL_PROTOCOLS,)] | None,  # type: ignore[valid-type]
         Meta(description="The label protocol that the model learned from."),
+    ]
+
+
+class SegmentationFormRecord(_GridRecord, kw_only=True):
+    """How segmented maps are stored."""
+
+    stored: Annotated[StoredLayers, Meta(description="Masks, or scores from 0 to 1.")]
+    classes: Annotated[
+        tuple[str, ...],
+        Meta(min_length=1, description="Names of the classes, in the order of the layers."),
     ]
 
 
@@ -247,6 +303,12 @@ class DetectionFile(_File, tag="detection"):
     results: Annotated[dict[Token, list[BoxEntry]], _BY_TOKEN]
 
 
+class TrackingFile(_File, tag="tracking"):
+    """Boxes of tracks of many samples."""
+
+    results: Annotated[dict[Token, list[TrackEntry]], _BY_TOKEN]
+
+
 class PlanningFile(_File, tag="planning"):
     """Planned paths of many samples."""
 
@@ -262,11 +324,26 @@ class ForecastingFile(_File, tag="forecasting"):
 class MotionFile(_File, tag="motion"):
     """The manifest of motion maps."""
 
-    form: FormRecord
+    form: MotionFormRecord
     shards: Annotated[list[Shard], Meta(min_length=1)]
 
 
-ResultsFile: TypeAlias = MotionFile | AccidentFile | DetectionFile | PlanningFile | ForecastingFile
+class SegmentationFile(_File, tag="segmentation"):
+    """The manifest of segmented maps."""
+
+    form: SegmentationFormRecord
+    shards: Annotated[list[Shard], Meta(min_length=1)]
+
+
+ResultsFile: TypeAlias = (
+    MotionFile
+    | AccidentFile
+    | DetectionFile
+    | TrackingFile
+    | PlanningFile
+    | ForecastingFile
+    | SegmentationFile
+)
 
 
 def _schema(file_type: type[_File]) -> NamedValues:
@@ -285,7 +362,7 @@ RESULT_SCHEMAS: Final = MappingProxyType(
         for file_type in get_args(ResultsFile)
     }
 )
-"""Task → schema of its JSON file (the manifest for motion).
+"""Task → schema of its JSON file (of the manifest for arrays).
 
 `read_results` also checks what a schema cannot express: repeated names, NaN, unit quaternions,
 arrays.
@@ -501,7 +578,7 @@ def _read_meta(content: bytes, document: ResultsFile) -> object:
     the raw parts have colons. If the numbers differ, the strict reader locates the fault, which
     takes four times as long.
     """
-    if not isinstance(document, MotionFile):
+    if not isinstance(document, MotionFile | SegmentationFile):
         record_type = ENTRY_RECORDS[document.task]
         fields = record_type.__struct_fields__
         optional_fields = fields[len(fields) - len(record_type.__struct_defaults__) :]

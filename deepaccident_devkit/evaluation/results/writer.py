@@ -7,27 +7,29 @@ import json
 import math
 import shutil
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, get_args
+from typing import Any, Final, TypeVar, get_args
 
 import msgspec
 import numpy as np
 
 from deepaccident_devkit.errors import EvaluationError, ResultsError, shortened
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.forecasting.metrics import Forecast
 from deepaccident_devkit.evaluation.planning.scene import Plan
+from deepaccident_devkit.evaluation.predicted_boxes import DetectedBoxes, Tracks
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput, checked_prediction
-from deepaccident_devkit.evaluation.results.motion import HEADS, MEMBER, MotionForm
+from deepaccident_devkit.evaluation.results.motion import MotionEncoder
 from deepaccident_devkit.evaluation.results.reader import Results, contents_of, read_results
 from deepaccident_devkit.evaluation.results.records import (
     ENTRY_RECORDS,
+    FOLDER_TASKS,
     FORMAT,
     FORMAT_VERSION,
     LENGTH_FIRST,
+    MEMBER,
     RESULTS_FILE,
     ContentError,
     Kind,
@@ -38,15 +40,16 @@ from deepaccident_devkit.evaluation.results.records import (
     json_meta,
     read_entries,
 )
+from deepaccident_devkit.evaluation.results.segmentation import SegmentationEncoder
+from deepaccident_devkit.evaluation.segmentation import SegmentationOutput
 from deepaccident_devkit.geometry import BevGrid
-from deepaccident_devkit.motion import predict_instances
 from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.support.files import replacing, replacing_folder
 from deepaccident_devkit.support.reading import file_checksum, open_file, read_bytes
 from deepaccident_devkit.support.text import PathType, choice, counted, differing_text, path_of
 from deepaccident_devkit.support.values import NamedValues, ReadOnlyValues
-from deepaccident_devkit.taxonomy import CATEGORIES
 
+_BoxesT = TypeVar("_BoxesT", bound=DetectedBoxes)
 # Text before the entries in a file. The notes before it do not contain line ends.
 _BODY_START = ',\n"results": {'
 # Text after the entries in a file.
@@ -62,9 +65,9 @@ MAX_SHARD_BYTES: Final = 32 * 2**20
 class ResultsWriter:
     """Writer of results that `read_results` can read; use it in a `with` statement.
 
-    The file (for motion, the folder) appears when the block ends without an exception; otherwise
-    nothing appears. Memory does not grow with the number of samples, and the same predictions
-    always lead to the same bytes.
+    The file (for motion and segmentation, the folder) appears when the block ends without an
+    exception; otherwise nothing appears. Memory does not grow with the number of samples, and the
+    same predictions always lead to the same bytes.
 
         with ResultsWriter("results/motion", "motion", meta={"method": "mine"}) as writer:
             for token in tokens:
@@ -81,15 +84,16 @@ class ResultsWriter:
         step: float = 0.5,
         labels: str | None = "released",
         store: Stored = "instances",
+        classes: Sequence[str] | None = None,
     ) -> None:
         """Prepare to write; no file is created yet.
 
         Args:
-            path: Path of a new file; for motion, of a new or empty folder.
+            path: Path of a new file; for motion and segmentation, of a new or empty folder.
             task: Name from `RESULTS_NAMES`.
             meta: Notes for readers, such as method, training and author; JSON-compatible values.
-            grid: For motion, the BEV grid of all predictions; None takes the grid of the first
-                prediction.
+            grid: For motion and segmentation, the BEV grid of all predictions; None takes the grid
+                of the first prediction.
             step: For motion, seconds between two frames.
             labels: For motion, the label protocol (`motion.LABEL_PROTOCOLS`) that the model was
                 trained on and is compared with; None if unknown.
@@ -99,6 +103,8 @@ class ResultsWriter:
                 post-processes heads differently, so its numbers differ slightly if they are
                 computed from instance maps. `heads` stores the model's outputs unchanged, 34 MB for
                 a sample with six predictions.
+            classes: For segmentation, names of the layers of all predictions; None takes those of
+                the first prediction.
 
         Raises:
             ChoiceError: If `task` is not a name from `RESULTS_NAMES`.
@@ -116,15 +122,10 @@ class ResultsWriter:
             "task": self.task,
             "meta": notes,
         }
-        form = MotionForm(
-            stored=store, grid=grid or BevGrid(), predictions=1, frames=1, step=step, labels=labels
-        )
-        self._motion: NamedValues = {
-            "grid": grid,
-            "step": form.step,
-            "labels": form.labels,
-            "store": form.stored,
-        }
+        self._encoder: MotionEncoder | SegmentationEncoder
+        self._encoder = MotionEncoder(grid, step, labels, store)
+        if self.task == "segmentation":
+            self._encoder = SegmentationEncoder(grid, classes)
         self._check_free()
         self._tokens: set[str] = set()
         self._stack = ExitStack()
@@ -139,9 +140,9 @@ class ResultsWriter:
         """Open a temporary file or folder next to the path; raise ResultsError on failure."""
         self._check_free()
         with _naming_results(self.path), ExitStack() as stack:
-            if self.task == "motion":
+            if self.task in FOLDER_TASKS:
                 folder = stack.enter_context(replacing_folder(self.path))
-                self._body = ShardWriter(folder, self._header, **self._motion)
+                self._body = ShardWriter(folder, self._header, self._encoder)
             else:
                 temporary = stack.enter_context(replacing(self.path))
                 self._body = EntryWriter(temporary, self._header)
@@ -176,7 +177,8 @@ class ResultsWriter:
         | Iterable[Accident]
         | DetectedBoxes
         | Iterable[Plan]
-        | Iterable[Forecast],
+        | Iterable[Forecast]
+        | SegmentationOutput,
     ) -> None:
         """Write the prediction for a sample.
 
@@ -185,8 +187,9 @@ class ResultsWriter:
                 whether the release has the sample; this method does not.
             prediction: For motion, a MotionOutput; all outputs must have the same grid and number
                 of frames. For accidents, a list of predicted accidents, [] if there are none. For
-                detection, boxes in the world frame. For planning, one or more Plans. For
-                forecasting, one Forecast per actor.
+                detection and tracking, boxes in the world frame. For planning, one or more Plans.
+                For forecasting, one Forecast per actor. For segmentation, a SegmentationOutput; all
+                outputs must have the same grid and classes, and all masks or all scores.
 
         Raises:
             ResultsError: If the prediction has the wrong type, grid or frame, the sample was added
@@ -230,9 +233,10 @@ class ResultsWriter:
         return self._body
 
     def _check_free(self) -> None:
-        """Raise ResultsError if the path exists; an empty folder is accepted for motion."""
+        """Raise ResultsError if the path exists, unless it is an empty folder for shards."""
         with _naming_results(self.path):
-            is_empty = self.task == "motion" and self.path.is_dir() and not any(self.path.iterdir())
+            may_exist = self.task in FOLDER_TASKS and self.path.is_dir()
+            is_empty = may_exist and not any(self.path.iterdir())
             if not is_empty and (self.path.exists() or self.path.is_symlink()):
                 raise ResultsError(
                     f"{self.path}: already exists{self._existing_notes_text()}; choose another "
@@ -281,7 +285,7 @@ def _write_error(path: Path, error: OSError) -> ResultsError:
 
 
 class EntryWriter:
-    """Writer of a results file, from the header to the last sample; motion has `ShardWriter`."""
+    """Writer of a results file, from the header to the last sample; maps have `ShardWriter`."""
 
     def __init__(self, path: Path, header: ReadOnlyValues) -> None:
         """Open a new file and write the header."""
@@ -358,10 +362,16 @@ def _accident_entries(token: str, prediction: object) -> list[NamedValues]:
 
 def _box_entries(token: str, prediction: object) -> list[NamedValues]:
     """Convert the boxes of a sample to entries; raise ResultsError if they are invalid."""
-    if not isinstance(prediction, DetectedBoxes):
+    return detection_entries(token, _check_boxes(DetectedBoxes, prediction))
+
+
+def _check_boxes(box_type: type[_BoxesT], prediction: object) -> _BoxesT:
+    """Return a prediction; raise ResultsError if it has another type or is not in the world."""
+    name = box_type.__name__
+    if type(prediction) is not box_type:
         raise ResultsError(
-            f"expected DetectedBoxes, found {type(prediction).__name__}; make them with "
-            "DetectedBoxes.from_arrays(center, size, yaw, scores, frame='world')"
+            f"expected {name}, found {type(prediction).__name__}; make them with "
+            f"{name}.from_arrays(center, size, yaw, scores, …, frame='world')"
         )
     frame = prediction.boxes.frame
     if frame != "world":
@@ -369,19 +379,21 @@ def _box_entries(token: str, prediction: object) -> list[NamedValues]:
             f"expected boxes in the world frame, found {frame}; give "
             f"detected.transform(dataset.world_from(token, {frame!r}), 'world')"
         )
-    return detection_entries(token, prediction)
+    return prediction
 
 
-def detection_entries(token: str, detected: DetectedBoxes) -> list[NamedValues]:
+def detection_entries(
+    token: str, predicted: DetectedBoxes, kind: str = "detection"
+) -> list[NamedValues]:
     """Convert a sample's boxes, which are in the world frame, to entries of a results file."""
-    boxes = detected.boxes
+    boxes = predicted.boxes
     rows = zip(
         boxes.center.tolist(),
         boxes.size[:, LENGTH_FIRST].tolist(),
         boxes.rotation.tolist(),
         boxes.velocity[:, :2].tolist(),
-        boxes.category.tolist(),
-        detected.scores.tolist(),
+        boxes.category_names,
+        predicted.scores.tolist(),
         strict=True,
     )
     return [
@@ -391,11 +403,18 @@ def detection_entries(token: str, detected: DetectedBoxes) -> list[NamedValues]:
             "size": size,
             "rotation": rotation,
             "velocity": velocity if all(map(math.isfinite, velocity)) else None,
-            "detection_name": CATEGORIES[category],
-            "detection_score": score,
+            f"{kind}_name": category,
+            f"{kind}_score": score,
         }
         for center, size, rotation, velocity, category, score in rows
     ]
+
+
+def _track_entries(token: str, prediction: object) -> list[NamedValues]:
+    """Convert the tracks of a sample to entries; raise ResultsError if they are invalid."""
+    tracks = _check_boxes(Tracks, prediction)
+    entries = detection_entries(token, tracks, "tracking")
+    return [{**entry, "tracking_id": name} for entry, name in zip(entries, tracks.ids, strict=True)]
 
 
 def _plan_entries(token: str, prediction: object) -> list[NamedValues]:
@@ -445,33 +464,31 @@ def _check_items(item_type: type[Kind], prediction: object) -> list[Kind]:
 _ENTRIES: Mapping[str, Callable[[str, object], list[NamedValues]]] = {
     "accident": _accident_entries,
     "detection": _box_entries,
+    "tracking": _track_entries,
     "planning": _plan_entries,
     "forecasting": _forecast_entries,
 }
 
 
 class ShardWriter:
-    """Writer of a folder of motion results: first the shards, then the manifest."""
+    """Writer of a folder of results in arrays: first the shards, then the manifest."""
 
     def __init__(
         self,
         folder: Path,
         header: ReadOnlyValues,
-        *,
-        grid: BevGrid | None,
-        step: float,
-        labels: str | None,
-        store: Stored,
+        encoder: MotionEncoder | SegmentationEncoder,
     ) -> None:
-        """Create the folder of shards in an empty folder; see `ResultsWriter` for the arguments."""
+        """Create the folder of shards in an empty folder.
+
+        Args:
+            folder: The folder.
+            header: Fields at the beginning of the manifest.
+            encoder: Encoder of the predictions.
+        """
         self._folder = folder
         self._header = header
-        self._grid = grid
-        self._step = step
-        self._labels = labels
-        self._store = store
-        self._frames = 0
-        self._predictions = 0
+        self._encoder: Any = encoder
         self._shards: list[Shard] = []
         self._archive: zipfile.ZipFile | None = None
         self._shard_tokens: list[str] = []
@@ -479,17 +496,7 @@ class ShardWriter:
 
     def add(self, token: str, prediction: object) -> None:
         """Write a sample's prediction; if it is invalid, raise ResultsError and write nothing."""
-        output = self._check_output(prediction)
-        arrays = self._make_arrays(output)
-        predictions, frames = next(iter(arrays.values())).shape[:2]
-        if self._frames not in (0, frames):
-            raise ResultsError(
-                f"expected {self._frames} frames, as in earlier samples, found {frames}"
-            )
-        self._make_form(output.grid, predictions, frames)  # raises if a value is invalid
-        self._grid = output.grid
-        self._frames = frames
-        self._predictions = max(self._predictions, predictions)
+        arrays = self._encoder.encode(prediction)
         if self._archive is None:
             self._archive = zipfile.ZipFile(self._folder / self._shard_file, "w")
         for name, array in arrays.items():
@@ -502,13 +509,11 @@ class ShardWriter:
     def add_part(self, part: Results) -> None:
         """Copy the shards of a folder that another writer of this class wrote.
 
-        The predictions of both must have the same grid and number of frames.
+        The predictions of both must have the same grid and, for motion, number of frames.
         """
         self._end_shard()
         contents: Any = contents_of(part.path / RESULTS_FILE)[0]
-        self._grid = contents.form.grid
-        self._frames = contents.form.frames
-        self._predictions = max(self._predictions, contents.form.predictions)
+        self._encoder.adopt(contents.form)
         for shard in contents.shards:
             target_path = self._folder / self._shard_file
             with open_file(part.path / shard.file) as source, target_path.open("wb") as target:
@@ -518,9 +523,9 @@ class ShardWriter:
     def finish(self) -> None:
         """Write the manifest; raise ResultsError if no sample was added."""
         self._end_shard()
-        if self._grid is None or not self._shards:
+        form = self._encoder.form
+        if form is None or not self._shards:
             raise ResultsError("no prediction was added; add at least one prediction")
-        form = self._make_form(self._grid, self._predictions, self._frames)
         shards = msgspec.to_builtins(self._shards)
         manifest = {**self._header, "form": form.as_dict(), "shards": shards}
         text = f"{json.dumps(manifest, indent=1)}\n"
@@ -539,50 +544,6 @@ class ShardWriter:
         number = len(self._shards)
         return f"shards/{number:05d}.npz"
 
-    def _make_form(self, grid: BevGrid, predictions: int, frames: int) -> MotionForm:
-        """Build the form of the results; raise ResultsError if a value is invalid."""
-        return MotionForm(
-            stored=self._store,
-            grid=grid,
-            predictions=predictions,
-            frames=frames,
-            step=self._step,
-            labels=self._labels,
-        )
-
-    def _check_output(self, prediction: object) -> MotionOutput:
-        """Return the prediction; raise ResultsError if it has the wrong type or grid."""
-        if not isinstance(prediction, MotionOutput):
-            raise ResultsError(
-                f"expected a MotionOutput, found {type(prediction).__name__}; make one with "
-                "MotionOutput.from_arrays(…), or from instance maps with instances_of(…)"
-            )
-        if self._grid not in (None, prediction.grid):
-            raise ResultsError(
-                f"expected a prediction on {self._grid}, found one on {prediction.grid}; write "
-                "predictions on different grids to different results"
-            )
-        return prediction
-
-    def _make_arrays(self, output: MotionOutput) -> dict[str, AnyArray]:
-        """Return the arrays to store by name; raise ResultsError if they cannot be stored."""
-        if output.instances is not None and output.instances.min() < 0:
-            raise ResultsError(
-                f"instances: expected ids from 1, and 0 elsewhere, found {output.instances.min()}"
-            )
-        if self._store == "instances":
-            return instance_arrays(output)
-        if output.heads is None:
-            raise ResultsError(
-                "expected heads, found instance maps; write instance maps with store='instances'"
-            )
-        if any(heads.ignore_index is not None for heads in output.heads):
-            raise ResultsError(
-                "expected the heads of a model, found heads made from labels, which contain "
-                "values to ignore; write the instance maps of the labels with store='instances'"
-            )
-        return head_arrays(output)
-
     def _end_shard(self) -> None:
         """Close the archive that is being written, and list it as a shard."""
         if self._archive is None:
@@ -597,30 +558,6 @@ class ShardWriter:
         )
         self._shards.append(shard)
         self._shard_tokens = []
-
-
-def head_arrays(output: MotionOutput) -> dict[str, AnyArray]:
-    """Return the heads of K predictions by name: float32 arrays (K, T, channels, H, W)."""
-    arrays = {}
-    for name in HEADS:
-        maps = [getattr(heads, name) for heads in output.heads or ()]
-        arrays[name] = np.stack(maps)
-    return arrays
-
-
-def instance_arrays(output: MotionOutput) -> dict[str, AnyArray]:
-    """Return the instance maps of K predictions, extracted from the heads if necessary."""
-    maps = output.instances
-    if maps is None:
-        predicted = [predict_instances(heads, "motion").instance for heads in output.heads or ()]
-        maps = np.stack(predicted)
-    max_id = int(maps.max(initial=0))
-    id_type: type[np.integer[Any]] = np.int32
-    if max_id < 2**8:
-        id_type = np.uint8
-    elif max_id < 2**16:
-        id_type = np.uint16
-    return {"instance": maps.astype(id_type)}
 
 
 def put_array(archive: zipfile.ZipFile, member: str, array: AnyArray) -> None:

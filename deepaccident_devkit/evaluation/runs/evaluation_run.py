@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -363,7 +363,7 @@ def evaluate_results(
         selection: Selection of the samples; the name of a split selects its `default_selection`.
         allow_partial: Whether to accept results whose samples differ from the selected ones. Then
             predictions for other samples are ignored, and if samples are missing, all output is
-            marked as partial.
+            marked as partial. For tracking, a recording that lacks samples is left out as a whole.
         out: Folder that the run will be saved to (`save_run`); counts are stored next to it. An
             interrupted run continues with these counts if nothing that they depend on has changed,
             and several processes with the same folder share the samples. None stores no counts.
@@ -388,7 +388,10 @@ def evaluate_results(
     opened = results if isinstance(results, Results) else read_results(results)
     loader = SampleLoader(dataset, opened, setup)
     check_recordings(opened, dataset)
-    covered = coverage(dataset, opened.tokens, selection, explain=not allow_partial)
+    predicted: Collection[str] = opened.tokens
+    if allow_partial and evaluator_class(setup.task).needs_complete_recordings:
+        predicted = _complete_recordings(predicted, selection.tokens(dataset))
+    covered = coverage(dataset, predicted, selection, explain=not allow_partial)
     tokens = _covered_tokens(dataset, opened, selection, covered, allow_partial=allow_partial)
     if evaluator_class(setup.task).needs_meta:
         check_metas(dataset, tokens, selection.split)
@@ -457,10 +460,17 @@ def _covered_tokens(
         if covered.options or not (covered.missing or covered.unknown):
             remedy = ""  # the text of the coverage suggests a better one
         raise ResultsError(f"{results.path}: {covered.to_text()}{remedy}")
-    tokens = [token for token in selection.tokens(dataset) if token in results]
+    missing = set(covered.missing)
+    tokens = [token for token in selection.tokens(dataset) if token not in missing]
     if not tokens:
         raise ResultsError(f"{results.path}: {covered.to_text()}; no sample is left to evaluate")
     return tokens
+
+
+def _complete_recordings(predicted: Collection[str], expected: Sequence[str]) -> list[str]:
+    """Return the predicted samples without those of recordings that lack an expected sample."""
+    recordings = {token.rpartition("/")[0] for token in set(expected).difference(predicted)}
+    return [token for token in predicted if token.rpartition("/")[0] not in recordings]
 
 
 def check_metas(dataset: Dataset, tokens: Sequence[str], split: str) -> None:

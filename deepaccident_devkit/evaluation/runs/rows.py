@@ -35,7 +35,7 @@ def sample_rows(run: EvaluationRun) -> list[Row]:
     - detection: the numbers of true boxes and detections that count, and of true positives at each
       threshold, summed over classes and ranges;
     - warning: the sample's counts, with lists replaced by their lengths;
-    - planning, forecasting: the headlines of the sample.
+    - tracking, planning, forecasting: the headlines of the sample.
     """
     rows = []
     for token in sorted(run.evaluator.tokens):

@@ -10,7 +10,7 @@ have a wrong size, height or heading, a warning reports it.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, permutations
 from operator import itemgetter
@@ -28,6 +28,7 @@ from deepaccident_devkit.evaluation.forecasting import Forecast, ForecastingTrut
 from deepaccident_devkit.evaluation.forecasting.metrics import SAME_TIME
 from deepaccident_devkit.evaluation.motion import actor_cells
 from deepaccident_devkit.evaluation.planning import Plan, PlanningScene
+from deepaccident_devkit.evaluation.predicted_boxes import Tracks
 from deepaccident_devkit.evaluation.predictions import (
     Accident,
     MotionOutput,
@@ -36,10 +37,17 @@ from deepaccident_devkit.evaluation.predictions import (
 )
 from deepaccident_devkit.evaluation.results import Results
 from deepaccident_devkit.evaluation.runs.setups import EvaluationSetup, SampleLoader
+from deepaccident_devkit.evaluation.segmentation import (
+    SegmentationOutput,
+    compared_masks,
+    segmentation_truth,
+)
 from deepaccident_devkit.evaluation.task import FrozenMappings
-from deepaccident_devkit.geometry import Boxes
+from deepaccident_devkit.evaluation.tracking import TrackingTruth
+from deepaccident_devkit.geometry import BevGrid, Boxes
+from deepaccident_devkit.geometry.bev_grid import Axis
 from deepaccident_devkit.motion import MotionLabels
-from deepaccident_devkit.support.arrays import AnyArray, FloatArray, IntArray
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from deepaccident_devkit.support.parallel import run_batch
 from deepaccident_devkit.support.text import counted
 from deepaccident_devkit.support.values import ReadOnlyValues
@@ -79,10 +87,21 @@ _MIN_HITS = {
     "motion": 100,
     "accident": 4,
     "detection": 10,
+    "tracking": 10,
     "planning": 10,
     "forecasting": 10,
+    "segmentation": 100,
 }
-_UNITS = dict(zip(_MIN_HITS, ("cells", "accidents", "true boxes", "places", "places"), strict=True))
+_UNIT_NAMES = (
+    "cells",
+    "accidents",
+    "true boxes",
+    "true boxes",
+    "places",
+    "places",
+    "cells",
+)
+_UNITS = dict(zip(_MIN_HITS, _UNIT_NAMES, strict=True))
 # Largest distance on the ground of a matched box; for accidents, averaged over both positions.
 _POSITION_TOLERANCE_M = 2.0
 # Weights of x, y and z. For z the tolerance is only 0.7 m, since LiDAR and ego frame differ only by
@@ -127,6 +146,14 @@ _YAWS = {
 # as most headings are, whatever was wrong with them.
 _MAX_YAW_RAD = 4.0
 _CLASSES = "classes swapped"
+_LAYERS = "layers swapped"
+# Mistake → where the contents of a cell come from along x and y, in cells from its own place.
+_SHIFTS = {
+    f"half a cell too far {forward} and {left}": (x, y)
+    for forward, x in (("forward", -0.5), ("back", 0.5))
+    for left, y in (("left", -0.5), ("right", 0.5))
+}
+_NEW_IDS = "ids of single samples"
 # Times, in seconds, at which paths are compared.
 _STEP_TIMES = np.arange(1, 7) * LABEL_STEP
 # Frames after the current one at these times.
@@ -139,6 +166,9 @@ _REMEDIES = {
     "place": {
         **dict.fromkeys(
             _AXES, "x is forward and y is to the left; for maps, state their orientation"
+        ),
+        **dict.fromkeys(
+            _SHIFTS, "the first cell begins, but is not centred, where the grid begins"
         ),
         "world frame for ego frame": "positions are in the world frame; give them in the "
         "present ego frame",
@@ -174,7 +204,13 @@ _REMEDIES = {
         (_DEGREES, *_YAWS), "yaw is in radians, counter-clockwise from x of the present ego frame"
     ),
     "velocity": dict.fromkeys(_VELOCITIES, "velocities are in m/s"),
-    "class": {_CLASSES: f"class numbers count from 0: {', '.join(CATEGORIES)}"},
+    "identity": {
+        _NEW_IDS: "a track keeps its id in all samples of a recording",
+    },
+    "class": {
+        _CLASSES: f"class numbers count from 0: {', '.join(CATEGORIES)}",
+        _LAYERS: "name the classes in the order of the layers",
+    },
 }
 # Group of mistakes → warning if most values of matched boxes are wrong, but no mistake explains it.
 _UNEXPLAINED = {
@@ -356,7 +392,7 @@ def _suspect_group(
     for name in _REMEDIES[group]:
         if name not in sums:
             continue
-        tally = class_tally(sums[name]) if name == _CLASSES else sums[name]
+        tally = class_tally(sums[name]) if group == "class" else sums[name]
         hits, totals, given_hits, given_totals = tally
         share = _worst_share(hits, totals)
         given_share = _worst_share(given_hits, given_totals)
@@ -579,6 +615,18 @@ def _detection_evidence(
     return SampleEvidence(tallies=tallies, scores=scores)
 
 
+def _tracking_evidence(
+    loader: SampleLoader, token: str, tracks: Tracks, truth: TrackingTruth
+) -> SampleEvidence:
+    """Compare boxes as for detections, and count the ids of the preceding sample."""
+    evidence = _detection_evidence(loader, token, tracks, truth.boxes)
+    if not len(tracks.past_times):
+        return evidence
+    is_known = np.isfinite(tracks.past[:, -1, 0])
+    new_ids = {_NEW_IDS: tally_of(len(tracks), is_known, len(tracks))}
+    return replace(evidence, tallies={**evidence.tallies, **new_ids})
+
+
 def _nearest_rows(predicted: FloatArray, true: FloatArray) -> IntArray:
     """Find the predicted point (K, 3) nearest to each true one (N, 3) on the ground: (N,)."""
     distances = _distance(true[:, None, :2], predicted[:, :2])
@@ -779,11 +827,60 @@ def _positions_at_steps(times: FloatArray, path: FloatArray, present: FloatArray
     return np.column_stack(coordinates)
 
 
+def _segmentation_evidence(
+    loader: SampleLoader,
+    token: str,
+    prediction: SegmentationOutput,
+    truth: SegmentationOutput,
+    known: BoolArray,
+) -> SampleEvidence:
+    """Compare cells of classes: for each mistake, only the cells that it changes."""
+    grid = truth.grid
+    true = grid.reorient(known & np.asarray(truth.masks), "devkit")
+    predicted = grid.reorient(known & compared_masks(prediction, truth), "devkit")
+    single_true = true & (true.sum(axis=0) == 1)
+    single_predicted = predicted & (predicted.sum(axis=0) == 1)
+    tallies = {
+        "place": _overlap(predicted, true, predicted).sum(axis=1, keepdims=True),
+        _LAYERS: np.einsum("ihw,jhw->ij", single_true.astype(float), single_predicted),
+    }
+    for name, (x, y, order) in _AXES.items():
+        if grid.x == grid.y or order == 1:
+            turned = _turn_maps(predicted, x, y, order)
+            tallies[name] = _changed_cells(turned == true, turned != predicted)
+    for name, (x_shift, y_shift) in _SHIFTS.items():
+        shifted_grid = BevGrid(_shift_axis(grid.x, x_shift), _shift_axis(grid.y, y_shift))
+        shifted, _ = segmentation_truth(loader.dataset, token, shifted_grid, loader.setup.rules)
+        moved = np.asarray(shifted.masks)
+        tallies[name] = _changed_cells(moved == predicted, moved != true)
+    return SampleEvidence(tallies=tallies, empty=not predicted.any())
+
+
+def _shift_axis(axis: Axis, shift: float) -> Axis:
+    """Return an axis of a grid that begins and ends `shift` cells later."""
+    start, end, size = axis
+    return start + shift * size, end + shift * size, size
+
+
+def _changed_cells(is_right: BoolArray, is_changed: BoolArray) -> FloatArray:
+    """Tally the cells that a mistake changes; each is right either as predicted or without it.
+
+    Args:
+        is_right: Whether each cell is right once the mistake is undone.
+        is_changed: Whether the mistake changes each cell.
+    """
+    total = np.count_nonzero(is_changed)
+    hits = np.count_nonzero(is_right & is_changed)
+    return tally_of(hits, total - hits, total)
+
+
 # Task of results → function that takes a sample's token, prediction and truth, and examines them.
 _EXAMINERS: Mapping[str, Callable[..., SampleEvidence]] = {
     "motion": _motion_evidence,
     "accident": _accident_evidence,
     "detection": _detection_evidence,
+    "tracking": _tracking_evidence,
     "planning": _plan_evidence,
     "forecasting": _forecast_evidence,
+    "segmentation": _segmentation_evidence,
 }

@@ -23,8 +23,10 @@ from deepaccident_devkit.evaluation.forecasting import ForecastingEvaluator
 from deepaccident_devkit.evaluation.motion import MotionEvaluator
 from deepaccident_devkit.evaluation.planning import PlanningEvaluator
 from deepaccident_devkit.evaluation.predictions import compared_labels
-from deepaccident_devkit.evaluation.results import Results
+from deepaccident_devkit.evaluation.results import MotionForm, Results
+from deepaccident_devkit.evaluation.segmentation import SegmentationEvaluator
 from deepaccident_devkit.evaluation.task import FrozenDict, switched
+from deepaccident_devkit.evaluation.tracking import TrackingEvaluator
 from deepaccident_devkit.evaluation.warning import WarningEvaluator
 from deepaccident_devkit.motion import LABEL_PROTOCOLS, MotionLabels
 from deepaccident_devkit.release.fingerprints import INDEX_REMEDY, digest_of
@@ -375,9 +377,11 @@ TASKS: Final[dict[str, type[Evaluator[Any]]]] = {
         MotionEvaluator,
         AccidentEvaluator,
         DetectionEvaluator,
+        TrackingEvaluator,
         WarningEvaluator,
         PlanningEvaluator,
         ForecastingEvaluator,
+        SegmentationEvaluator,
     )
 }
 """The devkit's own tasks by name. `evaluator_class` also finds the tasks of plug-ins."""
@@ -423,7 +427,7 @@ class EvaluationSetup:
         task: Name of a task of the devkit or of a plug-in.
         protocol: Name of one of the task's `protocols`.
         switches: Name of a changed field of the protocol (`task.switch_names`) → its new value.
-        horizon: Seconds that the predictions look ahead; detection does not use it.
+        horizon: Seconds that the predictions look ahead; detection and tracking do not use it.
     """
 
     task: str
@@ -534,12 +538,10 @@ class SampleLoader:
                 "protocol 'paper' or 'boxes'"
             )
         form = self.results.form
-        if form is None:
-            return
-        seconds = (form.frames - 1) * form.step
-        if seconds < self.setup.horizon - FRAME_PERIOD / 2:
+        min_seconds = self.setup.horizon - FRAME_PERIOD / 2
+        if isinstance(form, MotionForm) and form.lookahead < min_seconds:
             raise EvaluationError(
-                f"{self.results.path}: the predictions look {seconds:g} s ahead "
+                f"{self.results.path}: the predictions look {form.lookahead:g} s ahead "
                 f"({counted(form.frames, 'frame')}, {form.step:g} s apart, from the present on), "
                 f"less than the horizon of {self.setup.horizon:g} s; add the present frame if it "
                 "is missing, or evaluate with a shorter horizon"

@@ -418,11 +418,7 @@ def results_text(results: Results) -> str:
     }
     form = results.form
     if form is not None:
-        lines["form"] = (
-            f"{form.stored}, up to {form.predictions} predictions of {form.frames} frames, "
-            f"{form.step:g} s apart, cells x {form.grid.x}, y {form.grid.y}, orientation "
-            f"{form.grid.orientation}, labels {form.labels}"
-        )
+        lines["form"] = form.text
     return _align_lines(lines)
 
 
@@ -436,8 +432,10 @@ def reading_notes(summary: Json) -> list[str]:
     metrics = summary["metrics"]
     notes: list[str] = []
     if form is not None:
-        notes += _cell_notes(form, metrics.get("ranges") or ())
-        notes += _frame_notes(form, summary["horizon"])
+        if summary["protocol"] != "onebev":  # which was published with other cells
+            notes += _cell_notes(form, metrics.get("ranges") or ())
+        if "frames" in form:
+            notes += _frame_notes(form, summary["horizon"])
     is_released = summary["protocol"] == "released"
     if summary["task"] == "motion":
         notes += _path_notes(metrics)
@@ -478,6 +476,8 @@ def _cell_notes(form: Json, ranges: Sequence[str]) -> Iterator[str]:
     map_ends = [*form["x"][:2], *form["y"][:2]]
     nearest_end = min(map(abs, map_ends))
     for name in ranges:
+        if name == "all":
+            continue
         side = max(map(float, name.split("x")))
         if side > 2 * nearest_end:
             yield f"{human_name(name)}: the maps end within this range; only their cells count"

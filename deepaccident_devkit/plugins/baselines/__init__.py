@@ -21,6 +21,7 @@ from deepaccident_devkit.plugins.baselines.predict import (
     predict_forecasts,
     predict_motion,
     predict_plan,
+    predict_tracks,
 )
 from deepaccident_devkit.plugins.baselines.predict_results import Baseline, predict_results
 from deepaccident_devkit.v2x.cooperation import SeenActors, seen_actors
@@ -41,6 +42,7 @@ __all__ = [
     "predict_motion",
     "predict_plan",
     "predict_results",
+    "predict_tracks",
     "seen_actors",
     "turn_rates",
 ]

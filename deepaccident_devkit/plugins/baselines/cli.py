@@ -28,7 +28,7 @@ from deepaccident_devkit.errors import NotAvailableError
 from deepaccident_devkit.evaluation.results import RESULTS_NAMES
 from deepaccident_devkit.evaluation.runs.setups import agent_of
 from deepaccident_devkit.plugins.baselines import MOTION_MODELS, Baseline, predict_results
-from deepaccident_devkit.plugins.baselines.predict_results import is_predicted
+from deepaccident_devkit.plugins.baselines.predict_results import PREDICTED_TASKS, is_predicted
 from deepaccident_devkit.selection.samples import no_samples_text
 from deepaccident_devkit.support.files import writable_folder
 from deepaccident_devkit.support.parallel import keep_workers
@@ -70,7 +70,7 @@ Examples:
     multiple=True,
     metavar="NAME[,NAME…]",
     default=_DEFAULT_TASKS,
-    help=f"With a baseline: tasks to write results for: {', '.join(RESULTS_NAMES)}, or all.  "
+    help=f"With a baseline: tasks to write results for: {', '.join(PREDICTED_TASKS)}, or all.  "
     f"[default: {','.join(_DEFAULT_TASKS)}]",
 )
 @click.option(
@@ -136,9 +136,9 @@ def _predict_with_baseline(
     if link is None or not (link.pose_noise or link.packet_loss):
         refuse_unused("without --pose-noise or --packet-loss", "seed")
     words = [
-        choice("--task", word, (*RESULTS_NAMES, "all")) for word in split_words(options["tasks"])
+        choice("--task", word, (*PREDICTED_TASKS, "all")) for word in split_words(options["tasks"])
     ]
-    tasks = [task for task in RESULTS_NAMES if task in words or "all" in words]
+    tasks = [task for task in PREDICTED_TASKS if task in words or "all" in words]
     baseline = Baseline(agents=agents, model=model, link=link, horizon=options["horizon"])
     folder = writable_folder(out)
     is_released = baseline.horizon == _RELEASED_HORIZON and options["scope"] == "accident"

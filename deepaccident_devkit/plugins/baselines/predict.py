@@ -14,7 +14,7 @@ import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
 from deepaccident_devkit.errors import ConfigError, NotAvailableError
-from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation import Accident, DetectedBoxes, MotionOutput, Tracks
 from deepaccident_devkit.evaluation.forecasting import Forecast
 from deepaccident_devkit.evaluation.planning.scene import Plan
 from deepaccident_devkit.geometry import SE3
@@ -233,6 +233,20 @@ def predict_detections(
     scores = (agent_counts + point_shares) / (len(AGENTS) + 1)
     is_ego = actors.boxes.actor_id == OWN_ACTOR_ID
     return DetectedBoxes(boxes=actors.boxes, scores=np.where(is_ego, 0.0, scores))
+
+
+def predict_tracks(
+    dataset: Dataset, sample: RowArgument, *, agents: Agents = "single", link: Link | None = None
+) -> Tracks:
+    """Return the boxes of `predict_detections` as tracks; their ids are exact.
+
+    The ego's own box and untracked boxes have no track. Arguments and errors are as for
+    `predict_detections`.
+    """
+    detected = predict_detections(dataset, sample, agents=agents, link=link)
+    rows = ~np.isin(detected.boxes.actor_id, (OWN_ACTOR_ID, UNTRACKED_ID))
+    boxes = detected.boxes.select(rows)
+    return Tracks(boxes=boxes, scores=detected.scores[rows], ids=boxes.actor_id)
 
 
 def predict_forecasts(

@@ -10,11 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from deepaccident_devkit.dataset import Dataset
 from deepaccident_devkit.errors import ResultsError
 from deepaccident_devkit.evaluation.results import (
+    RESULTS_NAMES,
     Prediction,
     ResultsTask,
     ResultsWriter,
@@ -31,6 +32,7 @@ from deepaccident_devkit.plugins.baselines.predict import (
     predict_forecasts,
     predict_motion,
     predict_plan,
+    predict_tracks,
 )
 from deepaccident_devkit.release.fingerprints import digest_of
 from deepaccident_devkit.support.parallel import Places, Store, unfinished_folder
@@ -46,6 +48,9 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from deepaccident_devkit.support.parallel import Engine
+
+# Tasks that baselines predict; labels contain no map to segment.
+PREDICTED_TASKS: Final = tuple(task for task in RESULTS_NAMES if task != "segmentation")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +87,8 @@ class Baseline:
         cooperation: NamedValues = {"agents": self.agents, "link": self.link}
         if task == "detection":
             return predict_detections(dataset, token, **cooperation)
+        if task == "tracking":
+            return predict_tracks(dataset, token, **cooperation)
         if task == "motion":
             return predict_motion(
                 dataset, token, model=self.model, config=self.config, **cooperation
@@ -130,7 +137,7 @@ def predict_results(
 
     Args:
         dataset: The release.
-        task: A task in `RESULTS_NAMES`; for planning, all samples must be of vehicles.
+        task: A task in `PREDICTED_TASKS`; for planning, all samples must be of vehicles.
         tokens: Tokens of the samples.
         out: File or folder to write.
         baseline: The baseline; None for a single vehicle and constant velocity.
@@ -147,7 +154,7 @@ def predict_results(
         SomeFailedError: If samples of some scenarios cannot be predicted; the others are finished.
         WorkerError: If a worker was killed, or cannot do the work.
     """
-    task = choice("task", task, get_args(ResultsTask))
+    task = choice("task", task, PREDICTED_TASKS)
     path = path_of(out).absolute()
     scenarios = samples_by_scenario(path, tokens)
     work = _Work(dataset, task, baseline or Baseline(), tuple(scenarios))

@@ -83,7 +83,7 @@ class Model:
             form = self.results.form
         horizon = 2.0
         if form is not None:
-            horizon = min(2.0, (form.frames - 1) * form.step)
+            horizon = min(2.0, form.lookahead)
         protocol = next(iter(evaluator_class(task).protocols), "")
         if task == "accident":
             protocol = "boxes"  # the first protocol compares only motion

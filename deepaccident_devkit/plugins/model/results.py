@@ -45,6 +45,9 @@ from deepaccident_devkit.v2x.agents import agents_note
 from deepaccident_devkit.v2x.messages import POSE_BYTES, traffic_note
 from deepaccident_devkit.v2x.tracks import scenario_tracks
 
+# Tasks for which results are written.
+_WRITTEN_TASKS: Sequence[ResultsTask] = ("motion", "accident", "detection", "forecasting")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SamplePrediction(ShortRepr):
@@ -240,9 +243,8 @@ def predict_results(
     config = config or PredictConfig()
     folder = writable_folder(out)
     paths: dict[ResultsTask, Path] = {}
-    for task, name in RESULTS_NAMES.items():
-        if task != "planning":
-            paths[task] = folder / name
+    for task in _WRITTEN_TASKS:
+        paths[task] = folder / RESULTS_NAMES[task]
     meta = _make_notes(model, dataset, tokens, config)
     labels = model.config.labels
     step = labels.step * FRAME_PERIOD

@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 
 from deepaccident_devkit.dataset import Dataset, RowArgument
-from deepaccident_devkit.errors import ChoiceError, NotAvailableError
+from deepaccident_devkit.errors import ChoiceError, MissingFileError, NotAvailableError
 from deepaccident_devkit.evaluation.alarms import LABEL_STEP
-from deepaccident_devkit.evaluation.detection import DetectedBoxes
 from deepaccident_devkit.evaluation.drawing import Drawing
 from deepaccident_devkit.evaluation.evaluator import Evaluator
 from deepaccident_devkit.evaluation.forecasting import Forecast
 from deepaccident_devkit.evaluation.planning import Plan
+from deepaccident_devkit.evaluation.predicted_boxes import DetectedBoxes, Tracks
 from deepaccident_devkit.evaluation.predictions import Accident, MotionOutput
-from deepaccident_devkit.evaluation.results.motion import MotionForm
+from deepaccident_devkit.evaluation.results import Form, MotionForm, SegmentationForm
 from deepaccident_devkit.evaluation.runs.setups import SampleLoader, evaluator_class
+from deepaccident_devkit.evaluation.segmentation import SegmentationOutput
 from deepaccident_devkit.evaluation.task import headlines, value_text
 from deepaccident_devkit.evaluation.truth import RELEASED_HORIZON
 from deepaccident_devkit.support.arrays import ShortRepr
@@ -26,9 +27,11 @@ from deepaccident_devkit.support.human_names import human_name, metric_name
 _KINDS: Mapping[type, str] = {
     MotionOutput: "motion",
     DetectedBoxes: "detection",
+    Tracks: "tracking",
     Accident: "accident",
     Plan: "planning",
     Forecast: "forecasting",
+    SegmentationOutput: "segmentation",
 }
 # Kinds of predictions that are lists.
 _LIST_KINDS = ("accident", "planning", "forecasting")
@@ -121,7 +124,7 @@ def task_drawing(dataset: Dataset, token: str, prediction: Any, task: str | None
     form, horizon = _form_and_horizon(prediction)
     try:
         truth = evaluator.truth(dataset, token, form, horizon)
-    except NotAvailableError:
+    except (NotAvailableError, MissingFileError):
         return Evaluator.drawing(evaluator, dataset, token, prediction)
     return evaluator.drawing(dataset, token, prediction, *truth)
 
@@ -147,8 +150,10 @@ def _evaluator_of(prediction: Any, task: str | None, protocol: Any = None) -> Ev
     return evaluator_type(protocol or next(iter(evaluator_type.protocols), ""))
 
 
-def _form_and_horizon(prediction: Any) -> tuple[MotionForm | None, float]:
-    """Return how motion would be stored, None for other predictions, and seconds to look ahead."""
+def _form_and_horizon(prediction: Any) -> tuple[Form | None, float]:
+    """Return how maps would be stored, None for other predictions, and seconds to look ahead."""
+    if isinstance(prediction, SegmentationOutput):
+        return SegmentationForm.of(prediction), RELEASED_HORIZON
     if not isinstance(prediction, MotionOutput):
         return None, RELEASED_HORIZON
     if prediction.instances is not None:

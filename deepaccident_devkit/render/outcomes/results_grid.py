@@ -159,7 +159,7 @@ def _loader_of(
         default = next(iter(protocols), "")
     horizon = RELEASED_HORIZON
     if results.form is not None:
-        horizon = min(horizon, (results.form.frames - 1) * results.form.step)
+        horizon = min(horizon, results.form.lookahead)
     setup = EvaluationSetup(task=task, protocol=protocol or default, horizon=horizon)
     return SampleLoader(dataset, results, setup)
 

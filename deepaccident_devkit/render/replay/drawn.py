@@ -159,7 +159,7 @@ def _verdict(drawing: Drawing) -> tuple[str, str]:
 
     Instances count once in each of their frames. The colour is that of the most frequent verdict.
     Without verdicts, it is red if an alarm is raised or, in a task without alarms, if something
-    collides.
+    collides; there may be no words.
     """
     counts: Counter[Role] = Counter()
     for drawn in drawing.boxes:
@@ -172,7 +172,7 @@ def _verdict(drawing: Drawing) -> tuple[str, str]:
         words = [f"{counts[role]} {_VERDICTS[role]}" for role in judged]
         return ", ".join(words), _COLORS[max(judged, key=counts.__getitem__)]
     contacts = [place.note for place in drawing.places if place.role == "collision"]
-    text = next(filter(None, contacts), drawing.words) or "predicted"
+    text = next(filter(None, contacts), drawing.words)
     is_grave = bool(contacts)
     if drawing.alarm is not None:
         is_grave = drawing.alarm.fires

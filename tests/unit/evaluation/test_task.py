@@ -87,14 +87,22 @@ def test_properties_of_each_task() -> None:
         "motion": (("motion",), False, False),
         "accident": (("motion", "accident"), False, True),
         "detection": (("detection",), False, False),
+        "tracking": (("tracking",), True, False),
         "warning": (("motion", "accident"), True, True),
         "planning": (("planning",), True, True),
         "forecasting": (("forecasting",), True, False),
+        "segmentation": (("segmentation",), False, False),
     }
     assert [name for name, task in TASKS.items() if task.vehicles_only] == ["planning"]
 
     without_horizon = [name for name, task in TASKS.items() if not task.has_horizon]
-    assert without_horizon == ["detection", "planning", "forecasting"]
+    assert without_horizon == [
+        "detection",
+        "tracking",
+        "planning",
+        "forecasting",
+        "segmentation",
+    ]
 
 
 @for_every_protocol

@@ -28,6 +28,7 @@ WRITTEN = {
     "bev_segmentation.COVERAGE": "{'road': 0.5, 'lane_line': 0.0, 'sidewalk': 0.5, 'vehicle': "
     "0.5, 'pedestrian': 0.0}",
     "bev_segmentation.bev_segmentation": "grid=None, augmentation=None",
+    "bev_segmentation.cell_tags": "rule='majority'",
     "bev_segmentation.segmentation_of": "augmentation=None",
     "box_polygons.OWN_BOX_ID": "-101",
     "box_polygons.box_polygons": "is_vehicle=True",

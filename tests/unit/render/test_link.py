@@ -46,7 +46,7 @@ def test_arrows_are_as_long_as_the_pose_error(da_motion: DeepAccident, moving_sa
     lengths = np.hypot(arrows.U, arrows.V)
     # the agents may stand on a slope, 10 % at most
     np.testing.assert_allclose(lengths, 0.5, atol=2.5e-3)
-    assert ax.get_title() == "Box positions (largest error 0.50 m, means below)"
+    assert read_legend(figure)[0] == "other: 0.50 m"
 
 
 def test_the_two_largest_visible_errors_are_magnified(

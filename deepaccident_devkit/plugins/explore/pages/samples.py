@@ -20,6 +20,7 @@ from deepaccident_devkit.evaluation.breakdowns import (
     attribute_name,
     sample_attributes,
 )
+from deepaccident_devkit.evaluation.results import MotionForm
 from deepaccident_devkit.evaluation.runs.setups import (
     SampleLoader,
     agent_of,
@@ -305,7 +306,7 @@ def describe_rules(model: Model) -> str:
         form = model.results.form
         ahead = _ACCIDENT_HORIZON_S
         if form is not None:
-            ahead = (form.frames - 1) * form.step
+            ahead = form.lookahead
         horizon = model.setup.horizon
         if abs(ahead - horizon) > FRAME_PERIOD / 2:
             return f"These pictures look {ahead:g} s ahead; the evaluation looks {horizon:g} s."
@@ -333,7 +334,8 @@ def list_frames_ahead(explorer: Explorer, model: Model, token: str) -> list[floa
     form = None
     if model.results is not None:
         form = model.results.form
-    if model.setup.task != "motion" or form is None or not is_sample(explorer.dataset, token):
+    is_motion = model.setup.task == "motion" and is_sample(explorer.dataset, token)
+    if not is_motion or not isinstance(form, MotionForm):
         return []
     time_to_end = float(explorer.dataset.get("sample", token)["time_to_end"])
     max_time = min(model.setup.horizon, time_to_end)

@@ -134,7 +134,7 @@ function showCamera(card) {
     drawOver(card, camera, frame);
   }
   const sample = state.foreseen.find((candidate) => candidate.agent === card.number);
-  card.judged.replaceChildren(...(sample ? [verdictBadge(sample)] : []));
+  card.judged.replaceChildren(...(sample?.verdict ? [verdictBadge(sample)] : []));
   card.sees.textContent = sightText(card);
 }
 

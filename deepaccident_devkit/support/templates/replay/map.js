@@ -91,9 +91,12 @@ class SceneMap {
     if (layers.trails) for (const actor of data.actors) this.drawTrail(actor);
     this.drawSights();
     const samples = layers.prediction ? state.foreseen : [];
-    for (const line of linesAt(samples, state.frame)) this.drawLine(line);
+    const lines = linesAt(samples, state.frame);
+    const outlines = lines.filter((line) => line.frames && !line.filled);
+    for (const line of lines) if (!outlines.includes(line)) this.drawLine(line);
     for (const place of samples.flatMap((sample) => sample.places)) this.drawPlaces(place.points, thin(place.color));
     for (const [actor, now] of [...actors].reverse()) this.drawActor(actor, now);
+    for (const line of outlines) this.drawLine(line); // a missed box lies on its actor
     if (layers.agents) this.drawPoles();
     if (data.impact) this.drawImpact(data.impact);
     this.drawNames();

@@ -140,8 +140,9 @@ function addVerdicts(samples) {
     bar([sample.frame, sample.frame], sample.agent * BAND, BAND - 0.8, sample.color),
   );
   return addRow("verdicts", plot(BAND * data.agents.length, ...lines), () => {
-    const words = state.foreseen.map((sample) => `${data.agents[sample.agent].short} ${sample.verdict}`);
-    return words.join(", ") || "none yet";
+    const judged = state.foreseen.filter((sample) => sample.verdict);
+    const words = judged.map((sample) => `${data.agents[sample.agent].short} ${sample.verdict}`);
+    return state.foreseen.length ? words.join(", ") : "none yet";
   });
 }
 

@@ -28,7 +28,7 @@ function verdictRow(frame, samples) {
   jump.addEventListener("click", () => go(frame));
   const cells = data.agents.map((_, agent) => {
     const sample = samples.find((candidate) => candidate.agent === agent);
-    return made("td", {}, sample ? verdictBadge(sample) : "");
+    return made("td", {}, sample?.verdict ? verdictBadge(sample) : "");
   });
   const row = made("tr", {}, made("th", { scope: "row" }, jump), ...cells);
   row.dataset.frame = String(frame);
@@ -55,7 +55,7 @@ export function showForeseen() {
   const frame = kept?.frame ?? lastBefore(samplesAt.keys(), state.frame);
   state.foreseen = frame === null ? [] : samplesAt.get(frame) ?? [];
   const lines = state.foreseen.flatMap((sample) => [
-    made("p", {}, verdictBadge(sample), sample.text),
+    made("p", {}, ...(sample.verdict ? [verdictBadge(sample)] : []), sample.text),
     ...(sample.more ? [smallText(`and ${sample.more} more with lower scores`)] : []),
   ]);
   byId("foreseen").replaceChildren(...(lines.length ? lines : [smallText(nothingYet())]));

@@ -69,17 +69,17 @@ HEADERS: dict[str, tuple[Document, str]] = {
     "a version that is true": ({"version": True}, "version: expected 1, found true"),
     "no task": ({"task": ...}, "required field `task`"),
     "an unknown task": (
-        {"task": "tracking"},
+        {"task": "lanes"},
         (
-            "task: expected one of motion, accident, detection, planning, "
-            'forecasting, found "tracking"'
+            "task: expected one of motion, accident, detection, tracking, planning, "
+            'forecasting, segmentation, found "lanes"'
         ),
     ),
     "a list of tasks": (
         {"task": ["accident"]},
         (
-            "task: expected one of motion, accident, detection, planning, "
-            'forecasting, found ["accident"]'
+            "task: expected one of motion, accident, detection, tracking, planning, "
+            'forecasting, segmentation, found ["accident"]'
         ),
     ),
     "another task": ({"task": "detection"}, f"results of '{FIRST}': [0]: "),
@@ -468,7 +468,7 @@ MANIFESTS: dict[str, tuple[Callable[[Document], object], tuple[str, ...]]] = {
     ),
     "an unknown field": (
         lambda manifest: manifest["form"].update(z=1),
-        ("form: object contains unknown field `z` (expected stored, x,",),
+        ("form: object contains unknown field `z` (expected x, y, orientation, stored,",),
     ),
     "no shards": (
         lambda manifest: manifest.update(shards=[]),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support import handwritten_results as handwritten
 
-from deepaccident_devkit.evaluation import DetectedBoxes, MotionOutput
+from deepaccident_devkit.evaluation import DetectedBoxes, MotionOutput, SegmentationOutput
 from deepaccident_devkit.evaluation.results import RESULT_SCHEMAS, RESULTS_NAMES, read_results
 
 SCHEMA = Path(__file__).parents[4] / "schema"
@@ -19,6 +19,7 @@ PAGE = SCHEMA / "results" / "README.md"
 DOCUMENTS = {
     "accident": handwritten.accident_document,
     "detection": handwritten.detection_document,
+    "tracking": handwritten.tracking_document,
     "planning": handwritten.planning_document,
     "forecasting": handwritten.forecasting_document,
 }
@@ -84,9 +85,11 @@ def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
             first: [(100.0, -20.0, 0.8, 4.5, 1.9, 1.6, 0.3, "car", 0.9)],
             second: [],
         },
+        "tracks": {first: [(100.0, -20.0, 0.8, 4.5, 1.9, 1.6, 0.3, "car", 0.9, "7")], second: []},
         "plans": {first: np.array([[4.0, 0.0], [8.0, 0.5]]), second: np.ones((1, 2))},
         "forecasts": {first: {1236: np.arange(12.0).reshape(2, 3, 2)}, second: {}},
         "maps": {first: instances, second: 0 * instances},
+        "masks": {first: instances[0] == 3, second: instances[0] > 3},
     }
 
     for code in read_code_blocks("python"):
@@ -102,3 +105,6 @@ def test_the_code_of_the_page_writes_valid_files(tmp_path: Path) -> None:
     output = results_by_task["motion"].prediction(first)
     assert isinstance(output, MotionOutput)
     np.testing.assert_array_equal(output.instances, instances)  # type: ignore[arg-type]
+    segmentation = results_by_task["segmentation"].prediction(first)
+    assert isinstance(segmentation, SegmentationOutput)
+    np.testing.assert_array_equal(segmentation.masks_at(0.5), instances[0] == 3)

@@ -19,10 +19,17 @@ from support import handwritten_results as handwritten
 from support.expected_errors import assert_raises
 
 from deepaccident_devkit.errors import ChoiceError, ResultsError, TokenError
-from deepaccident_devkit.evaluation import Accident, DetectedBoxes, instances_of
+from deepaccident_devkit.evaluation import (
+    Accident,
+    DetectedBoxes,
+    SegmentationOutput,
+    Tracks,
+    instances_of,
+)
 from deepaccident_devkit.evaluation.forecasting import Forecast
 from deepaccident_devkit.evaluation.planning import Plan
 from deepaccident_devkit.evaluation.results import Results, ResultsWriter, read_results, reader
+from deepaccident_devkit.evaluation.results.records import FOLDER_TASKS
 from deepaccident_devkit.evaluation.results.writer import detection_entries
 from deepaccident_devkit.geometry import BevGrid
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -36,10 +43,16 @@ PREDICTIONS: dict[str, Callable[[], Any]] = {
     "detection": lambda: DetectedBoxes.from_arrays(
         np.ones((2, 3)), np.ones((2, 3)), [0, 1], [0.5, 1], frame="world"
     ),
+    "tracking": lambda: Tracks.from_arrays(
+        np.ones((2, 3)), np.ones((2, 3)), [0, 1], [0.5, 1], ids=[3, "a:b"], frame="world"
+    ),
     "planning": lambda: [
         Plan(times=[1.0], path=[(5.0, 0.5)]),
         Plan(times=[0.5], path=[(3, 0)], yaw=[0.1]),
     ],
+    "segmentation": lambda: SegmentationOutput.from_arrays(
+        masks=np.ones((5, *GRID.shape), dtype=bool), grid=GRID
+    ),
     "forecasting": lambda: [
         Forecast(actor_id=actor, times=[0.5], paths=[[(actor, 1.5)]], probabilities=[0.25])
         for actor in (7, 8)
@@ -74,7 +87,7 @@ class TestWriter:
         second = write_all_samples(tmp_path / "b" / "x", task)
         files = read_files(tmp_path / "a")
         assert files == read_files(tmp_path / "b")
-        assert len(files) == (2 if task == "motion" else 1)
+        assert len(files) == (2 if task in FOLDER_TASKS else 1)
         assert first.fingerprint == second.fingerprint
 
     def test_an_exception_leaves_nothing(self, tmp_path: Path, task: Any) -> None:
@@ -92,7 +105,7 @@ class TestWriter:
         def raise_full_disk(*arguments: object, **options: object) -> None:
             raise OSError(28, "No space left on device")
 
-        function = "put_array" if task == "motion" else "EntryWriter.add"
+        function = "put_array" if task in FOLDER_TASKS else "EntryWriter.add"
         writer = ResultsWriter(tmp_path / "x", task)
         add_second = partial(writer.add, SECOND, PREDICTIONS[task]())
         with (  # noqa: PT012
@@ -197,6 +210,9 @@ class TestWriter:
                     ),
                 ),
             ],
+            "tracking": [
+                (lidar, "expected Tracks, found DetectedBoxes; make them with Tracks.from_arrays("),
+            ],
             "planning": [
                 ([1], "expected a list of Plans, found int in the list"),
                 (
@@ -209,6 +225,7 @@ class TestWriter:
                 (PREDICTIONS["planning"](), "expected a list of Forecasts, found Plan in the list"),
                 (3, "expected a list of Forecasts, found int in the list"),
             ],
+            "segmentation": [([], "expected a SegmentationOutput, found list; make one with")],
         }
         with ResultsWriter(tmp_path / "x", task) as writer:
             assert_raises(
@@ -235,10 +252,10 @@ class TestWriter:
             )
         )
 
-    def test_an_empty_folder_is_free_only_for_motion(self, tmp_path: Path, task: Any) -> None:
+    def test_an_empty_folder_is_free_only_for_shards(self, tmp_path: Path, task: Any) -> None:
         path = tmp_path / "x"
         path.mkdir()
-        if task == "motion":
+        if task in FOLDER_TASKS:
             assert len(write_all_samples(path, task)) == 3
         else:
             assert_raises(
@@ -276,15 +293,15 @@ def test_plans_and_forecasts_are_read_as_they_were_written(tmp_path: Path) -> No
 def test_tasks_without_results(tmp_path: Path) -> None:
     with pytest.raises(
         ChoiceError,
-        match="task: expected one of motion, accident, detection, planning, "
-        "forecasting, found 'warning'",
+        match="task: expected one of motion, accident, detection, tracking, planning, "
+        "forecasting, segmentation, found 'warning'",
     ):
         ResultsWriter(tmp_path / "x", "warning")  # type: ignore[arg-type]
 
 
 @pytest.fixture(params=PREDICTIONS)
 def results(request: pytest.FixtureRequest, tmp_path: Path) -> Results:
-    name = "m" if request.param == "motion" else "results.json"
+    name = "m" if request.param in FOLDER_TASKS else "results.json"
     return write_all_samples(tmp_path / name, request.param)
 
 
@@ -309,20 +326,20 @@ def test_a_copy_reads_again(results: Results) -> None:
     copy = pickle.loads(content)
     for name in ("task", "path", "fingerprint", "tokens", "meta", "form"):
         assert getattr(copy, name) == getattr(results, name), name
-    assert len(copy.prediction(SECOND)) == len(results.prediction(SECOND))
+    assert describe(copy, SECOND) == describe(results, SECOND)
 
 
 def test_in_threads_and_forked_processes(results: Results) -> None:
     tokens = handwritten.TOKENS * 20
-    expected = [len(results.prediction(token)) for token in tokens]
+    expected = [describe(results, token) for token in tokens]
     with ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(count_entries, [results] * 60, tokens)) == expected
+        assert list(pool.map(describe, [results] * 60, tokens)) == expected
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("fork")) as pool:
-        assert list(pool.map(count_entries, [results] * 6, tokens[:6])) == expected[:6]
+        assert list(pool.map(describe, [results] * 6, tokens[:6])) == expected[:6]
 
 
 def test_a_change_is_noticed(results: Results) -> None:
-    file = results.path / "results.json" if results.task == "motion" else results.path
+    file = results.path / "results.json" if results.task in FOLDER_TASKS else results.path
     copy = pickle.dumps(results)
     results.check()
     file.write_bytes(file.read_bytes().replace(b'"meta": {}', b'"meta": {"a": 1}'))
@@ -344,8 +361,8 @@ def test_a_change_is_noticed(results: Results) -> None:
     )
 
 
-def count_entries(results: Results, token: str) -> int:
-    return len(results.prediction(token))
+def describe(results: Results, token: str) -> str:
+    return repr(results.prediction(token))
 
 
 def test_the_fingerprint_changes_with_any_cell(tmp_path: Path) -> None:

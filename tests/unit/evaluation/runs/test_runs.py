@@ -72,12 +72,14 @@ EXPECTED_PROTOCOLS = {
     "motion": ("released", "paper"),
     "accident": ("released", "paper", "boxes"),
     "detection": ("released", "released_iou", "paper", "opencood"),
+    "tracking": ("clean", "nuscenes"),
     "warning": ("clean", "field"),
     "planning": (
         *("clean", "uniad", "stp3", "vad", "bev_planner"),
         *("uniad_own_box", "stp3_own_box", "vad_own_box", "bev_planner_own_box"),
     ),
     "forecasting": ("clean",),
+    "segmentation": ("clean", "onebev"),
 }
 
 

@@ -57,8 +57,8 @@ class TestSetup:
                 {"task": "motions"},
                 ChoiceError,
                 (
-                    r"task: expected one of motion, accident, detection, warning, "
-                    r"planning, forecasting, found 'mo"
+                    r"task: expected one of motion, accident, detection, tracking, warning, "
+                    r"planning, forecasting, segmentation, found 'mo"
                 ),
             ),
             (

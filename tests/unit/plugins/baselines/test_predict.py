@@ -23,6 +23,7 @@ from deepaccident_devkit.evaluation import (
 )
 from deepaccident_devkit.evaluation.accident import accident_context
 from deepaccident_devkit.evaluation.results import read_results
+from deepaccident_devkit.evaluation.tracking import TrackingEvaluator
 from deepaccident_devkit.geometry import Boxes
 from deepaccident_devkit.motion import MotionLabelConfig
 from deepaccident_devkit.plugins.baselines import (
@@ -38,6 +39,7 @@ from deepaccident_devkit.plugins.baselines import (
     predict_motion,
     predict_plan,
     predict_results,
+    predict_tracks,
     seen_actors,
 )
 from deepaccident_devkit.plugins.baselines.predict import accidents_ahead
@@ -259,6 +261,20 @@ def test_paths_in_files_look_three_seconds_ahead_at_least(
         assert {len(forecast.times) for forecast in forecasts} == {steps}
 
 
+def test_tracks_of_what_an_agent_sees_are_perfect_for_its_own_truth(
+    da_hidden: DeepAccident, tokens: list[str]
+) -> None:
+    evaluator = TrackingEvaluator(truth="own")
+    for token in tokens:
+        truth = evaluator.truth(da_hidden, token)
+        evaluator.update(token, predict_tracks(da_hidden, token), *truth)
+
+    result = evaluator.compute()
+
+    assert result.pooled["hota"] == pytest.approx(1.0)
+    assert result.pooled["id_switches"] == 0
+
+
 def test_an_unknown_task_and_an_impossible_horizon_are_refused(
     da_hidden: DeepAccident, tokens: list[str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -268,7 +284,7 @@ def test_an_unknown_task_and_an_impossible_horizon_are_refused(
             lambda: predict_results(da_hidden, "warning", tokens, out),
             ChoiceError,
             (
-                "task: expected one of motion, accident, detection, planning, "
+                "task: expected one of motion, accident, detection, tracking, planning, "
                 "forecasting, found 'warning'"
             ),
         ),
