@@ -39,7 +39,7 @@ _MAX_LISTED_NAMES = 3
 _PATHS_WITHOUT_INTERVAL = (
     "false_recordings",
     *("within/*/distance", "threshold", "best_f1", "quiet", "quiet_braking"),
-    "median_*",
+    *("median_*", "id_switches", "fragments", "mostly_tracked"),
 )
 # Range of a number without limits.
 _NO_LIMITS = (-math.inf, math.inf)

@@ -22,7 +22,7 @@ from deepaccident_devkit.evaluation.tracking.result import TrackingResult, mean_
 from deepaccident_devkit.evaluation.tracking.truth import TrackingTruth, tracking_truth
 from deepaccident_devkit.evaluation.truth import recorded_past
 from deepaccident_devkit.geometry import Boxes
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray
+from deepaccident_devkit.support.arrays import AnyArray
 from deepaccident_devkit.taxonomy import FRAME_PERIOD
 
 _Protocol = CleanTracking | NuScenesTracking
@@ -127,8 +127,8 @@ class TrackingEvaluator(Evaluator[TrackingResult]):
                 f"{token}: tracks in frame {tracks.frame!r}, truth in {truth.boxes.frame!r}; "
                 "transform both to 'world'"
             )
-        is_true = self._is_counted(truth.boxes, truth)
-        is_tracked = self._is_counted(tracks, truth)
+        is_true = self.protocol.counts(truth.boxes, truth)
+        is_tracked = self.protocol.counts(tracks, truth)
         return {
             "recording": recording,
             "frame": int(frame),
@@ -137,11 +137,6 @@ class TrackingEvaluator(Evaluator[TrackingResult]):
                 tracks.select(is_tracked), prediction.ids[is_tracked], prediction.scores[is_tracked]
             ),
         }
-
-    def _is_counted(self, boxes: Boxes, truth: TrackingTruth) -> BoolArray:
-        """Return which boxes in the world are in range and have a class, (N,)."""
-        frame = self.protocol.frame
-        return self.protocol.counts(boxes.transform(truth.world_from_agent.inverse(), frame))
 
     def _rows(self, boxes: Boxes, ids: AnyArray, scores: AnyArray | None = None) -> list[list[Any]]:
         """Return [id, class, x, y, score] of each box; a true box has the score 0."""
@@ -161,8 +156,8 @@ class TrackingEvaluator(Evaluator[TrackingResult]):
         counts = self._count_sample(token, tracks, true)
         (recording,) = recordings_of([counts], len(self.protocol.classes))
         matches = self.protocol.matches(recording)
-        true_rows = np.flatnonzero(self._is_counted(true.boxes, true))
-        track_rows = np.flatnonzero(self._is_counted(tracks.boxes, true))
+        true_rows = np.flatnonzero(self.protocol.counts(true.boxes, true))
+        track_rows = np.flatnonzero(self.protocol.counts(tracks.boxes, true))
         # the index of an id is its position among the ids that count
         found_ids = recording.truth.id_index[matches.truth]
         found = true_rows[np.argsort(true.boxes.actor_id[true_rows])][found_ids]

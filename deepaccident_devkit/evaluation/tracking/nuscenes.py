@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Final, Literal, get_args
 
@@ -21,7 +21,7 @@ from deepaccident_devkit.evaluation.tracking.recordings import (
     matched,
 )
 from deepaccident_devkit.evaluation.tracking.truth import Shape, TrackingRules, TruthSource
-from deepaccident_devkit.support.arrays import BoolArray, FloatArray, check_minima
+from deepaccident_devkit.support.arrays import FloatArray, check_minima
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES
 
@@ -87,98 +87,97 @@ class NuScenesTracking(TrackingRules):
         scores = _PAIR_SCORE - pairs.distance
         return pairs[matched(recording, pairs, scores, _CONTINUED_BONUS)]
 
-    def summed(self, recording: Recording) -> ScoredTracks:
-        """Return the recording without gaps, from which all numbers follow."""
+    def summed(self, recording: Recording) -> tuple[ScoredTracks, ...]:
+        """Return the tracks of each class, without gaps, from which all numbers follow."""
         truth = _filled(recording.truth, recording, self.interpolation)
         tracks = _filled(recording.tracks, recording, self.interpolation)
-        return ScoredTracks(replace(recording, truth=truth, tracks=tracks), self)
+        filled = replace(recording, truth=truth, tracks=tracks)
+        return tuple(ScoredTracks(filled, index, self) for index in range(len(self.classes)))
 
     def numbers(
-        self, summaries: Sequence[ScoredTracks]
+        self, summaries: Sequence[Sequence[ScoredTracks]]
     ) -> tuple[dict[str, dict[str, float]], dict[str, float]]:
         """Compute the numbers of each class from the tracks of recordings."""
         classes = {}
         for index, (name, _) in enumerate(self.classes):
-            classes[name] = self._numbers(summaries, index)
+            classes[name] = self._numbers([tracks[index] for tracks in summaries])
         return classes, {}
 
-    def _numbers(self, summaries: Sequence[ScoredTracks], index: int) -> dict[str, float]:
+    def _numbers(self, recordings: Sequence[ScoredTracks]) -> dict[str, float]:
         """Compute the numbers of a class; most are those at the score with the best MOTA."""
-
-        def numbers_at(threshold: float) -> dict[str, float]:
-            sums = np.zeros(len(_SUMS))
-            for tracks in summaries:
-                sums += tracks.sums(index, threshold)
-            return _numbers_of(dict(zip(_SUMS, sums.tolist(), strict=True)))
-
-        best = numbers_at(np.inf) | _WORST | {"motp": float(self.distance)}
-        truths = int(best["true_boxes"])
-        scores = np.concatenate([[], *(tracks.match_scores(index) for tracks in summaries)])
-        levels = [numbers_at(threshold) for threshold in self._thresholds(scores, truths)]
+        truths = sum(tracks.true_boxes for tracks in recordings)
+        scores = np.concatenate([[], *(tracks.match_scores for tracks in recordings)])
+        thresholds = np.append(self._thresholds(scores, truths), np.inf)
+        sums = np.zeros((len(thresholds), len(_SUMS)))
+        for tracks in recordings:
+            sums += tracks.sums(thresholds)
+        rows = [dict(zip(_SUMS, row, strict=True)) for row in sums.tolist()]
+        *levels, nothing = map(_numbers_of, rows)
+        best = nothing
         if levels:
             best = max(levels, key=itemgetter("mota"))  # the first one, with the highest recall
+        elif truths:
+            best = nothing | _WORST | {"motp": float(self.distance)}
         unreached = self.recalls - len(levels)
         motp = sum(numbers["motp"] for numbers in levels) + unreached * self.distance
         amota = sum(numbers["motar"] for numbers in levels) / self.recalls
         best |= {"amota": amota, "amotp": motp / self.recalls}
         if not truths:
-            best = dict.fromkeys(best, np.nan) | {"true_boxes": 0}
+            best |= {name: np.nan for name, value in best.items() if not isinstance(value, int)}
         return best
 
-    def _thresholds(self, scores: FloatArray, truths: int) -> list[float]:
+    def _thresholds(self, scores: FloatArray, truths: int) -> FloatArray:
         """Return the ascending scores at which matches with scores (M,) reach levels of recall."""
         if not len(scores):
-            return []
+            return scores
         recalls = np.arange(1, len(scores) + 1) / truths
         levels = np.linspace(self.min_recall, 1, self.recalls).round(12)
         thresholds = np.interp(levels, recalls, np.sort(scores)[::-1])
-        reached: list[float] = thresholds[levels <= recalls[-1]][::-1].tolist()
-        return reached
+        return np.asarray(thresholds[levels <= recalls[-1]][::-1])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class ScoredTracks:
-    """A recording without gaps; sums at a score are computed once.
+    """The tracks of one class in a recording without gaps; sums at a score are computed once.
 
     Attributes:
-        recording: Recording whose tracked boxes have the score of their track.
-        rules: Rules of the matches.
-        known: Class and number of its boxes with at least a score → sums.
+        true_boxes: Number of true boxes of the class.
+        match_scores: (M,) scores of the matches without a change of identity, if all tracks count.
     """
 
-    recording: Recording
-    rules: NuScenesTracking
-    known: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
+    def __init__(self, recording: Recording, class_index: int, rules: NuScenesTracking) -> None:
+        """Select the class, and match all of its tracks."""
+        tracks = recording.tracks[recording.tracks.class_index == class_index]
+        truth = recording.truth[recording.truth.class_index == class_index]
+        self._recording = replace(recording, truth=truth, tracks=tracks)
+        self._class_index = class_index
+        self._rules = rules
+        self._scores = np.sort(tracks.score)
+        self._sums = np.full((len(tracks) + 1, len(_SUMS)), np.nan)
+        matches = rules.matches(self._recording)
+        self.true_boxes = len(truth)
+        self.match_scores = tracks.score[matches.track[~is_switch(self._recording, matches)]]
 
-    def match_scores(self, class_index: int) -> FloatArray:
-        """Return the scores of a class's matches without a change of identity, if all count."""
-        tracks = self.recording.tracks
-        recording = replace(self.recording, tracks=tracks[tracks.class_index == class_index])
-        matches = self.rules.matches(recording)
-        is_same = ~is_switch(recording, matches)
-        return np.asarray(recording.tracks.score[matches.track[is_same]])
+    def sums(self, thresholds: FloatArray) -> FloatArray:
+        """Return `_SUMS` of the tracks with at least each score (R,), shape (R, 13)."""
+        counts = len(self._scores) - np.searchsorted(self._scores, thresholds)
+        for count in np.unique(counts[np.isnan(self._sums[counts, 0])]).tolist():
+            lowest = np.append(self._scores, np.inf)[-1 - count]
+            self._sums[count] = exact_sum(self._compute_sums(lowest))
+        return np.asarray(self._sums[counts])
 
-    def sums(self, class_index: int, threshold: float) -> FloatArray:
-        """Return `_SUMS` of a class's tracks with at least this score, shape (13,)."""
-        tracks = self.recording.tracks
-        counts = (tracks.score >= threshold) & (tracks.class_index == class_index)
-        key = (class_index, int(counts.sum()))
-        if key not in self.known:
-            self.known[key] = exact_sum(self._compute_sums(class_index, counts))
-        return self.known[key]
-
-    def _compute_sums(self, class_index: int, counts: BoolArray) -> FloatArray:
-        """Compute `_SUMS` of the tracked boxes of a class that count, a mask (N,)."""
-        recording = replace(self.recording, tracks=self.recording.tracks[counts])
-        matches = self.rules.matches(recording)
+    def _compute_sums(self, threshold: float) -> FloatArray:
+        """Compute `_SUMS` of the tracks with at least a score."""
+        tracks = self._recording.tracks
+        recording = replace(self._recording, tracks=tracks[tracks.score >= threshold])
+        matches = self._rules.matches(recording)
         has_box = recording.sizes(recording.truth) + recording.sizes(recording.tracks) > 0
         frames = recording.positions(has_box)  # samples without any box do not count
-        keys = recording.key(recording.truth)
-        order = np.zeros(len(keys), dtype=np.int64)
+        actors = recording.truth.id_index
+        order = np.zeros(len(actors), dtype=np.int64)
         delays = []
         gaps = []
-        for actor in np.unique(keys[recording.truth.class_index == class_index]):
-            rows = np.flatnonzero(keys == actor)
+        for actor in np.unique(actors):
+            rows = np.flatnonzero(actors == actor)
             order[rows] = np.arange(len(rows))
             matched_rows = rows[np.isin(rows, matches.truth)]
             if len(matched_rows):
@@ -186,10 +185,9 @@ class ScoredTracks:
                 unmatched = np.diff([ends[0], *frames[matched_rows], ends[1]]) - 1
                 delays.append(unmatched[0])
                 gaps.append(unmatched.max())
-        sums = match_sums(recording, matches, order, _MOSTLY_TRACKED)[class_index]
-        frame_count = has_box.reshape(-1, recording.class_count)[:, class_index].sum()
+        sums = match_sums(recording, matches, order, _MOSTLY_TRACKED)[self._class_index]
         times = [_SAMPLE_PERIOD * sum(delays), _SAMPLE_PERIOD * sum(gaps)]
-        return np.array([*sums, frame_count, *times, len(delays)])
+        return np.array([*sums, has_box.sum(), *times, len(delays)])
 
 
 def _numbers_of(sums: dict[str, float]) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import chain, groupby, pairwise
 from operator import itemgetter
 from typing import Any, Final, TypeAlias
 
@@ -84,13 +84,13 @@ class Recording:
         """Return the pairs of each group that are nearer than a distance, metres."""
         sizes = self.sizes(self.tracks)
         groups = self.group(self.truth)
-        first_tracks = (np.cumsum(sizes) - sizes)[groups]
+        # all pairs of a group: each true box is repeated, and its tracks are counted up
         truth = np.repeat(np.arange(len(groups)), sizes[groups])
         first_pairs = np.cumsum(sizes[groups]) - sizes[groups]
+        first_tracks = (np.cumsum(sizes) - sizes)[groups]
         track = np.arange(len(truth)) + (first_tracks - first_pairs)[truth]
         x = self.truth.x[truth] - self.tracks.x[track]
         y = self.truth.y[truth] - self.tracks.y[track]
-        columns = [truth, track, np.sqrt(x**2 + y**2)]
         columns = [truth, track, np.sqrt(x**2 + y**2)]
         pairs: Table = np.rec.fromarrays(columns, dtype=_PAIR)
         return pairs[pairs.distance < distance]
@@ -111,12 +111,11 @@ def recordings_of(counts: Collection[Counts], class_count: int) -> Iterator[Reco
 
 def _table(samples: Sequence[Sequence[Sequence[Any]]]) -> Table:
     """Join the boxes of all samples, each a list of [id, class, x, y, score]."""
-    ids = [row[0] for rows in samples for row in rows]
-    order = {name: index for index, name in enumerate(sorted(set(ids)))}
-    numbers = np.array([row[1:] for rows in samples for row in rows], dtype=np.float64)
-    classes, *columns = numbers.reshape(-1, 4).T
-    frames = np.repeat(np.arange(len(samples)), [len(rows) for rows in samples])
-    id_index = np.array([order[name] for name in ids], dtype=np.int64)
+    rows = list(chain.from_iterable(samples))
+    ids = np.array([row[0] for row in rows], dtype=object)
+    _, id_index = np.unique(ids, return_inverse=True)
+    classes, *columns = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 4).T
+    frames = np.repeat(np.arange(len(samples)), list(map(len, samples)))
     return in_order(np.rec.fromarrays([frames, classes, id_index, *columns], dtype=_BOX))
 
 

@@ -8,25 +8,27 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import ClassVar
 
+from deepaccident_devkit.evaluation.evaluator import ratio
 from deepaccident_devkit.evaluation.task import Row, TaskResult
 
 # Numbers of any protocol; headlines in the order of tables.
+_SHARES = ("hota", "amota", "det_a", "ass_a", "idf1")
+_OTHER_SHARES = (
+    *("loc_a", "det_re", "det_pr", "ass_re", "ass_pr", "motp_similarity"),
+    *("id_recall", "id_precision", "recall", "motar"),
+)
+# Headlines are floats, other counts are integers.
+_COUNTS = ("id_switches", "fragments", "mostly_tracked")
 _COLUMNS = (
-    Row("hota", "share", "higher"),
-    Row("amota", "share", "higher"),
-    Row("amotp", "m"),
-    Row("det_a", "share", "higher"),
-    Row("ass_a", "share", "higher"),
-    Row("loc_a", "share", "higher", is_headline=False),
+    *(Row(name, "share", "higher") for name in _SHARES),
     Row("mota", "share", "higher", is_signed=True),
-    Row("motp", "m"),
-    Row("idf1", "share", "higher"),
-    Row("id_switches", "count"),
-    Row("fragments", "count"),
-    Row("mostly_tracked", "count", "higher"),
+    *(Row(name, "m") for name in ("amotp", "motp")),
+    *(Row(name, "count") for name in _COUNTS[:2]),
+    Row(_COUNTS[2], "count", "higher"),
+    *(Row(name, "share", "higher", is_headline=False) for name in _OTHER_SHARES),
     Row("moda", "share", "higher", is_signed=True, is_headline=False),
-    Row("tid", "s", is_headline=False),
-    Row("lgd", "s", is_headline=False),
+    Row("faf", "count", is_headline=False),
+    *(Row(name, "s", is_headline=False) for name in ("tid", "lgd")),
 )
 
 
@@ -63,11 +65,11 @@ def mean_of_classes(classes: Mapping[str, Mapping[str, float]]) -> dict[str, flo
         classes: Class → name → number; counts are integers.
     """
     with_truth = [numbers for numbers in classes.values() if numbers["true_boxes"]]
-    mean = {}
+    mean: dict[str, float] = {}
     for name in dict.fromkeys(chain.from_iterable(classes.values())):
         values = [numbers[name] for numbers in with_truth if not math.isnan(numbers[name])]
-        if values and all(isinstance(value, int) for value in values):
-            mean[name] = sum(values)
+        if any(isinstance(numbers[name], int) for numbers in classes.values()):
+            mean[name] = float(sum(values)) if name in _COUNTS else sum(values)
         else:
-            mean[name] = math.fsum(values) / len(values) if values else math.nan
+            mean[name] = ratio(math.fsum(values), len(values))
     return mean

@@ -12,7 +12,7 @@ from deepaccident_devkit.errors import ConfigError, NotAvailableError
 from deepaccident_devkit.evaluation.predicted_boxes import check_classes
 from deepaccident_devkit.evaluation.task import as_tuples
 from deepaccident_devkit.geometry import SE3, Boxes
-from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ShortRepr
+from deepaccident_devkit.support.arrays import AnyArray, BoolArray, ShortRepr, check_minima
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x.cooperation import visible_actors
@@ -42,8 +42,8 @@ class TrackingRules:
         class_of_instance: Whether a true box has the category of its instance; otherwise it has
             that of the label at the moment.
         frame: Frame around which the range lies, `lidar` or `ego`.
-        shape: Shape of the range: `square` for |x| and |y| of at most the range, `circle` for a
-            distance on the ground below it.
+        shape: Shape of the range: `square` for |x| and |y| of at most the range in the frame,
+            `circle` for a distance in the world's x and y below it.
         ranges: Range of each class, metres; centres of true and tracked boxes beyond it do not
             count. A single number is for all classes.
         distance: Distance between centres on the ground at which two boxes are no longer near,
@@ -75,8 +75,7 @@ class TrackingRules:
                 f"ranges: expected a positive number, or one for each of {len(self.classes)} "
                 f"classes, found {self.ranges}"
             )
-        if not self.distance > 0:
-            raise ConfigError(f"distance: expected a positive number, found {self.distance}")
+        check_minima(self, distance=0)
 
     def class_index(self, category: AnyArray) -> AnyArray:
         """Return the index of the class of each category (N,), shape (N,); −1 for none."""
@@ -86,14 +85,16 @@ class TrackingRules:
                 index_by_category[CATEGORIES.index(name)] = index
         return index_by_category[category]
 
-    def counts(self, boxes: Boxes) -> BoolArray:
-        """Return which boxes, in the frame of the rules, have a class and are in range, (N,)."""
+    def counts(self, boxes: Boxes, truth: TrackingTruth) -> BoolArray:
+        """Return which boxes in the world have a class and are in range of the agent, (N,)."""
         classes = self.class_index(boxes.category)
         limits = np.broadcast_to(self.ranges, len(self.classes))[classes]
-        x, y = np.abs(boxes.center[:, :2].T)
+        pose = truth.world_from_agent
         if self.shape == "square":
-            is_near = np.maximum(x, y) <= limits
+            in_frame = np.abs(pose.inverse().apply(boxes.center))
+            is_near = in_frame[:, :2].max(axis=1, initial=0) <= limits
         else:
+            x, y, _ = (boxes.center - pose.translation).T
             is_near = np.hypot(x, y) < limits
         return np.asarray(is_near & (classes >= 0))
 

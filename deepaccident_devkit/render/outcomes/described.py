@@ -174,10 +174,13 @@ def _number_words(evaluator: Evaluator[Any], token: str, prediction: Any, *truth
     for number in headlines(evaluator.compute([token])):
         if number.value is None or not np.isfinite(number.value):
             continue
-        words = f"{metric_name(number.name)} {value_text(number.value, number.unit)}"
+        name, _, detail = metric_name(number.name).partition(", ")
+        if detail:
+            name = f"{name} ({detail})"
+        words = f"{name} {value_text(number.value, number.unit)}"
         if number.path in evaluator.main_numbers:
             main_words.append(words)
         else:
             other_words.append(words)
     shown_words = main_words or other_words[:_OTHER_NUMBERS]
-    return "; ".join(shown_words) or "no numbers for this sample"
+    return "; ".join(shown_words) or "nothing counts in this sample"

@@ -231,7 +231,7 @@ def best_camera_of_drawing(dataset: Dataset, sample: str, drawing: Drawing) -> s
 
 
 def drawing_handles(drawing: Drawing) -> list[Artist]:
-    """Return a legend's handles, one for each label."""
+    """Return a legend's handles, one for each label of something that is drawn."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -244,12 +244,16 @@ def drawing_handles(drawing: Drawing) -> list[Artist]:
             handle = Line2D([], [], color=color, linewidth=_line_width(path.role))
         handles[path.label] = handle
     for boxes in drawing.boxes:
+        if not len(boxes.boxes):
+            continue
         color = _edge_color(boxes.role)
         fill = _FILLS.get(boxes.role, _BOX_OPACITY)
         handles[boxes.label] = Patch(
             facecolor=(color, fill), edgecolor=color, **_line_style(boxes.role)
         )
     for cells in _without_found(drawing.cells):
+        if not cells.instance.any():
+            continue
         color = _cell_color(cells.role)
         handle = Patch(facecolor=(color, _CELL_OPACITY), edgecolor=color)
         if cells.role == "missed":
