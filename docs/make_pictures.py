@@ -183,7 +183,7 @@ def save_pages(served: Served, explorer: Explorer) -> None:
         "twin": (
             f"{scenario}/twin",
             "",
-            "[...document.querySelectorAll('iframe')].every((each) => each.contentWindow.go)",
+            "[...document.querySelectorAll('iframe')].every((each) => each.contentDocument.querySelector('canvas[data-view]'))",
         ),
         "moment": (f"{scenario}/moment/ego_vehicle/30", "", "document.images[0].naturalWidth"),
         "model": ("model/ego_alone/", "", COMPUTED),

@@ -187,5 +187,8 @@ def drawn_matches(
         )
         for role, rows in predicted_rows.items()
     ]
-    counts = [f"{len(part.boxes)} {part.label}" for part in (*drawn, *true) if part.role != "truth"]
+    counts = []
+    for part in (*drawn, *true):
+        if part.role != "truth":
+            counts.append(f"{len(part.boxes)} {part.label}")
     return Drawing(boxes=(true[0], *drawn, true[1]), words=", ".join(counts))

@@ -581,7 +581,8 @@ def sightings(dataset: Dataset, scenario: str, agent: str, actor_id: int) -> Sig
         if len(box):
             is_seen = actor_id in visible_actors(dataset, sample, agents=[agent])
             rows.append((frame, box.num_lidar_pts[0], box.camera_visible[0], is_seen))
-    index, points, camera, seen = np.array(rows, dtype=np.int64).reshape(-1, 4).T
+    columns = np.array(rows, dtype=np.int64).reshape(-1, 4).T
+    index, points, camera, seen = columns
     return Sightings(
         agent=agent,
         index=index,

@@ -167,7 +167,8 @@ def beside_twin(dataset: Dataset, scenario: RowArgument) -> Beside:
     """
     accident, recording, twin = twin_recordings(dataset, scenario)
     shift = shift_of(recording, twin)
-    matches = matched_rows(recording, shifted_recording(twin, shift))
+    shifted_twin = shifted_recording(twin, shift)
+    matches = matched_rows(recording, shifted_twin)
     twin_ids = {
         recording.actor_id[row]: twin.actor_id[other] for row, (other, _) in matches.items()
     }

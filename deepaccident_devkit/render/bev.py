@@ -353,12 +353,13 @@ def _draw_boxes(
     boxes = boxes.select(is_shown)
     colors = role_colors(dataset, record, boxes)
     if "trajectories" in layers:
+        world_from_target = dataset.world_from(record, view.frame)
         draw_trails(
             dataset,
             record,
             boxes,
             colors,
-            target_from_world=dataset.world_from(record, view.frame).inverse(),
+            target_from_world=world_from_target.inverse(),
             seconds=view.seconds,
             ax=ax,
         )

@@ -50,7 +50,8 @@ def hidden_points_filter(
     sample = dataset.get("sample_data", camera)["sample_token"]
     if has_cloud(dataset, sample):
         own_points = map_pointcloud_to_image(dataset, camera, colors=False)
-        np.maximum.at(depths, find_cells(own_points), own_points.depth[own_points.mask])
+        own_depths = own_points.depth[own_points.mask]
+        np.maximum.at(depths, find_cells(own_points), own_depths)
     for rows in (depths, depths[::-1]):
         for row_before, row in pairwise(rows):
             np.copyto(row, row_before, where=row == 0)

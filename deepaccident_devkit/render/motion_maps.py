@@ -368,7 +368,8 @@ def _draw_picture(
     else:
         vectors = maps.vectors(name)[frame]
         left, forward = np.nan_to_num(vectors)
-        colors = direction_colors(left, forward, longest=maps.longest(name))
+        longest = maps.longest(name)
+        colors = direction_colors(left, forward, longest=longest)
         colors[np.isnan(vectors[0])] = 1.0
         draw_cells(ax, colors, maps.grid)
 

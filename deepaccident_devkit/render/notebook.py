@@ -50,7 +50,8 @@ def png_of(thing: object) -> bytes:
 
 def _draw_boxes(boxes: Boxes, ax: Axes) -> None:
     _name_axes(boxes.frame, ax)
-    step = -(-len(boxes) // _MAX_BOXES)
+    box_count = len(boxes)
+    step = -(-box_count // _MAX_BOXES)
     shown_boxes = boxes[::step]
     if boxes.frame in CAMERAS:
         shown_boxes = shown_boxes.transform(_LEVEL_FROM_OPTICAL, "ego")

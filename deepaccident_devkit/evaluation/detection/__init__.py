@@ -162,13 +162,13 @@ class DetectionEvaluator(Evaluator[DetectionResult]):
         )
         counts = self._count(token, prediction, true_boxes)
         precision = self.result_of([counts]).mean_average_precision
-        limit = f"overlap {matches.threshold:g}"
+        limit = f"with an overlap of {matches.threshold:g}"
         if self.protocol.measure.startswith("distance"):
-            limit = f"{matches.threshold:g} m"
+            limit = f"within {matches.threshold:g} m"
         return replace(
             drawing,
             boxes=(*drawing.boxes, *drawn_pair(dataset, token, frame)),
-            words=f"mAP of this sample {precision:.1f} %; boxes are matched at {limit}",
+            words=f"mAP of this sample {precision:.1f} %; boxes match {limit}",
         )
 
     def result_of(self, counts: Collection[Counts]) -> DetectionResult:

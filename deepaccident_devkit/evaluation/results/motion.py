@@ -139,7 +139,8 @@ class MotionEncoder:
         """Return a prediction's arrays by name; raise ResultsError if they cannot be stored."""
         output = self._check_output(prediction)
         arrays = self._make_arrays(output)
-        predictions, frames = next(iter(arrays.values())).shape[:2]
+        first_array = next(iter(arrays.values()))
+        predictions, frames = first_array.shape[:2]
         if self.form is not None and self.form.frames != frames:
             raise ResultsError(
                 f"expected {self.form.frames} frames, as in earlier samples, found {frames}"

@@ -293,7 +293,8 @@ def _parse(content: bytes, path: Path) -> Contents:
     except (ContentError, OSError) as error:
         raise fault_of(path, error) from error
     prediction = partial(make_prediction, entries)
-    return EntryContents(document.task, meta, entries.number.keys(), prediction)
+    tokens = entries.number.keys()
+    return EntryContents(document.task, meta, tokens, prediction)
 
 
 @contextmanager

@@ -214,7 +214,8 @@ def _check_members(archive: zipfile.ZipFile, shard: Shard, form: Form) -> None:
     """Raise ContentError if an archive has unknown or repeated members."""
     tokens = set(shard.tokens)
     file_names = {f"{name}.npy" for name in (*form.array_layout(), *NOT_READ)}
-    for member, count in Counter(archive.namelist()).items():
+    counts = Counter(archive.namelist())
+    for member, count in counts.items():
         token, _, file_name = member.rpartition("/")
         if token not in tokens or file_name not in file_names:
             raise ContentError(

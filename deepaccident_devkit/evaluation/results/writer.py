@@ -237,7 +237,8 @@ class ResultsWriter:
         with _naming_results(self.path):
             may_exist = self.task in FOLDER_TASKS and self.path.is_dir()
             is_empty = may_exist and not any(self.path.iterdir())
-            if not is_empty and (self.path.exists() or self.path.is_symlink()):
+            exists = self.path.exists() or self.path.is_symlink()
+            if exists and not is_empty:
                 raise ResultsError(
                     f"{self.path}: already exists{self._existing_notes_text()}; choose another "
                     "path, or remove it"

@@ -27,7 +27,9 @@ from deepaccident_devkit.support.arrays import AnyArray, BoolArray
 from deepaccident_devkit.support.text import settle_choices
 
 # Name of a range → side length, in metres, of the square around the ego in which cells count.
-RANGES: Final[Mapping[str, float]] = MappingProxyType({"30x30": 30.0, "100x100": 100.0, "all": 1e9})
+SEGMENTED_RANGES: Final[Mapping[str, float]] = MappingProxyType(
+    {"30x30": 30.0, "100x100": 100.0, "all": 1e9}
+)
 ClassSet = Literal["bev5", "camera"]
 CLASS_SETS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {"bev5": BEV_CLASSES, "camera": CAMERA_CLASSES}
@@ -208,7 +210,7 @@ class SegmentationEvaluator(Evaluator[SegmentationResult]):
         if self.protocol.absent_is_zero:
             best_percents = np.nan_to_num(best_percents)
         ranges = {}
-        for name, values in zip(RANGES, best_percents.tolist(), strict=True):
+        for name, values in zip(SEGMENTED_RANGES, best_percents.tolist(), strict=True):
             iou = dict(zip(CLASS_SETS[self.protocol.classes], values, strict=True))
             present = [value for value in values if not math.isnan(value)]
             ranges[name] = {"miou": ratio(math.fsum(present), len(present)), "iou": iou}
@@ -217,7 +219,7 @@ class SegmentationEvaluator(Evaluator[SegmentationResult]):
     def pooled(self, counts: Collection[Counts]) -> list[Counts]:
         """Sum the counts; the list has a single entry, whose cells are an array."""
         num_classes = len(CLASS_SETS[self.protocol.classes])
-        shape = (len(self.protocol.thresholds), len(RANGES), 3, num_classes)
+        shape = (len(self.protocol.thresholds), len(SEGMENTED_RANGES), 3, num_classes)
         cells = np.zeros(shape, dtype=np.int64)
         for sample in counts:
             cells += sample["cells"]
@@ -254,7 +256,7 @@ def compared_masks(
 
 
 def count_cells(predicted: BoolArray, true: BoolArray, grid: BevGrid) -> list[list[list[int]]]:
-    """Count the cells of C classes in each of `RANGES`.
+    """Count the cells of C classes in each of `SEGMENTED_RANGES`.
 
     Args:
         predicted: (C, H, W) predicted masks, without unknown cells.
@@ -266,7 +268,7 @@ def count_cells(predicted: BoolArray, true: BoolArray, grid: BevGrid) -> list[li
     """
     layers = (predicted & true, predicted, true)
     counts = []
-    for extent in RANGES.values():
+    for extent in SEGMENTED_RANGES.values():
         in_range = cells_within(grid, extent)
         counts_in_range = []
         for masks in layers:

@@ -157,7 +157,8 @@ def _checked_scores(scores: AnyArray) -> AnyArray:
     """Return scores as floats; raise GeometryError unless all of them are in [0, 1]."""
     if scores.dtype == np.uint8:
         return scores.astype(np.float32) / _MAX_BYTE
-    low, high = scores.min(initial=1), scores.max(initial=0)
+    low = scores.min(initial=1)
+    high = scores.max(initial=0)
     if scores.dtype.kind != "f" or not (low >= 0 and high <= 1):
         raise GeometryError(
             "scores: expected finite floats from 0 to 1, or uint8 from 0 to 255, found "

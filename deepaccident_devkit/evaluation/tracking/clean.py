@@ -10,8 +10,8 @@ import numpy as np
 
 from deepaccident_devkit.evaluation.tracking.recordings import (
     MATCH_SUMS,
-    Recording,
-    Table,
+    BoxRows,
+    TrackedRecording,
     exact_sum,
     match_sums,
     matched,
@@ -47,7 +47,7 @@ class CleanTracking(TrackingRules):
         hota = f"for HOTA within {self.distance:g} m"
         return f"{TrackingRules.words(self)}; match: within {limit:g} m, {hota}"
 
-    def matches(self, recording: Recording) -> Table:
+    def matches(self, recording: TrackedRecording) -> BoxRows:
         """Return the matches of the CLEAR numbers, preferably those of the preceding sample."""
         pairs = recording.near_pairs(self.distance)
         similarity = 1 - pairs.distance / self.distance
@@ -56,7 +56,7 @@ class CleanTracking(TrackingRules):
         position = _paired_positions(recording)
         return near[matched(recording, near, similarity[is_near], _CONTINUED_BONUS, position)]
 
-    def summed(self, recording: Recording) -> FloatArray:
+    def summed(self, recording: TrackedRecording) -> FloatArray:
         """Return the sums of each class, from which all numbers follow, (C, S)."""
         pairs = recording.near_pairs(self.distance)
         similarity = 1 - pairs.distance / self.distance
@@ -121,7 +121,7 @@ class CleanTracking(TrackingRules):
         return numbers | {name: int(value) for name, value in counts.items()}
 
 
-def _paired_positions(recording: Recording) -> IntArray:
+def _paired_positions(recording: TrackedRecording) -> IntArray:
     """Return the position of each true box among the samples with truth and tracks of its class.
 
     As in TrackEval, samples without one of the two end no pair.
@@ -130,7 +130,7 @@ def _paired_positions(recording: Recording) -> IntArray:
     return recording.positions(np.minimum(*sizes) > 0)
 
 
-def _identity_sums(recording: Recording, pairs: Table) -> FloatArray:
+def _identity_sums(recording: TrackedRecording, pairs: BoxRows) -> FloatArray:
     """Return the IDTP of each class, (C, 1): the most matches with one track for each actor."""
     from scipy.optimize import linear_sum_assignment
 
@@ -146,7 +146,7 @@ def _identity_sums(recording: Recording, pairs: Table) -> FloatArray:
     return as_floats(matches[:, None])
 
 
-def _hota_sums(recording: Recording, pairs: Table, similarity: FloatArray) -> FloatArray:
+def _hota_sums(recording: TrackedRecording, pairs: BoxRows, similarity: FloatArray) -> FloatArray:
     """Return five sums for each α and class, (C, 95).
 
     The sums are the number of matches, their similarity, and the association, its recall and its

@@ -17,7 +17,7 @@ from deepaccident_devkit.evaluation.predicted_boxes import Tracks, drawn_matches
 from deepaccident_devkit.evaluation.task import switched
 from deepaccident_devkit.evaluation.tracking.clean import CleanTracking
 from deepaccident_devkit.evaluation.tracking.nuscenes import NuScenesTracking
-from deepaccident_devkit.evaluation.tracking.recordings import recordings_of
+from deepaccident_devkit.evaluation.tracking.recordings import tracked_recordings
 from deepaccident_devkit.evaluation.tracking.result import TrackingResult, mean_of_classes
 from deepaccident_devkit.evaluation.tracking.truth import TrackingTruth, tracking_truth
 from deepaccident_devkit.evaluation.truth import recorded_past
@@ -154,7 +154,7 @@ class TrackingEvaluator(Evaluator[TrackingResult]):
         world_from_prediction = dataset.world_from(token, prediction.boxes.frame)
         tracks = prediction.transform(world_from_prediction, "world")
         counts = self._count_sample(token, tracks, true)
-        (recording,) = recordings_of([counts], len(self.protocol.classes))
+        (recording,) = tracked_recordings([counts], len(self.protocol.classes))
         matches = self.protocol.matches(recording)
         true_rows = np.flatnonzero(self.protocol.counts(true.boxes, true))
         track_rows = np.flatnonzero(self.protocol.counts(tracks.boxes, true))
@@ -195,6 +195,6 @@ class TrackingEvaluator(Evaluator[TrackingResult]):
 
     def pooled(self, counts: Collection[Counts]) -> Sequence[Counts]:
         """Summarize whole recordings; the list has a single entry."""
-        recordings = recordings_of(counts, len(self.protocol.classes))
+        recordings = tracked_recordings(counts, len(self.protocol.classes))
         summaries = [self.protocol.summed(recording) for recording in recordings]
         return [{_SUMMARIES: summaries, "samples": len(counts)}]

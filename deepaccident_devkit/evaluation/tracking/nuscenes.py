@@ -12,15 +12,15 @@ import numpy as np
 from deepaccident_devkit.evaluation.evaluator import ratio
 from deepaccident_devkit.evaluation.tracking.recordings import (
     MATCH_SUMS,
-    Recording,
-    Table,
+    BoxRows,
+    TrackedRecording,
+    boxes_in_order,
     exact_sum,
-    in_order,
     is_switch,
     match_sums,
     matched,
 )
-from deepaccident_devkit.evaluation.tracking.truth import Shape, TrackingRules, TruthSource
+from deepaccident_devkit.evaluation.tracking.truth import Shape, TrackedActors, TrackingRules
 from deepaccident_devkit.support.arrays import FloatArray, check_minima
 from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES
@@ -60,7 +60,7 @@ class NuScenesTracking(TrackingRules):
         min_recall: Lowest level of recall.
     """
 
-    truth: TruthSource = "label"
+    truth: TrackedActors = "label"
     classes: tuple[tuple[str, tuple[str, ...]], ...] = _CLASSES
     class_of_instance: bool = True
     frame: Literal["lidar", "ego"] = "ego"
@@ -81,13 +81,13 @@ class NuScenesTracking(TrackingRules):
         gaps = f"gaps: {self.interpolation} interpolation"
         return f"{TrackingRules.words(self)}; match: below {self.distance:g} m; {gaps}"
 
-    def matches(self, recording: Recording) -> Table:
+    def matches(self, recording: TrackedRecording) -> BoxRows:
         """Return the matches of all tracks; a match continues while the two are near."""
         pairs = recording.near_pairs(self.distance)
         scores = _PAIR_SCORE - pairs.distance
         return pairs[matched(recording, pairs, scores, _CONTINUED_BONUS)]
 
-    def summed(self, recording: Recording) -> tuple[ScoredTracks, ...]:
+    def summed(self, recording: TrackedRecording) -> tuple[ScoredTracks, ...]:
         """Return the tracks of each class, without gaps, from which all numbers follow."""
         truth = _filled(recording.truth, recording, self.interpolation)
         tracks = _filled(recording.tracks, recording, self.interpolation)
@@ -144,7 +144,9 @@ class ScoredTracks:
         match_scores: (M,) scores of the matches without a change of identity, if all tracks count.
     """
 
-    def __init__(self, recording: Recording, class_index: int, rules: NuScenesTracking) -> None:
+    def __init__(
+        self, recording: TrackedRecording, class_index: int, rules: NuScenesTracking
+    ) -> None:
         """Select the class, and match all of its tracks."""
         tracks = recording.tracks[recording.tracks.class_index == class_index]
         truth = recording.truth[recording.truth.class_index == class_index]
@@ -213,7 +215,7 @@ def _numbers_of(sums: dict[str, float]) -> dict[str, float]:
     }
 
 
-def _filled(boxes: Table, recording: Recording, interpolation: Interpolation) -> Table:
+def _filled(boxes: BoxRows, recording: TrackedRecording, interpolation: Interpolation) -> BoxRows:
     """Give each box the mean score of its track, and fill the gaps of tracks.
 
     A box in a gap has the class of the next box.
@@ -236,4 +238,4 @@ def _filled(boxes: Table, recording: Recording, interpolation: Interpolation) ->
             values = known[name]
             result[name] = (1 - weight) * values[left] + weight * values[right]
         parts.append(result)
-    return in_order(np.concatenate(parts).view(np.recarray))
+    return boxes_in_order(np.concatenate(parts).view(np.recarray))

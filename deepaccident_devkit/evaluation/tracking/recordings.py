@@ -13,7 +13,7 @@ import numpy as np
 from deepaccident_devkit.evaluation.evaluator import Counts
 from deepaccident_devkit.support.arrays import BoolArray, FloatArray, IntArray
 
-Table: TypeAlias = Any
+BoxRows: TypeAlias = Any
 """A `np.recarray`: boxes of one side, sorted by sample, class and id, or pairs of boxes.
 
 The columns of N boxes are `frame` (index of the sample), `class_index`, `id_index` (in the order of
@@ -42,7 +42,7 @@ _MOSTLY_LOST = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Recording:
+class TrackedRecording:
     """One agent's recording of a scenario. A group is one sample and class.
 
     Attributes:
@@ -54,18 +54,18 @@ class Recording:
 
     frame_number: IntArray
     class_count: int
-    truth: Table
-    tracks: Table
+    truth: BoxRows
+    tracks: BoxRows
 
-    def key(self, boxes: Table) -> IntArray:
+    def key(self, boxes: BoxRows) -> IntArray:
         """Return the index of id and class of each box, shape (N,)."""
         return np.asarray(boxes.id_index * self.class_count + boxes.class_index)
 
-    def group(self, boxes: Table) -> IntArray:
+    def group(self, boxes: BoxRows) -> IntArray:
         """Return the index of the group of each box, shape (N,)."""
         return np.asarray(boxes.frame * self.class_count + boxes.class_index)
 
-    def sizes(self, boxes: Table) -> IntArray:
+    def sizes(self, boxes: BoxRows) -> IntArray:
         """Return the number of boxes in each group, (G,)."""
         group_count = len(self.frame_number) * self.class_count
         return np.bincount(self.group(boxes), minlength=group_count)
@@ -80,7 +80,7 @@ class Recording:
         position = np.cumsum(by_class, axis=0, dtype=np.int64).reshape(-1)
         return np.asarray(position[self.group(self.truth)])
 
-    def near_pairs(self, distance: float) -> Table:
+    def near_pairs(self, distance: float) -> BoxRows:
         """Return the pairs of each group that are nearer than a distance, metres."""
         sizes = self.sizes(self.tracks)
         groups = self.group(self.truth)
@@ -92,16 +92,16 @@ class Recording:
         x = self.truth.x[truth] - self.tracks.x[track]
         y = self.truth.y[truth] - self.tracks.y[track]
         columns = [truth, track, np.sqrt(x**2 + y**2)]
-        pairs: Table = np.rec.fromarrays(columns, dtype=_PAIR)
+        pairs: BoxRows = np.rec.fromarrays(columns, dtype=_PAIR)
         return pairs[pairs.distance < distance]
 
 
-def recordings_of(counts: Collection[Counts], class_count: int) -> Iterator[Recording]:
+def tracked_recordings(counts: Collection[Counts], class_count: int) -> Iterator[TrackedRecording]:
     """Yield the recordings of the samples that `TrackingEvaluator.update` counted, by name."""
     in_order = sorted(counts, key=itemgetter("recording", "frame"))
     for _, group in groupby(in_order, key=itemgetter("recording")):
         samples = list(group)
-        yield Recording(
+        yield TrackedRecording(
             frame_number=np.array([sample["frame"] for sample in samples]),
             class_count=class_count,
             truth=_table([sample["truth"] for sample in samples]),
@@ -109,24 +109,24 @@ def recordings_of(counts: Collection[Counts], class_count: int) -> Iterator[Reco
         )
 
 
-def _table(samples: Sequence[Sequence[Sequence[Any]]]) -> Table:
+def _table(samples: Sequence[Sequence[Sequence[Any]]]) -> BoxRows:
     """Join the boxes of all samples, each a list of [id, class, x, y, score]."""
     rows = list(chain.from_iterable(samples))
     ids = np.array([row[0] for row in rows], dtype=object)
     _, id_index = np.unique(ids, return_inverse=True)
     classes, *columns = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 4).T
     frames = np.repeat(np.arange(len(samples)), list(map(len, samples)))
-    return in_order(np.rec.fromarrays([frames, classes, id_index, *columns], dtype=_BOX))
+    return boxes_in_order(np.rec.fromarrays([frames, classes, id_index, *columns], dtype=_BOX))
 
 
-def in_order(boxes: Table) -> Table:
+def boxes_in_order(boxes: BoxRows) -> BoxRows:
     """Sort boxes by sample, class and id."""
     return boxes[np.lexsort((boxes.id_index, boxes.class_index, boxes.frame))]
 
 
 def matched(
-    recording: Recording,
-    pairs: Table,
+    recording: TrackedRecording,
+    pairs: BoxRows,
     scores: FloatArray,
     bonus: float = 0.0,
     position: IntArray | None = None,
@@ -177,7 +177,7 @@ def matched(
     return is_matched
 
 
-def is_switch(recording: Recording, matches: Table) -> BoolArray:
+def is_switch(recording: TrackedRecording, matches: BoxRows) -> BoolArray:
     """Return which matches (M,) give an actor another track than its match before, (M,)."""
     actors = recording.key(recording.truth)[matches.truth]
     order = np.lexsort((matches.truth, actors))
@@ -188,7 +188,7 @@ def is_switch(recording: Recording, matches: Table) -> BoolArray:
 
 
 def match_sums(
-    recording: Recording, matches: Table, position: IntArray, mostly_tracked: float
+    recording: TrackedRecording, matches: BoxRows, position: IntArray, mostly_tracked: float
 ) -> FloatArray:
     """Return `MATCH_SUMS` of each class, shape (C, 9).
 

@@ -17,7 +17,7 @@ from deepaccident_devkit.support.text import settle_choices
 from deepaccident_devkit.taxonomy import CATEGORIES, OWN_ACTOR_ID, UNTRACKED_ID
 from deepaccident_devkit.v2x.cooperation import visible_actors
 
-TruthSource = Literal["visible", "own", "label"]
+TrackedActors = Literal["visible", "own", "label"]
 Shape = Literal["square", "circle"]
 SIX_CLASSES = tuple((name, (name,)) for name in CATEGORIES)
 # Truth → words for people.
@@ -50,7 +50,7 @@ class TrackingRules:
             metres.
     """
 
-    truth: TruthSource = "visible"
+    truth: TrackedActors = "visible"
     classes: tuple[tuple[str, tuple[str, ...]], ...] = SIX_CLASSES
     class_of_instance: bool = False
     frame: Literal["lidar", "ego"] = "lidar"
@@ -67,7 +67,7 @@ class TrackingRules:
         """
         object.__setattr__(self, "classes", as_tuples(self.classes))
         object.__setattr__(self, "ranges", as_tuples(self.ranges))
-        choices = {"truth": TruthSource, "frame": Literal["lidar", "ego"], "shape": Shape}
+        choices = {"truth": TrackedActors, "frame": Literal["lidar", "ego"], "shape": Shape}
         settle_choices(self, {name: get_args(words) for name, words in choices.items()})
         check_classes(self.classes)
         if len(self.ranges) not in (1, len(self.classes)) or not min(self.ranges) > 0:

@@ -22,12 +22,13 @@ from deepaccident_devkit.geometry import BevGrid, Boxes, quaternions
 from deepaccident_devkit.geometry.cell_outlines import outlines
 from deepaccident_devkit.render.bev import BevView, draw_bev
 from deepaccident_devkit.render.boxes import (
+    bounds_in_image,
     draw_boxes_from_above,
     draw_boxes_in_image,
     write_beside,
 )
 from deepaccident_devkit.render.camera import best_view
-from deepaccident_devkit.render.captions import titled_from_above
+from deepaccident_devkit.render.captions import box_handles, titled_from_above
 from deepaccident_devkit.render.chips import keep_free, keep_line_free, place_chips
 from deepaccident_devkit.render.figures import Layer, Layers, square_around
 from deepaccident_devkit.render.motion_maps import draw_cells, trail_picture
@@ -75,6 +76,8 @@ ROLE_COLORS: Final[Mapping[Role, str]] = {
 }
 _LINE_WIDTHS_PT: Mapping[Role, float] = {"past": 0.8, "truth": 1.0}
 _PREDICTED_WIDTH_PT = 2.4
+# Scale of the lines on cells, whose outcome they would hide.
+_SCALE_ON_CELLS = 0.5
 # Roles of paths in the order in which they are drawn.
 _ROLE_ORDER = ("past", "predicted", "false", "missed", "right", "collision", "truth")
 _RIBBON_OPACITY = 0.4
@@ -85,6 +88,10 @@ _TRUE_CELL_COLOR = INSTANCE_COLORS[0]
 # Opacity of cells in camera images and in legends.
 _CELL_OPACITY = 0.3
 _OUTLINE_WIDTH_PT = 1.6
+# Width of the colliding pair's rim around boxes of an outcome, in points.
+_RIM_WIDTH_PT = 3.0
+# Drawing order of the rim; other boxes are drawn at 3.
+_RIM_ORDER = 2.9
 # Corners of a box's top, in `Boxes.corners` order.
 _TOP_CORNERS = (0, 1, 4, 5)
 # Largest number of scores that are written at boxes of one kind.
@@ -99,6 +106,8 @@ _SHARE_BEFORE_POINT = 0.98
 _MIN_VIEW_RANGE_M = 15.0
 _MAX_VIEW_RANGE_M = 60.0
 _VIEW_MARGIN_M = 8.0
+# Farthest place that the largest view contains together with the agent.
+_MAX_PLACE_M = 2 * (_MAX_VIEW_RANGE_M - _VIEW_MARGIN_M)
 # Positions nearer than this count as much as at this depth.
 _MIN_DEPTH_M = 5.0
 _MARK_MARGIN_PT = (-6.0, -6.0, 6.0, 6.0)
@@ -133,21 +142,24 @@ def draw_drawing_from_above(
     view_range = float(np.clip(half, _MIN_VIEW_RANGE_M, _MAX_VIEW_RANGE_M))
     shown_layers = layers - {"trajectories", "image", "labels"}
     agents: Agents = None
-    if drawing.cells or any(boxes.role != "collision" for boxes in drawing.boxes):
+    has_outcomes = any(boxes.role != "collision" for boxes in drawing.boxes)
+    if drawing.cells or has_outcomes:
         shown_layers -= {"boxes"}  # the drawing has shapes of its own
         agents = "single"
     view = BevView(agents=agents, view_range=view_range, center=(x, y), surroundings_shown=True)
-    draw_bev(dataset, sample, view, shown_layers, ax)
+    colors_of_actors, _ = draw_bev(dataset, sample, view, shown_layers, ax)
     if "labels" in layers:
         _draw_cells_from_above(drawing.cells, ax)
     if "trajectories" in layers:
-        _draw_paths_from_above(_in_drawing_order(drawing), ax)
+        scale = _SCALE_ON_CELLS if drawing.cells else 1.0
+        _draw_paths_from_above(_in_drawing_order(drawing), ax, scale)
     if "boxes" in layers:
         for drawn in drawing.boxes:
             boxes = _in_ego_frame(dataset, sample, drawn)
-            fill = _FILLS.get(drawn.role, _BOX_OPACITY)
+            fill = _fill_opacity(drawn)
             colors = [_edge_color(drawn.role)] * len(boxes)
-            draw_boxes_from_above(boxes, ax, colors, fill=fill, **_line_style(drawn.role))
+            style = _line_style(drawn.role, is_rim=has_outcomes)
+            draw_boxes_from_above(boxes, ax, colors, fill=fill, **style)
     for place in drawing.places:
         color = ROLE_COLORS[place.role]
         marker: dict[str, Any] = _marker_of(place.role)
@@ -159,7 +171,9 @@ def draw_drawing_from_above(
     if drawing.alarm is not None:
         _draw_alarm(drawing.alarm, ax)
     titled_from_above(ax, "", grid="grid" in layers)
-    return drawing_handles(drawing)
+    handles = box_handles(colors_of_actors & {COLLIDER_COLOR})
+    handles += drawing_handles(drawing)
+    return [*{handle.get_label(): handle for handle in handles}.values()]
 
 
 def draw_drawing_in_camera(
@@ -247,7 +261,7 @@ def drawing_handles(drawing: Drawing) -> list[Artist]:
         if not len(boxes.boxes):
             continue
         color = _edge_color(boxes.role)
-        fill = _FILLS.get(boxes.role, _BOX_OPACITY)
+        fill = _fill_opacity(boxes)
         handles[boxes.label] = Patch(
             facecolor=(color, fill), edgecolor=color, **_line_style(boxes.role)
         )
@@ -311,18 +325,18 @@ def is_covered(points: FloatArray, boxes: Boxes) -> BoolArray:
 def _shown_positions(drawing: Drawing) -> FloatArray:
     """Return the positions (N, 2) that a picture should contain, and the agent's.
 
-    Positions that are too far away from the agent are left out.
+    Positions that are too far away from the agent are left out, but marked places are not.
     """
     positions = [np.zeros((1, 2))]
     positions += [path.xy for path in drawing.paths]
-    positions += [place.xy for place in drawing.places]
     positions += [drawn.boxes.center[:, :2] for drawn in drawing.boxes if drawn.role != "collision"]
     for cells in drawing.cells:
         is_occupied = cells.instance.any(axis=0)
         positions.append(cells.grid.centers()[is_occupied])
     all_positions = np.concatenate(positions)
     is_near = np.abs(all_positions).max(axis=1) <= _MAX_VIEW_RANGE_M - _VIEW_MARGIN_M
-    near_positions: FloatArray = all_positions[is_near]
+    places = [place.xy.clip(-_MAX_PLACE_M, _MAX_PLACE_M) for place in drawing.places]
+    near_positions: FloatArray = np.concatenate([all_positions[is_near], *places])
     return near_positions
 
 
@@ -357,10 +371,22 @@ def _own_ids(dataset: Dataset, sample: str, camera: str) -> list[int]:
     return own_ids
 
 
-def _line_style(role: Role) -> dict[str, Any]:
-    """Return the options for the outlines of boxes and cells; missed ones are dashed."""
+def _fill_opacity(drawn: DrawnBoxes) -> float:
+    """Return the opacity of boxes from above; future boxes are outlines."""
+    if drawn.time:
+        return 0.0
+    return _FILLS.get(drawn.role, _BOX_OPACITY)
+
+
+def _line_style(role: Role, *, is_rim: bool = False) -> dict[str, Any]:
+    """Return the options for the outlines of boxes and cells; missed ones are dashed.
+
+    With `is_rim`, the colliding pair's are wide and below other boxes, which stay visible.
+    """
     if role == "missed":
         return {"linestyle": DASHED}
+    if is_rim and role == "collision":
+        return {"linewidths": _RIM_WIDTH_PT, "zorder": _RIM_ORDER}
     return {}
 
 
@@ -436,7 +462,10 @@ def instance_outlines(instance: AnyArray, grid: BevGrid) -> list[FloatArray]:
 
 
 def _draw_boxes_in_camera(drawn: DrawnBoxes, own_ids: Sequence[int], view: CameraView) -> None:
-    """Draw boxes in the ego frame, the nearest on top, with the highest scores."""
+    """Draw boxes in the ego frame, the nearest on top, with the highest scores.
+
+    Words do not cover the colliding pair.
+    """
     channel = view.camera.rsplit("/", 1)[1]
     boxes = drawn.boxes.transform(view.optical_from_ego, channel)
     is_other = ~np.isin(boxes.actor_id, own_ids)
@@ -448,6 +477,9 @@ def _draw_boxes_in_camera(drawn: DrawnBoxes, own_ids: Sequence[int], view: Camer
     in_image = draw_boxes_in_image(
         shown_boxes, view.lens, view.ax, colors, **_line_style(drawn.role)
     )
+    if drawn.role == "collision" and not drawn.time:
+        bounds = bounds_in_image(shown_boxes.select(in_image), view.lens)
+        keep_free(view.ax, bounds.reshape(-1, 2, 2))
     if drawn.scores is None or (drawn.scores == 1).all():
         return
     rows = rows[in_image]
@@ -462,7 +494,8 @@ def _draw_boxes_in_camera(drawn: DrawnBoxes, own_ids: Sequence[int], view: Camer
     place_chips(view.ax, chips, colors=[color] * len(chips))
 
 
-def _draw_paths_from_above(paths: Sequence[DrawnPath], ax: Axes) -> None:
+def _draw_paths_from_above(paths: Sequence[DrawnPath], ax: Axes, scale: float) -> None:
+    """Draw paths; `scale` multiplies the widths of their lines."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba
 
@@ -475,7 +508,7 @@ def _draw_paths_from_above(paths: Sequence[DrawnPath], ax: Axes) -> None:
             outline = ribbon(path.xy, path.width)
             ax.fill(*outline.T, color=color, alpha=_RIBBON_OPACITY * opacity, linewidth=0, zorder=3)
         colors.append(to_rgba(color, opacity))
-        widths.append(_line_width(path.role))
+        widths.append(scale * _line_width(path.role))
     lines = LineCollection([path.xy for path in paths], colors=colors, linewidths=widths, zorder=4)
     ax.add_collection(lines, autolim=False)
 
@@ -546,7 +579,7 @@ def _draw_alarm(alarm: DrawnAlarm, ax: Axes) -> None:
     ax.add_patch(Rectangle((left, low), score_width, height, facecolor=color, **options))
     ax.text(
         left,
-        low + height * 1.2,
+        low + height * 1.4,
         f"alarm {alarm.score:.2f}",
         fontsize=text_size(),
         transform=ax.transAxes,

@@ -154,7 +154,9 @@ def _loader_of(
     """Return what loads samples to judge them as `render_evaluation` does."""
     task = task or results.task
     protocols = evaluator_class(task).protocols
-    default = "boxes" if results.task == task == "accident" else "released"
+    default = "released"
+    if results.task == task == "accident":
+        default = "boxes"
     if default not in protocols:
         default = next(iter(protocols), "")
     horizon = RELEASED_HORIZON
@@ -210,6 +212,7 @@ def render_results(
             ax.set(xlabel="", ylabel="")
     for name, ax in zip(["ground truth", *results], axes[:, 0], strict=True):
         ax.set_ylabel(textwrap.fill(name, _NAME_WIDTH), fontsize=text_size())
+    handles.pop("found", None)  # found boxes look like the true ones of the first row
     draw_legend(fig, list(handles.values()))
     return lay_out_figure(fig)
 

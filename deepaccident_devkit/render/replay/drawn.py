@@ -69,7 +69,8 @@ def drawing_entries(
         drawing, words = _describe(recording, prediction, evaluator, token)
         shown = _shown_drawing(drawing)
         parts: list[Any] = [*shown.paths, *shown.boxes, *shown.cells, *shown.places]
-        legend.update({part.label: _COLORS[part.role] for part in parts})
+        for part in parts:
+            legend[part.label] = _COLORS[part.role]
         verdict, color = _verdict(drawing)
         samples.append(
             {
@@ -188,7 +189,8 @@ def _sample_entry(
     lines = [_path_line(recording, token, path) for path in paths[:_MAX_LINES]]
     for drawn in drawing.boxes:
         lines += _box_lines(recording, token, frame, drawn)
-    count = len(paths) + sum(len(drawn.boxes) for drawn in drawing.boxes)
+    count = len(paths)
+    count += sum(len(drawn.boxes) for drawn in drawing.boxes)
     left_out = count - len(lines)
     for cells in drawing.cells:
         lines += _cell_lines(recording, token, frame, cells)

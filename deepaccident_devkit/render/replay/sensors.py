@@ -382,7 +382,8 @@ def _by_agent(pictured: _Images, encoded: Sequence[bytes]) -> Jpegs:
     for (agent, channel), images in pictured.items():
         pictures = tuple(None if image is None else next(remaining) for image in images)
         if any(pictures):
-            jpegs.setdefault(agent, {})[channel] = pictures
+            agent_jpegs = jpegs.setdefault(agent, {})
+            agent_jpegs[channel] = pictures
     return jpegs
 
 

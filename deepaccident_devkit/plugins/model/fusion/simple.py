@@ -100,7 +100,7 @@ class Agent3D(nn.Module):
     def __init__(self, config: Agent3DConfig) -> None:
         super().__init__()
         width = config.channels
-        layers = []
+        layers: list[nn.Module] = []
         in_channels = width + POSE_CHANNELS
         for _ in range(config.agents - 1):
             layers.append(TemporalBlock(in_channels, width))

@@ -235,7 +235,7 @@ def test_a_release_without_bev_files_is_refused(da_b: DeepAccident) -> None:
 
 def test_a_sample_draws_itself(da: DeepAccident, tokens: list[str]) -> None:
     drawn = sample_drawing(da, tokens[0], make_output_of(da, tokens[0]), task="segmentation")
-    assert "mIoU, 100 m × 100 m 100.00 %" in drawn.words
+    assert "mIoU (100 m × 100 m) 100.00 %" in drawn.words
     assert [bool(cells.instance.any()) for cells in drawn.drawing.cells] == [
         True,
         True,
