@@ -44,7 +44,6 @@ from deepaccident_devkit.render.styles import (
     TRUE_PLACE_COLOR,
     current_style,
     in_own_settings,
-    text_size,
 )
 from deepaccident_devkit.support.arrays import FloatArray
 from deepaccident_devkit.support.values import ReadOnlyValues
@@ -168,7 +167,7 @@ def render_link(
     box_ax.set(xlim=(-half_width, half_width), ylim=(-view_range, view_range), aspect="equal")
     label_axes(box_ax, "ego")
     box_ax.locator_params(nbins=6)  # each tick costs time
-    box_ax.set_title("Box positions")
+    box_ax.set_title("Box positions (mean errors in the legend)")
     _draw_shared(shared, shown_layers, box_ax)
     insets = _magnify_largest_errors(shared, box_ax) if "boxes" in shown_layers else []
     words = f"received by {short_name(record['agent'])}"
@@ -184,8 +183,7 @@ def render_link(
         target_from_world = dataset.world_from(record, "ego").inverse()
         axes = [box_ax, *insets, *cloud_axes]
         draw_road(dataset, record["frame_token"], axes, target_from_world=target_from_world)
-    title = "Mean position error by partner"
-    draw_legend(fig, _legend_handles(shared), columns=4, title=title, title_fontsize=text_size())
+    draw_legend(fig, _legend_handles(shared), columns=4)
     set_scene_title(fig, dataset, record["token"], below=link_words(link))
     return lay_out_figure(fig)
 
