@@ -402,7 +402,7 @@ def test_the_strip_describes_the_pair_and_leads_to_its_frames(
         "[...document.querySelectorAll('.strip .told')].map((element) => element.textContent)"
     )
     assert not missing_parts(
-        texts, f"{pair['gap'][20] / 100:.1f} m", f"{pair['ttc'][20] / 10:.1f} s", "E TP"
+        texts, f"{pair['gap'][20] / 100:.1f} m", f"{pair['ttc'][20] / 10:.1f} s", "E alarm"
     )
 
 
